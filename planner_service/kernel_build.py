@@ -26,9 +26,11 @@ from planner_service.kernels import (
     cell_costs,
     corridor_growth,
     directed_buckets,
-    directed_growth,
     lower_bounds,
     parents,
+    parents_from_root,
+    pieces,
+    pieces_mend,
     repair,
     route_walk,
     wide_buckets,
@@ -42,12 +44,14 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(wide_buckets.grow_by_wide_buckets, directed_growth.grow_directed),
+    wide_buckets.grow_by_wide_buckets,
+    parents_from_root.find_parents_from_root,
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
     cell_costs.changed_cells,
     route_walk.find_starts,
+    route_walk.drive_rests,
     cell_costs.cell_cost_range,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
@@ -63,8 +67,15 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     corridor_growth.tighten,
     corridor_growth.mark_levels,
     route_walk.relabel,
+    pieces_mend.mend_tiles,
+    pieces.relabel_tiles,
+    pieces.evaluate,
+    pieces_mend.cut_ways,
+    pieces_mend.merge_parents,
+    pieces_mend.drop_lost,
+    pieces.costs_at,
 )
-"""For windows, repairs and corridors, which save growing whole trees."""
+"""For windows, repairs, corridors and pieces, which save growing whole trees."""
 
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"

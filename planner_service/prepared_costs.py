@@ -47,8 +47,9 @@ class PreparedCosts:
 
     def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: str | None = None) -> None:
         cost_grid = CostGrid(terrain.grid, config, terrain.climb)
-        of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.terms}"
-        of_ways = f"{of_costs} {cost_grid.rule} {cost_grid.corners} {corridors.LEAST} {corridors.SAMPLES}"
+        of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.metres}"
+        rules = f"{cost_grid.length_weight_s} {cost_grid.rule} {cost_grid.corners}"
+        of_ways = f"{of_costs} {rules} {corridors.LEAST} {corridors.SAMPLES}"
         self._size = cost_grid.size
         self._folder = folder
         self._kept = kept
@@ -59,7 +60,7 @@ class PreparedCosts:
             found = _read(path, np.float32, self._size)
             if found is None:
                 cost_grid.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
-                save_array(path, cost_grid.cell_cost)
+                save_array(path, cost_grid.time_cost)
                 found = open_array(path)
         self.cell_cost: Floats = found
 

@@ -287,7 +287,6 @@ class TargetTree:
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
             starts = self._costs.pad_all(asked[inside])
-            self._tree.tighten(starts)
             costs[inside] = self._tree.cost_at(starts)
         return costs
 

@@ -213,6 +213,30 @@ def gap(
 
 
 @app.command()
+def certificates(
+    checks: Annotated[int, typer.Option(min=1, help="Routes to check.")] = 1_000_000,
+    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were checked.")] = 600,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first life; the next one's is one more.")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Random rules, strategies and lives: is each route what its planner says?
+
+    \b
+    swarm bench certificates --checks 10000000 --seconds 1200
+
+    Every route is driven step by step in float64 and held against the best way that
+    scipy finds. The status is 1 where a law was broken; the seed shown repeats it.
+    """
+    from launch_scripts.bench.planning.certificate_checks import run_checks, tables
+
+    with progress_of("certificates") as progress:
+        report = run_checks(checks, seed, seconds, progress)
+    show(report, as_json, tables)
+    if report["violations"]:
+        raise typer.Exit(1)
+
+
+@app.command()
 def directed(
     sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
     repeats: Annotated[int, typer.Option(min=1, help="Roots, the same for both.")] = 7,

@@ -26,17 +26,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import (
-    BUCKETS,
-    GRID,
-    INF,
-    RULE_OCTILE,
-    RULE_PAPER,
-    SQRT2,
-    TOO_FINE,
-    WALL,
-    exit_key,
-)
+from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL
 from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
@@ -92,14 +82,14 @@ def _ask_for(cell_cost, cost, s, u):
 
 
 @helper
-def offer_straight(cell_cost, cost, s, batch, n, touched, always):
+def offer_straight(cell_cost, cost, s, batch, n, touched):
     """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
-    many. `always` is that of `exit_key`."""
+    many."""
     count = _ZERO
     for p in range(n):
         _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = exit_key(cost[u], cell_cost[u], always)
+        key = cost[u] + cell_cost[u]
         north, west, east, south = cost[u - s], cost[u - _ONE], cost[u + _ONE], cost[u + s]
         for i, old in ((u - s, north), (u - _ONE, west), (u + _ONE, east), (u + s, south)):
             cost[i] = min(old, key)
@@ -109,12 +99,12 @@ def offer_straight(cell_cost, cost, s, batch, n, touched, always):
 
 
 @helper
-def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count, always):
+def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
     """As `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
         _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = exit_key(cost[u], cell_cost[u] * SQRT2, always)
+        key = cost[u] + cell_cost[u] * SQRT2
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -140,13 +130,13 @@ def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count, always
 
 
 @helper
-def offer_around(cell_cost, cost, s, corners, batch, n, touched, always):
+def offer_around(cell_cost, cost, s, corners, batch, n, touched):
     """As `offer_straight`, to eight neighbours, all a step of length 1 away."""
     count = _ZERO
     for p in range(n):
         _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = exit_key(cost[u], cell_cost[u], always)
+        key = cost[u] + cell_cost[u]
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -226,13 +216,13 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
         n = take(queue, b, batch)
         waiting -= n
         if rule == RULE_PAPER:
-            count = offer_around(cell_cost, cost, s, corners, batch, n, touched, None)
+            count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
         else:
-            count = offer_straight(cell_cost, cost, s, batch, n, touched, None)
+            count = offer_straight(cell_cost, cost, s, batch, n, touched)
         if rule == RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
-            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count, None)
+            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
 
 
 @kernel(f"({GRID}, f4[::1], i8, u4[::1])")

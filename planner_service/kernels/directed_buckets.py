@@ -1,17 +1,28 @@
-"""Exact growth where a step also costs by what it climbs, with a bucket queue (Dial 1969).
+"""Exact growth where a step also costs by what it climbs, over cell costs of any ratio, with buckets of several
+levels (E. V. Denardo, B. L. Fox, "Shortest-route methods: 1. Reaching, pruning, and buckets", Operations Research
+27(1), 1979, 161-186).
 
 Neighbours of a cell are offered different keys, so that a cell's first offer is not its least, as it is in
-`bucket_queue`. But a bucket is narrower than the cheapest step: once it is served, no cell in it is offered less.
-So a cell waits under its own cost, once for each time that it fell, and is served the first time that its turn
-comes. Parents follow from the costs.
+`bucket_queue`. But where no cell of a bucket offers anything that lies in it, all of them are final. So a cell
+waits under its own cost, once for each time that it fell, and is served once. Parents follow from the costs.
+
+A cost's *index* is how many finest widths it has. Its digits to the base 128 say where a cell waits: in the bucket
+of the first digit in which its index differs from what is served, so that buckets of one level are 128 times as
+wide as those of the level below. When the turn of a bucket comes, the least that any of its cells may offer decides
+(A. Crauser, K. Mehlhorn, U. Meyer, P. Sanders, "A parallelization of Dijkstra's shortest path algorithm", MFCS
+1998, their OUT-criterion): cells that cost no more than that are final. Where these lie in a good part of the
+bucket, they are served, and the others wait on; where not, all of them are spread over the level below. So neither
+dear cells nor cheap ones make the others' buckets narrower, and no result rests on a width or on the rounding of
+sums.
 
 Arrays, beside those of `layout` and `climbs`:
-    touched  uint32  (8 * _PIECE + 1,) padded cells whose cost has fallen
-    chosen   int32   (8 * _PIECE + 1,) their buckets
+    touched  uint32  (8 * _PIECE + 8,) padded cells whose cost has fallen
+    chosen   int32   (8 * _PIECE + 8,) their buckets
     batch    uint32  (8 * size + _AHEAD,) padded cells of the bucket that is being served
-    steps    float32, int32 (8 * _PIECE,)  of the steps into a piece's cells, a row for each direction: rise, m;
-                                           entry of `prices`
-    queue    as of `chunked_buckets`
+    steps    float32, int32 (8 * _PIECE + 8,)  of the steps into a piece's cells, a row for each direction: rise, m;
+                                               entry of `prices`
+    waiting  uint64  (_LEVELS,)  how many entries wait at each level
+    queue    as of `chunked_buckets`; bucket `digit` of a level is the one numbered _BASE * level + digit
 
 While growing, the cost of a cell that was served is negative, so that no offer lowers it, and WALL on lethal cells.
 """
@@ -24,7 +35,7 @@ from numpy.typing import NDArray
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.climbs import CLIMBS, find_entries
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_FOUR, TOO_FINE, WALL
+from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
 from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
@@ -38,20 +49,33 @@ _PIECE = np.uint64(1 << 6)
 WIDTH = 0.9
 """Of a bucket, in cheapest steps. A cell in a bucket that is being served must not be offered less by another,
 whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most 2^-24
-of the cost. Up to `_MOST_BUCKETS` that is a tenth of a bucket."""
-_MOST_BUCKETS = 1 << 19
-_SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), {QUEUE}))"
+of the cost. Up to `_SURE` that is a tenth of a bucket."""
+_SURE = np.uint64(1 << 19)
+BASE_BITS = 7
+"""Buckets of each level: 2 to the power of this."""
+_DIGIT, _BASE = np.uint64(BASE_BITS), np.uint64(1 << BASE_BITS)
+_LAST = _BASE - _ONE
+_MASK = np.uint64((1 << 32) - 1)
+_LEVELS = np.uint64(-(-63 // BASE_BITS))
+_MOST_INDEX = np.float32(2.0**62)
+_PART = np.uint64(3)
+"""A bucket is served in parts where the first is at least its width shifted right by so many bits,"""
+_FEW = np.uint64(8)
+"""or where it holds no more cells than these."""
+_ALL = np.float32(-1.0)
+_SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), u8[::1], {QUEUE}))"
 
 Steps = tuple[NDArray[np.float32], NDArray[np.int32]]
-Scratch = tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.uint32], Steps, Queue]
+Scratch = tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.uint32], Steps, NDArray[np.uint64], Queue]
 
 
-def make_scratch(size: int, buckets: int) -> Scratch:
-    """(touched, chosen, batch, steps, queue) for a growth over `size` padded cells, for the worst case."""
+def make_scratch(size: int) -> Scratch:
+    """(touched, chosen, batch, steps, waiting, queue) for a growth over `size` padded cells, for the worst case."""
     room = 8 * int(_PIECE) + 8
     batch = np.empty(8 * size + _AHEAD, np.uint32)
     steps = np.empty(room, np.float32), np.empty(room, np.int32)
-    return np.empty(room, np.uint32), np.empty(room, np.int32), batch, steps, make_queue(8 * size, buckets)
+    waiting, queue = np.empty(int(_LEVELS), np.uint64), make_queue(8 * size, int(_LEVELS * _BASE))
+    return np.empty(room, np.uint32), np.empty(room, np.int32), batch, steps, waiting, queue
 
 
 @helper
@@ -142,60 +166,144 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
 
 
 @helper
-def _choose(cost, inverse, least, cells, count, buckets):
-    """buckets := which one each cell's cost falls into, `least` at least."""
+def _index(cost, inverse):
+    """uint64: how many finest widths a cost has."""
+    return np.uint64(np.int64(min(cost * inverse, _MOST_INDEX)))
+
+
+@helper
+def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
+    """buckets := where each cell is to wait: at `level` or above."""
+    shift = level * _DIGIT
+    now = served >> shift
+    own = level << _DIGIT
+    far = _ZERO
     for i in range(count):
-        v = np.uint64(cells[i])
-        buckets[i] = max(np.int32(cost[v] * inverse), least)
+        at = _index(cost[np.uint64(cells[i])], inverse) >> shift
+        apart = at ^ now
+        if apart <= _LAST:
+            buckets[i] = np.int32(own + (at & _LAST))
+            continue
+        above = level
+        while apart > _LAST:
+            apart >>= _DIGIT
+            at >>= _DIGIT
+            above += _ONE
+        waiting[above] += _ONE
+        far += _ONE
+        buckets[i] = np.int32((above << _DIGIT) + (at & _LAST))
+    waiting[level] += count - far
 
 
-@kernel(f"({GRID}, f4[::1], i8, {CLIMBS}, {BUCKETS}, {_SCRATCH})")
-def grow_directed_by_buckets(grid, cost, root, climbs, buckets, scratch):
+@helper
+def _least_ahead(cell_cost, cost, batch, n):
+    """Keep those cells of a batch that were not served yet. Returns how many, and the least that any of them
+    may offer."""
+    kept = _ZERO
+    least = INF
+    for p in range(n):
+        ahead = np.uint64(batch[p + np.uint64(_AHEAD)])
+        prefetch(cost, ahead)
+        prefetch(cell_cost, ahead)
+        u = np.uint64(batch[p])
+        c = cost[u]
+        batch[kept] = u
+        if c >= _ZERO32:
+            kept += _ONE
+            least = min(least, c + cell_cost[u])
+    return kept, least
+
+
+@helper
+def _put_back(cost, inverse, served, level, batch, n, least, scratch):
+    """Let those cells of a batch wait, at `level` or above, that cost more than `least`. Returns how many are
+    left."""
+    touched, chosen, _, _, waiting, queue = scratch
+    room = np.uint64(8) * _PIECE
+    kept = _ZERO
+    count = _ZERO
+    for i in range(n):
+        u = np.uint64(batch[i])
+        batch[kept] = u
+        touched[count] = u
+        late = cost[u] > least
+        count += np.uint64(late)
+        kept += np.uint64(not late)
+        if count == room:
+            _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+            put(queue, touched, count, chosen, _MASK, _ZERO)
+            count = _ZERO
+    _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+    put(queue, touched, count, chosen, _MASK, _ZERO)
+    return kept
+
+
+@helper
+def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
+    """Let the cells of the batch that have not yet make their offers."""
+    cell_cost, _, stride, rule, corners = grid
+    touched, chosen, batch, steps, waiting, queue = scratch
+    s = np.uint64(stride)
+    n = _serve_once(cost, batch, n)
+    first = _ZERO
+    while first < n:
+        some = min(_PIECE, n - first)
+        count = _offer(cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, some, steps, touched)
+        _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+        put(queue, touched, count, chosen, _MASK, _ZERO)
+        first += some
+
+
+@helper
+def _find_level(waiting):
+    level = _ZERO
+    while level < _LEVELS and waiting[level] == _ZERO:
+        level += _ONE
+    return level
+
+
+@kernel(f"({GRID}, f4[::1], i8, {CLIMBS}, f8, b1, {_SCRATCH})")
+def grow_directed_by_buckets(grid, cost, root, climbs, width, look, scratch):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
-    buckets  width: at most `WIDTH` lowest cell costs, s. count: of the circular queue, a power of two;
-             count * width exceeds the dearest step by two widths
+    width    s, of the finest buckets. Costs are exact whatever it is
+    look     False: it is at most `WIDTH` lowest cell costs, so that up to `_SURE` no cell of a finest bucket
+             leads back into it
     scratch  as `make_scratch` returns it
-    Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
     """
-    cell_cost, _, stride, rule, corners = grid
-    touched, chosen, batch, steps, queue = scratch
-    width, circle = buckets
-    empty(queue, circle)
+    cell_cost = grid[0]
+    batch, waiting, queue = scratch[2], scratch[4], scratch[5]
+    empty(queue, _LEVELS * _BASE)
     head, tail = queue[3], queue[4]
-    s = np.uint64(stride)
-    mask = np.uint64(circle) - _ONE
-    inverse = np.float32(1.0 / width)
+    inverse = np.float32(min(1.0 / width, 1e30))
     for i in range(cell_cost.size):
         cost[i] = INF if cell_cost[i] < INF else WALL
+    for level in range(_LEVELS):
+        waiting[level] = _ZERO
     cost[np.uint64(root)] = _ZERO32
-    current = np.int32(0)
     batch[0] = root
-    n = _ONE
-    waiting = _ZERO
-    while True:
-        n = _serve_once(cost, batch, n)
-        first = _ZERO
-        while first < n:
-            some = min(_PIECE, n - first)
-            count = _offer(
-                cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, some, steps, touched
-            )
-            _choose(cost, inverse, np.int32(current + 1), touched, count, chosen)
-            put(queue, touched, count, chosen, mask, _ZERO)
-            waiting += count
-            first += some
-        if waiting == _ZERO:
-            break
-        if current > _MOST_BUCKETS:
-            return TOO_FINE
-        current = np.int32(current + 1)
-        b = np.uint64(current) & mask
+    _serve(grid, cost, climbs, inverse, _ZERO, _ZERO, _ONE, scratch)
+    served = _ZERO
+    level = _find_level(waiting)
+    while level < _LEVELS:
+        shift = level * _DIGIT
+        now = served >> shift
+        b = (level << _DIGIT) + (now & _LAST)
         while head[b] == tail[b]:
-            current = np.int32(current + 1)
-            b = np.uint64(current) & mask
+            b += _ONE
+        served = ((now & ~_LAST) | (b & _LAST)) << shift
         n = take(queue, b, batch)
-        waiting -= n
+        waiting[level] -= n
+        if look or level > _ZERO or served >= _SURE:
+            n, least = _least_ahead(cell_cost, cost, batch, n)
+            wide = _ONE << shift
+            sure = _index(least, inverse) - served
+            if n > _FEW and level > _ZERO and sure < wide >> _PART:
+                level -= _ONE
+                n = _put_back(cost, inverse, served, level, batch, n, _ALL, scratch)
+            elif sure < wide:
+                n = _put_back(cost, inverse, served, level, batch, n, least, scratch)
+        _serve(grid, cost, climbs, inverse, served, level, n, scratch)
+        level = _find_level(waiting)
     for i in range(cost.size):
         cost[i] = abs(cost[i])
-    return current

@@ -71,22 +71,6 @@ def step_offsets(stride: int) -> NDArray[np.int64]:
     return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1), np.int64)
 
 
-ALWAYS = np.float32(2.0**-24 * (1 + 2.0**-10))
-"""Of a cost, a little more than half of what it differs from the next larger float32."""
-
-
-@helper
-def exit_key(cost, step, always):
-    """What a cell that costs `cost` offers by a step of cost `step`, s.
-
-    always  ALWAYS where the next larger float32 is the least that may be offered, so that costs grow strictly along
-            every way, however many of its steps they hold; None where no step is lost in the rounding of a cost
-    """
-    if always is None:
-        return cost + step
-    return cost + max(step, cost * always)
-
-
 @helper
 def diagonal_length(rule):
     """float32: length of a diagonal step in straight ones; inf where there is none."""

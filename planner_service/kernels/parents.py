@@ -10,7 +10,7 @@ import numpy as np
 
 from planner_service.kernels.climbs import CLIMBS, offers_of_row
 from planner_service.kernels.compile import helper, step_kernel
-from planner_service.kernels.layout import ALWAYS, BOX, GRID, HUGE, INF, NONE, RULE_FOUR, diagonal_length, exit_key
+from planner_service.kernels.layout import BOX, GRID, HUGE, INF, NONE, RULE_FOUR, diagonal_length
 
 _ONE = np.uint64(1)
 
@@ -18,15 +18,15 @@ _ONE = np.uint64(1)
 @helper
 def _parents_of_four(cell_cost, cost, s, first, last, parent):
     for i in range(first, last):
-        best = exit_key(cost[i - s], cell_cost[i - s], ALWAYS)
+        best = cost[i - s] + cell_cost[i - s]
         code = np.uint8(0)
-        key = exit_key(cost[i + _ONE], cell_cost[i + _ONE], ALWAYS)
+        key = cost[i + _ONE] + cell_cost[i + _ONE]
         code = np.uint8(2) if key < best else code
         best = min(best, key)
-        key = exit_key(cost[i + s], cell_cost[i + s], ALWAYS)
+        key = cost[i + s] + cell_cost[i + s]
         code = np.uint8(4) if key < best else code
         best = min(best, key)
-        key = exit_key(cost[i - _ONE], cell_cost[i - _ONE], ALWAYS)
+        key = cost[i - _ONE] + cell_cost[i - _ONE]
         code = np.uint8(6) if key < best else code
         best = min(best, key)
         parent[i] = code if max(cost[i], best) < INF else NONE
@@ -37,10 +37,10 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
     """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
     vectorises."""
     for i in range(first, last):
-        north = exit_key(cost[i - s], cell_cost[i - s], ALWAYS)
-        east = exit_key(cost[i + _ONE], cell_cost[i + _ONE], ALWAYS)
-        south = exit_key(cost[i + s], cell_cost[i + s], ALWAYS)
-        west = exit_key(cost[i - _ONE], cell_cost[i - _ONE], ALWAYS)
+        north = cost[i - s] + cell_cost[i - s]
+        east = cost[i + _ONE] + cell_cost[i + _ONE]
+        south = cost[i + s] + cell_cost[i + s]
+        west = cost[i - _ONE] + cell_cost[i - _ONE]
         best = north
         code = np.uint8(0)
         code = np.uint8(2) if east < best else code
@@ -49,19 +49,19 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
         best = min(best, south)
         code = np.uint8(6) if west < best else code
         best = min(best, west)
-        key = exit_key(cost[i - s + _ONE], cell_cost[i - s + _ONE] * step, ALWAYS)
+        key = cost[i - s + _ONE] + cell_cost[i - s + _ONE] * step
         key = key if max(north, east) <= limit else INF
         code = np.uint8(1) if key < best else code
         best = min(best, key)
-        key = exit_key(cost[i + s + _ONE], cell_cost[i + s + _ONE] * step, ALWAYS)
+        key = cost[i + s + _ONE] + cell_cost[i + s + _ONE] * step
         key = key if max(south, east) <= limit else INF
         code = np.uint8(3) if key < best else code
         best = min(best, key)
-        key = exit_key(cost[i + s - _ONE], cell_cost[i + s - _ONE] * step, ALWAYS)
+        key = cost[i + s - _ONE] + cell_cost[i + s - _ONE] * step
         key = key if max(south, west) <= limit else INF
         code = np.uint8(5) if key < best else code
         best = min(best, key)
-        key = exit_key(cost[i - s - _ONE], cell_cost[i - s - _ONE] * step, ALWAYS)
+        key = cost[i - s - _ONE] + cell_cost[i - s - _ONE] * step
         key = key if max(north, west) <= limit else INF
         code = np.uint8(7) if key < best else code
         best = min(best, key)

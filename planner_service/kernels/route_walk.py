@@ -246,6 +246,71 @@ def join_routes(walks, walk, directions):
         n = max(n, ends[r])
 
 
+@helper
+def _hash(cell):
+    """uint64 of 32 bits (D. E. Knuth, "The art of computer programming", vol. 3, 6.4: multiplicative hashing)."""
+    return (np.uint64(cell) * np.uint64(0x9E3779B1)) & np.uint64(0xFFFFFFFF)
+
+
+@step_kernel(
+    "(f4[::1], CLIMBS, u1[::1], Tuple((u8[::1], f8[::1])), i8, i8[::1],"
+    " Tuple((u4[::1], f8[::1])), Tuple((u4[::1], f8[::1])), f8[::1])",
+    CLIMBS,
+)
+def drive_rests(cell_cost, climbs, parent, moves, root, starts, known, trail, rests):
+    """What is driven from each start along the parents to the root, in float64; inf where there is no way.
+
+    known  (cells, sums), the rests that are known already of a 16th of all cells, the milestones: their routes
+           share their trunks. Cells are 0 before; there are a power of two, at most 2**16. Written
+    trail  (cells, sums) of the milestones that one route meets first; room for all cells
+    rests  float64 (n,), s; written whole
+    A rest is the sum up to the first milestone plus the milestone's own, and so the same whoever else is asked for.
+    Returns False if a route does not end.
+    """
+    offsets, lengths = moves
+    known_cells, known_sums = known
+    trail_cells, trail_sums = trail
+    check_cells(starts, parent.size)
+    mask = np.uint64(known_cells.size - 1)
+    for i in range(starts.size):
+        v = np.uint64(starts[i])
+        many = 0
+        steps = 0
+        own = 0.0
+        rest = 0.0
+        while v != np.uint64(root):
+            mixed = _hash(v)
+            if mixed >> np.uint64(28) == 0:
+                slot = (mixed >> np.uint64(12)) & mask
+                if known_cells[slot] == v:
+                    rest = known_sums[slot]
+                    break
+                trail_cells[many] = v
+                trail_sums[many] = own
+                many += 1
+                own = 0.0
+            code = parent[v]
+            steps += 1
+            if code == NONE or steps > parent.size:
+                break
+            u = v + offsets[code]
+            own += _driven(cell_cost, climbs, lengths, v, u, code)
+            v = u
+        if steps > parent.size:
+            return False
+        if parent[v] == NONE and v != np.uint64(root):
+            rests[i] = np.inf
+            continue
+        for j in range(many - 1, -1, -1):
+            rest += own
+            own = trail_sums[j]
+            slot = (_hash(trail_cells[j]) >> np.uint64(12)) & mask
+            known_cells[slot] = trail_cells[j]
+            known_sums[slot] = rest
+        rests[i] = own + rest
+    return True
+
+
 @kernel("(f4[::1], u1[::1], i8, i8, i8[::1], i8[::1], u1[::1])")
 def find_starts(cell_cost, parent, stride, root, asked, starts, status):
     """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
@@ -270,18 +335,17 @@ def find_starts(cell_cost, parent, stride, root, asked, starts, status):
             starts[i] = v
 
 
-@kernel(f"(UniTuple(f8, 3), {_WALKS}, f8[::1], u1[::1], f8[::1], f8[:, ::1])")
-def price_routes(metres, walks, rest, status, bound, prices):
+@kernel(f"(UniTuple(f8, 2), {_WALKS}, f8[::1], u1[::1], f8[:, ::1])")
+def price_routes(metres, walks, rests, status, prices):
     """What walked routes cost and how long they are.
 
-    metres  (resolution, m; length of a diagonal in straight steps; price of length, s/m)
+    metres  (resolution, m; length of a diagonal in straight steps)
     walks   (ends, driven, diagonals, last) as `walk_routes` and `join_routes` wrote them
-    rest    float64 (n,), s; cost-to-go from where each ends
-    bound   float64 (n,), s; proven lower bound on the cost of each
-    prices  written whole
+    rests   float64 (n,), s; what is driven from where each ends
+    prices  written, but for the bound of a route that there is
     Returns False if a route does not end where it should.
     """
-    resolution, diagonal, length_weight = metres
+    resolution, diagonal = metres
     ends, driven, diagonals, _ = walks
     begin = 0
     for i in range(status.size):
@@ -295,9 +359,7 @@ def price_routes(metres, walks, rest, status, bound, prices):
             return False
         length = (np.float64(ends[i] - begin) + np.float64(diagonals[i]) * (diagonal - 1.0)) * resolution
         begin = ends[i]
-        whole = driven[i] - length * length_weight + rest[i]
-        prices[0, i] = whole
-        prices[1, i] = min(bound[i], whole)
+        prices[0, i] = driven[i] + rests[i]
         prices[2, i] = length
-        prices[3, i] = rest[i]
+        prices[3, i] = rests[i]
     return True

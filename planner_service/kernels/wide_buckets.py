@@ -12,8 +12,6 @@ held few cells. A bucket in which too many are served again is undone: what it t
 waits is put into narrower ones. What does not fit into a circle waits behind it, until the circle is filled anew
 from its lowest key on; cells without a neighbour that could still be touched are then dropped.
 
-No step is lost in the rounding of a cost (`layout.exit_key`), so that parents follow from costs here, too.
-
 Arrays, beside those of `layout`:
     touched         uint32  (size + AHEAD,)  padded cells that got their cost from the last bucket
     batch, slanted  uint32  (size + AHEAD,)  those of the bucket that is served, by straight and by diagonal steps
@@ -39,7 +37,6 @@ from planner_service.kernels.bucket_queue import (
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import (
-    ALWAYS,
     GRID,
     INF,
     RULE_OCTILE,
@@ -47,7 +44,6 @@ from planner_service.kernels.layout import (
     SQRT2,
     WALL,
     diagonal_length,
-    exit_key,
 )
 
 _ONE = np.uint64(1)
@@ -99,7 +95,7 @@ def _file(cell_cost, cost, length, first, era, current, cells, count, queue, lef
     n = _ZERO
     for i in range(count):
         v = np.uint64(cells[i])
-        b = _bucket(exit_key(cost[v], cell_cost[v] * length, ALWAYS), base, inverse)
+        b = _bucket(cost[v] + cell_cost[v] * length, base, inverse)
         left[n] = v
         places[n] = first + np.uint64(b & _MASK if b - current < _CIRCLE else _CIRCLE)
         n += np.uint64(b > current)
@@ -130,7 +126,7 @@ def _gather(grid, cost, queue, kind, length, first, least, cells, batch):
                 wanted |= cost[v + np.uint64(offsets[k])] == INF
             cells[kept] = v
             kept += np.uint64(wanted)
-            key = exit_key(cost[v], cell_cost[v] * length, ALWAYS)
+            key = cost[v] + cell_cost[v] * length
             least = min(least, key if wanted else INF)
     return kept, least
 
@@ -164,7 +160,7 @@ def _serve_again(grid, cost, era, current, touched, count, ring, most):
     head = tail = _ZERO
     for i in range(count):
         v = np.uint64(touched[i])
-        back = _bucket(exit_key(cost[v], cell_cost[v], ALWAYS), base, inverse) <= current
+        back = _bucket(cost[v] + cell_cost[v], base, inverse) <= current
         ring[tail] = v
         tail += np.uint64(back)
         cost[v] = -cost[v] if back else cost[v]
@@ -177,8 +173,8 @@ def _serve_again(grid, cost, era, current, touched, count, ring, most):
         served += _ONE
         own = -cost[u]
         cost[u] = own
-        straight = exit_key(own, cell_cost[u], ALWAYS)
-        diagonal = exit_key(own, cell_cost[u] * slant, ALWAYS)
+        straight = own + cell_cost[u]
+        diagonal = own + cell_cost[u] * slant
         if _bucket(diagonal, base, inverse) > current:
             diagonal = INF
         for k in range(8):
@@ -195,7 +191,7 @@ def _serve_again(grid, cost, era, current, touched, count, ring, most):
                 touched[count] = v
                 count += _ONE
             waits = old < _ZERO32
-            back = waits or _bucket(exit_key(key, cell_cost[v], ALWAYS), base, inverse) <= current
+            back = waits or _bucket(key + cell_cost[v], base, inverse) <= current
             cost[v] = -key if back else key
             if back and not waits:
                 ring[tail] = v
@@ -266,12 +262,12 @@ def grow_by_wide_buckets(grid, cost, root, narrowest, scratch):
                 b = _ZERO
             n = take(queue, b, batch)
             if rule == RULE_PAPER:
-                count = offer_around(cell_cost, cost, s, corners, batch, n, touched, ALWAYS)
+                count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
             else:
-                count = offer_straight(cell_cost, cost, s, batch, n, touched, ALWAYS)
+                count = offer_straight(cell_cost, cost, s, batch, n, touched)
             if octile:
                 m = take(queue, b + slants, slanted)
-                count = offer_diagonal(cell_cost, cost, s, corners, slanted, m, touched, count, ALWAYS)
+                count = offer_diagonal(cell_cost, cost, s, corners, slanted, m, touched, count)
             most = _FEW + _AGAIN * (n + m) if width > least_width else _ANY
             count, more, settled = _serve_again(grid, cost, era, current, touched, count, places, most)
             if not settled:

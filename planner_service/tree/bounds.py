@@ -52,15 +52,18 @@ class LowerBounds:
         if lowered < 0:
             self._heuristic = None
 
-    def at(self, tree: CostToGoTree, starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    def at(
+        self, tree: CostToGoTree, starts: NDArray[np.int64], cost: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """Proven lower bounds, s, on the time from padded cells to the target now.
 
+        cost  float64 (n,), what `tree.cost_at` says of these cells, where that is known
         Raises ValueError where a start is no padded cell.
         """
         grid = self._grid
         lowest, most = grid.lowest_cell_cost, grid.grid.cells
         if tree.exact:
-            cost = tree.cost_at(starts)
+            cost = tree.cost_at(starts) if cost is None else cost
             steps = np.minimum(cost / lowest, most) + 4.0  # as `kernels` bounds them
             bound = cost * np.maximum(1.0 - steps * kernels.ROUNDING, 0.0)
         else:
@@ -71,10 +74,8 @@ class LowerBounds:
             kernels.bound_by_heuristic(
                 heuristic, root, grid.stride, part, box, rim, rim_cost, starts, self._lowest, most, bound
             )
-        if grid.length_weight_s:
-            # Of the optimum only the share that is travel time counts: at least 1 - lambda / lowest cell cost.
-            bound *= 1.0 - grid.length_weight_s / lowest
-        return bound
+        # Of the optimum only the share that is travel time counts.
+        return bound * grid.time_share
 
 
 _NONE: Floats = np.empty(0, np.float32)

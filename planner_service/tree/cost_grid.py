@@ -127,6 +127,10 @@ class CostGrid:
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
+        self._time_cost: Floats | None = None
+        """As `time_cost`, where that is an array of its own. `load` and `share` set it, `apply` writes it."""
+        self._lowest_time = math.inf
+        """s; the lowest of it, where there is one."""
         self._offsets = step_offsets(self.stride)
         self._shared: Floats | None = None
         """What `cell_cost` began as, where that is mapped: `share` sets it, `load` resets it."""
@@ -191,25 +195,48 @@ class CostGrid:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
         self._shared = None
-        self.cell_cost = np.full(self.size, np.inf, np.float32)
-        bad = kernels.pad_cell_costs(pace, self._metres, self.length_weight_s, self.stride, self.cell_cost)
+        self.cell_cost, bad = self._padded(pace, self.length_weight_s)
         if bad:
             raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
+        if self.length_weight_s:
+            self._time_cost, _ = self._padded(pace, 0.0)
         self._find_range()
 
-    @property
-    def terms(self) -> tuple[float, float]:
-        """(m, s): a cell costs its pace times the first, plus the second."""
-        return self._metres, self.length_weight_s
+    def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int]:
+        costs: Floats = np.full(self.size, np.inf, np.float32)
+        return costs, kernels.pad_cell_costs(pace, self._metres, extra_s, self.stride, costs)
 
-    def share(self, cell_cost: Floats) -> None:
-        """Take cell costs that another cost grid of the same `terms` has loaded, from `open_array`. What `apply`
-        changes is this grid's own. Raises ValueError unless they are of this grid."""
-        if cell_cost.shape != (self.size,) or cell_cost.dtype != np.float32:
+    @property
+    def metres(self) -> float:
+        """m; a straight step into a cell takes its pace times this."""
+        return self._metres
+
+    @property
+    def time_cost(self) -> Floats:
+        """float32 (size,), s: what a straight step into each cell takes; `cell_cost` itself where length costs
+        nothing. Where it does, a route's time cannot be had from `cell_cost`: the price of its length may have
+        rounded it away."""
+        return self.cell_cost if self._time_cost is None else self._time_cost
+
+    @property
+    def time_share(self) -> float:
+        """What part of any route's cost is time at least: that of the lowest cell, less the rounding of float32 in
+        both of its costs."""
+        if not self.length_weight_s:
+            return 1.0
+        return self._lowest_time / (self._lowest_time + self.length_weight_s) * (1.0 - 2.0**-22)
+
+    def share(self, time_cost: Floats) -> None:
+        """Take the `time_cost` that another cost grid of the same map and `metres` has loaded, from `open_array`.
+        What `apply` changes is this grid's own. Raises ValueError unless they are of this grid."""
+        if time_cost.shape != (self.size,) or time_cost.dtype != np.float32:
             raise ValueError(f"cell costs of this map are float32, {self.size} cells")
-        self._shared = cell_cost
         self._written[:] = False
-        self.cell_cost = private_copy(cell_cost)
+        if self.length_weight_s:
+            self._shared, self._time_cost = None, private_copy(time_cost)
+            self.cell_cost = self._time_cost + np.float32(self.length_weight_s)
+        else:
+            self._shared, self.cell_cost = time_cost, private_copy(time_cost)
         self._find_range()
 
     def snapshot(self) -> Self:
@@ -218,6 +245,7 @@ class CostGrid:
         frozen._make_scratch()
         if self._shared is None:
             frozen.cell_cost = self.cell_cost.copy()
+            frozen._time_cost = None if self._time_cost is None else self._time_cost.copy()
             return frozen
         frozen.cell_cost = private_copy(self._shared)
         for block in np.flatnonzero(self._written).tolist():
@@ -250,6 +278,11 @@ class CostGrid:
     def _find_range(self) -> None:
         bits = kernels.cell_cost_range(self.cell_cost.view(np.int32))
         self.lowest_cell_cost, self.highest_cell_cost = floats_of_bits(bits)
+        self._find_lowest_time()
+
+    def _find_lowest_time(self) -> None:
+        if self._time_cost is not None:
+            self._lowest_time, _ = floats_of_bits(kernels.cell_cost_range(self._time_cost.view(np.int32)))
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
@@ -278,6 +311,14 @@ class CostGrid:
                 self.highest_cell_cost = max(self.highest_cell_cost, float(highest))
                 found.append(Changes(cells[:count], before[:count], self.cell_cost[cells[:count]]))
                 self._written[cells[:count] // _BLOCK] = True
+            if self._time_cost is not None:
+                # A change of time may be too small to be seen in a cost that holds the price of length, too.
+                of_map = self._time_cost.reshape(self.grid.rows + 2, self.stride)
+                of_map[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1] = pace[row0:row1, col0:col1] * np.float32(
+                    self._metres
+                )
+        if dirty:
+            self._find_lowest_time()
         if not found:
             return NO_CHANGES
         changes = found[0]
@@ -353,6 +394,19 @@ class CostGrid:
         directions = np.empty(steps, np.uint8)
         route_walk.join_routes(walks, self._lanes, directions)
         return Walks(directions, *walks)
+
+    def rests(self, parent: NDArray[np.uint8], root: int, starts: Cells, cell_cost: Floats) -> NDArray[np.float64]:
+        """float64, s: what is driven from padded cells along the parents to a padded root; inf where there is no
+        way. Raises ValueError where a start is no padded cell."""
+        rests = np.empty(starts.size)
+        many = min(1 << 16, 64 << starts.size.bit_length())
+        known = np.zeros(many, np.uint32), np.empty(many)
+        trail = np.empty(self.grid.cells + 1, np.uint32), np.empty(self.grid.cells + 1)
+        if not route_walk.drive_rests(
+            cell_cost, self.climbs, parent, self._moves, root, starts, known, trail, rests
+        ):
+            raise AssertionError("a route does not end at the target: the tree is broken")
+        return rests
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

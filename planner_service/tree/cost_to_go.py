@@ -150,7 +150,7 @@ class CostToGoTree:
         kept = self._kept if part.size <= _SMALL else None
         grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, None, kept)
         way = float(cost[old])
-        if not way < math.inf:
+        if not (way < math.inf and self.offset + way <= FINE * grid.lowest_cell_cost):
             return 0
         self.offset += way
         merge_window(cost, box, self.offset, grid.pad(self.root), self.cost, grid.stride)
@@ -198,22 +198,27 @@ class CostToGoTree:
         return int(visited)
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
-        """float64, s: the cost-to-go of padded cells, inf where there is no way; at least what is driven along the
-        parents, up to the rounding of float32. Raises ValueError where one is no padded cell.
+        """float64, s: what it costs to go from padded cells along the parents, length's price with it; inf where
+        there is no way. Raises ValueError where one is no padded cell.
 
-        The one way to ask a tree what a cell costs: readers know neither how labels are kept nor what they lack.
+        With `time_at` the one way to ask a tree what a cell costs: labels are upper bounds, rounded to float32.
         """
-        if ((cells < 0) | (cells >= self.cost_grid.size)).any():
-            raise ValueError("padded cells lie outside the map")
-        costs: NDArray[np.float64] = np.maximum(self.cost[cells].astype(np.float64) + self.offset, 0.0)
-        costs[cells == self.cost_grid.pad(self.root)] = 0.0
-        return costs
+        return self._driven(cells, self.cost_grid.cell_cost)
+
+    def time_at(self, cells: Cells) -> NDArray[np.float64]:
+        """float64, s: how long it takes to drive from padded cells along the parents. Otherwise as `cost_at`."""
+        return self._driven(cells, self.cost_grid.time_cost)
+
+    def _driven(self, cells: Cells, cell_cost: Floats) -> NDArray[np.float64]:
+        _, parent, root = self._labels
+        return self.cost_grid.rests(parent, root, cells, cell_cost)
 
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
 
         A window raises the costs beyond it by the most that may be, move after move, until a growth comes by or
-        this is asked. Raises ValueError where one is no padded cell.
+        this is asked: later windows then leave alone what is good already. Raises ValueError where one is no padded
+        cell.
         """
         if not self.exact:
             grid = self.cost_grid
@@ -241,6 +246,7 @@ class CostToGoTree:
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents, and the offset 0."""
         route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
+        self.reach += self.offset
         self.offset = 0.0
 
     @property

@@ -69,7 +69,7 @@ def test_what_is_read_must_be_a_padded_cell(tree: CostToGoTree, cell: int) -> No
     bounds.take(tree.cost.copy())
     root = tree.cost_grid.pad(tree.root)
     attempts: list[Callable[[], object]] = [
-        lambda: tree.tighten(padded),
+        lambda: tree.cost_at(padded),
         lambda: bounds.at(tree, padded),
         lambda: tree.cost_grid.walk(tree.parent, root, padded, 0, tree.cost_grid.cell_cost),
     ]
@@ -99,7 +99,7 @@ def test_a_window_holds_the_old_root_and_the_new_one(tree: CostToGoTree, root: i
 
 def test_a_tree_that_was_never_grown_says_so() -> None:
     tree = CostToGoTree(CostGrid(GRID, PlannerConfig()))
-    for attempt in (tree.relabel, lambda: tree.tighten(np.array([12])), lambda: tree.move(0, GRID.window)):
+    for attempt in (tree.relabel, lambda: tree.cost_at(np.array([12])), lambda: tree.move(0, GRID.window)):
         with pytest.raises(ValueError, match="no root"):
             attempt()
 

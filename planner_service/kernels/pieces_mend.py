@@ -1,0 +1,381 @@
+"""Making a tree of `pieces` optimal again: a window is taken over, tiles are looked at and mended.
+
+A cell is *offered less* where a neighbour's cost and the step to it are less than what it costs. Tiles about which
+all totals have changed by the same number hold no such cell if they held none before. All others are looked at:
+with one cell around, by vectors; and cells that are offered less take it, and spread it inside the tile, by a
+label-correcting search. What that offers to cells of other tiles is left to these.
+
+The invariant: **what a cell costs is at least what its parent offers**. It holds where costs are what is driven; a
+cell that takes less takes whoever offers it as its parent, so that its children are offered no more than
+they cost; and only falls. Steps cost something, so costs fall strictly along parents: there is never a cycle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.layout import (
+    BOX,
+    GRID,
+    INF,
+    NONE,
+    RULE_FOUR,
+    RULE_OCTILE,
+    SQRT2_EXACT,
+)
+from planner_service.kernels.pieces import (
+    BEFORE,
+    BENCH,
+    BITS,
+    CELLS,
+    FINEST,
+    LABELLED,
+    LOOK,
+    NO_PIECE,
+    PIECES,
+    REHOOK,
+    ROOM,
+    ROOT_PIECE,
+    SIDE,
+    TILES,
+    TOTAL,
+    WIDE,
+    corner_of,
+    moved,
+    name_of,
+    step_cost,
+    tile_of,
+    where_to,
+)
+
+_ONE = np.uint64(1)
+
+
+@helper
+def _lay_line(count, g, step, i, jump, at, by, other, grid, labels, total, bench):
+    """Put `count` cells on the bench, each `step` after the one before on the map, `jump` in tile `other`, `by` on
+    the bench; from padded cell g, from i in the tile, from `at`. There is no such tile where cells are lethal."""
+    cell_cost = grid[0]
+    piece, local = labels[1], labels[2]
+    cost, own = bench[1], bench[2]
+    names = other * ROOM
+    for _ in range(count):
+        own[at] = cell_cost[g]
+        cost[at] = np.inf
+        if cell_cost[g] < INF:
+            cost[at] = total[names + np.int64(piece[i]), TOTAL] + local[i]
+        g += step
+        i += jump
+        at += by
+
+
+@helper
+def _lay(t, grid, labels, total, tiles, bench):
+    """Put a tile on the bench, with the cells around."""
+    cell_cost, _, stride, _, _ = grid
+    _, piece, local, _ = labels
+    across = tiles[6]
+    cost, own = bench[1], bench[2]
+    origin, rows, cols = corner_of(grid, across, t)
+    if rows < SIDE or cols < SIDE:
+        for i in range(cost.size):
+            cost[i] = np.inf
+            own[i] = np.inf
+    totals = np.uint64(t * ROOM)
+    for row in range(rows):
+        g = np.uint64(origin + row * stride)
+        i = np.uint64(t * CELLS + (row << BITS))
+        at = np.uint64((row + 1) * WIDE + 1)
+        for col in range(np.uint64(cols)):
+            cost[at + col] = total[totals + np.uint64(piece[i + col]), TOTAL] + local[i + col]
+            own[at + col] = cell_cost[g + col]
+    for down in range(-1, 2):
+        for right in range(-1, 2):
+            if not (down or right):
+                continue
+            # The first cell around on this side, counted from the tile's first; and how many there are.
+            row = rows if down > 0 else down
+            col = cols if right > 0 else right
+            count = 1 if down and right else (cols if down else rows)
+            other = t + down * across + right
+            i = other * CELLS + ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
+            at = (row + 1) * WIDE + col + 1
+            g = origin + row * stride + col
+            if down:
+                _lay_line(count, g, 1, i, 1, at, 1, other, grid, labels, total, bench)
+            else:
+                _lay_line(count, g, stride, i, SIDE, at, WIDE, other, grid, labels, total, bench)
+
+
+@helper
+def _find_less(cost, own, begin, end, diagonal, corners, least, less):
+    """less := 1 where a cell is offered less than it costs by more than `least`, 0 elsewhere. Without a branch,
+    so that it vectorises."""
+    s = np.uint64(WIDE)
+    for i in range(begin, end):
+        north, east, south, west = own[i - s], own[i + _ONE], own[i + s], own[i - _ONE]
+        best = min(min(cost[i - s] + north, cost[i + _ONE] + east), min(cost[i + s] + south, cost[i - _ONE] + west))
+        offer = cost[i - s + _ONE] + own[i - s + _ONE] * diagonal
+        best = min(best, offer if corners or max(north, east) < np.inf else np.inf)
+        offer = cost[i + s + _ONE] + own[i + s + _ONE] * diagonal
+        best = min(best, offer if corners or max(south, east) < np.inf else np.inf)
+        offer = cost[i + s - _ONE] + own[i + s - _ONE] * diagonal
+        best = min(best, offer if corners or max(south, west) < np.inf else np.inf)
+        offer = cost[i - s - _ONE] + own[i - s - _ONE] * diagonal
+        best = min(best, offer if corners or max(north, west) < np.inf else np.inf)
+        best = best if own[i] < np.inf else np.inf
+        less[i] = 1 if best + least < cost[i] else 0
+
+
+@helper
+def _open(own, around, rule, corners, at, code):
+    """Whether there is a step between a passable cell on the bench and the one in this direction."""
+    if not code & 1:
+        return True
+    if rule == RULE_FOUR:
+        return False
+    return corners or max(own[at + around[code - 1]], own[at + around[(code + 1) & 7]]) < np.inf
+
+
+@helper
+def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
+    """Have a cell of a tile, `at` on the bench, take the least that it is offered. Returns whether that is less."""
+    _, _, stride, rule, corners = grid
+    parent, piece, local, _ = labels
+    _, cost, own, _, _, _, _, _, around = bench
+    across = tiles[6]
+    best, by = np.inf, 0
+    for code in range(8):
+        u = at + around[code]
+        if _open(own, around, rule, corners, at, code):
+            offer = cost[u] + step_cost(rule, own[u], code)
+            if offer < best:
+                best, by = offer, code
+    if not best + least < cost[at]:
+        return False
+    cost[at] = best
+    origin, _, _ = corner_of(grid, across, t)
+    parent[origin + (cell >> BITS) * stride + (cell & (SIDE - 1))] = by
+    other, beside = where_to(across, t, cell, by)
+    i = t * CELLS + cell
+    if other == t:
+        j = t * CELLS + beside
+        piece[i] = piece[j]
+        local[i] = local[j] + step_cost(rule, own[at + around[by]], by)
+        return True
+    name = name_of(cell)
+    if piece[i] != name or local[i] > 0.0:
+        exits, many = tiles[0], tiles[1]
+        exits[t * ROOM + many[t]] = name
+        many[t] += 1
+        piece[i] = name
+        local[i] = 0.0
+    total = pieces[0]
+    total[t * ROOM + name, TOTAL] = best
+    total[t * ROOM + name, BEFORE] = best
+    return True
+
+
+@helper
+def _spread(t, grid, labels, tiles, bench, count, least):
+    """Spread what the first `count` cells of the queue cost, inside the tile. Cells around that are offered less
+    have their tile looked at."""
+    _, offsets, stride, rule, corners = grid
+    parent, piece, local, _ = labels
+    span, wanted, across = tiles[2], tiles[3], tiles[6]
+    _, cost, own, _, queue, waits, _, _, around = bench
+    first = t * CELLS
+    origin, rows, cols = corner_of(grid, across, t)
+    head, tail = 0, count
+    while count > 0:
+        at = np.int64(queue[head])
+        head = head + 1 if head + 1 < queue.size else 0
+        count -= 1
+        waits[at] = 0
+        row, col = at // WIDE - 1, at % WIDE - 1
+        v = origin + row * stride + col
+        rim = row == 0 or col == 0 or row == rows - 1 or col == cols - 1
+        for code in range(8):
+            u = at + around[code]
+            offer = cost[at] + step_cost(rule, own[at], code)
+            child = parent[v + offsets[code]] == (code + 4) & 7
+            # A child always follows, so that what a cell is said to cost is what is driven.
+            if not offer + (0.0 if child else least) < cost[u] or not own[u] < np.inf:
+                continue
+            if not child and not _open(own, around, rule, corners, at, code):
+                continue
+            down, right = moved(code)
+            down += row
+            right += col
+            if rim and (down | right) & -SIDE:
+                other = t + (down >> BITS) * across + (right >> BITS)
+                # A child's tile sees that its total changes.
+                wanted[other] |= REHOOK if child else LOOK
+                continue
+            cost[u] = offer
+            i, j = first + (row << BITS) + col, first + (down << BITS) + right
+            piece[j] = piece[i]
+            local[j] = local[i] + step_cost(rule, own[at], code)
+            span[t] = max(span[t], local[j])
+            parent[v + offsets[code]] = (code + 4) & 7
+            if not waits[u]:
+                waits[u] = 1
+                queue[tail] = u
+                tail = tail + 1 if tail + 1 < queue.size else 0
+                count += 1
+
+
+@helper
+def _mend(t, grid, labels, pieces, tiles, bench):
+    """Look at a tile; returns whether a parent has changed."""
+    _, _, _, rule, corners = grid
+    piece = labels[1]
+    total = pieces[0]
+    exits, many, span, _, _, _, across = tiles
+    names, cost, own, less, queue, waits, _, _, _ = bench
+    _lay(t, grid, labels, total, tiles, bench)
+    _, rows, cols = corner_of(grid, across, t)
+    farthest = 0.0
+    for j in range(many[t]):
+        one = total[t * ROOM + np.int64(exits[t * ROOM + j]), TOTAL]
+        farthest = max(farthest, one if one < np.inf else 0.0)
+    least = (farthest + span[t]) * FINEST
+    diagonal = np.inf if rule == RULE_FOUR else (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
+    _find_less(*(cost, own, np.uint64(WIDE + 1), np.uint64((rows + 1) * WIDE - 1), diagonal, corners, least, less))
+    count = 0
+    for row in range(rows):
+        first = np.uint64((row + 1) * WIDE + 1)
+        some = np.int32(0)
+        for col in range(np.uint64(cols)):
+            some |= less[first + col]
+        if some:
+            for col in range(cols):
+                at = (row + 1) * WIDE + col + 1
+                if less[at] and _take_less(
+                    *(at, t, (row << BITS) + col, grid, labels, pieces, tiles, bench, least)
+                ):
+                    queue[count] = at
+                    waits[at] = 1
+                    count += 1
+    if count == 0:
+        return False
+    _spread(t, grid, labels, tiles, bench, count, least)
+    # Exits whose way leads on inside the tile by now are none any more; nobody leads over them.
+    kept = 0
+    for j in range(many[t]):
+        name = np.int64(exits[t * ROOM + j])
+        if name == ROOT_PIECE or piece[t * CELLS + names[name]] == name:
+            exits[t * ROOM + kept] = name
+            kept += 1
+    many[t] = kept
+    return True
+
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, i8[::1])")
+def mend_tiles(grid, labels, pieces, tiles, bench, which):
+    """Look at these tiles, in this order, and mend them. Returns how many had to be; `evaluate` is to follow.
+
+    Until then totals of a mended tile are what its exits were offered, and those of others may be too high.
+    """
+    wanted, falls = tiles[3], tiles[4]
+    mended = 0
+    for n in range(which.size):
+        t = which[n]
+        wanted[t] &= ~LOOK
+        falls[2, t] = 0.0
+        if _mend(t, grid, labels, pieces, tiles, bench):
+            wanted[t] |= REHOOK
+            mended += 1
+    return mended
+
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, i8, f4[::1], u1[::1], {BOX}, i8, f8, u1[::1])")
+def merge_parents(grid, labels, pieces, across, part, part_parent, box, old_root, way, changed):
+    """Take the parents of a window that was grown around a new root (`labels`), where its costs (`part`) are less
+    than the tree's and the way from the old root to the new one, `way` s.
+
+    changed  uint8 (n,), set to 1 for tiles in which a parent has changed
+    Costs stay what they are until `evaluate`. There is no cycle: with the lesser of the two costs, every
+    cell's parent has a lower one.
+    """
+    stride = grid[2]
+    parent, piece, local, root = labels
+    total = pieces[0]
+    row0, col0, row1, col1 = box
+    width = col1 - col0 + 2
+    for row in range(row0, row1):
+        for col in range(col0, col1):
+            i = (row - row0 + 1) * width + col - col0 + 1
+            if not part[i] < INF:
+                continue
+            v = (row + 1) * stride + col + 1
+            t = (row >> BITS) * across + (col >> BITS)
+            cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
+            cost = total[t * ROOM + np.int64(piece[t * CELLS + cell]), TOTAL] + local[t * CELLS + cell]
+            code = NONE if v == root else part_parent[i]
+            if (part[i] < cost + way or v == old_root) and parent[v] != code:
+                parent[v] = code
+                changed[t] = 1
+    t, _ = tile_of(root, stride, across)
+    changed[t] = 1
+    t, _ = tile_of(old_root, stride, across)
+    changed[t] = 1
+
+
+@kernel(f"({GRID}, {LABELLED}, i8, i8[::1], f4[::1], u1[::1])")
+def cut_ways(grid, labels, across, cells, before, changed):
+    """Cells that became lethal, and those whose step they forbid, lose their parent.
+
+    cells, before  padded cells whose cost changed, and their cell cost before, s
+    changed        uint8 (n,), set to 1 for tiles of cells that step into one of these, or are one
+    """
+    cell_cost, offsets, stride, _, corners = grid
+    parent = labels[0]
+    for j in range(cells.size):
+        x = cells[j]
+        t, _ = tile_of(x, stride, across)
+        changed[t] = 1
+        lethal = not cell_cost[x] < INF and before[j] < INF
+        if lethal:
+            parent[x] = NONE
+        for code in range(8):
+            v = x + offsets[code]
+            way = parent[v]
+            if way == NONE:
+                continue
+            into = way == (code + 4) & 7
+            squeezed = lethal and not corners and way & 1
+            squeezed = squeezed and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
+            if into or squeezed:
+                t, _ = tile_of(v, stride, across)
+                changed[t] = 1
+                if lethal:
+                    parent[v] = NONE
+
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i8[::1])")
+def drop_lost(grid, labels, pieces, tiles, which):
+    """Cells of these tiles that have no way lose their parent, and pieces that lead nowhere go."""
+    _, _, stride, _, _ = grid
+    parent, piece, local, root = labels
+    total = pieces[0]
+    exits, many, _, _, _, _, across = tiles
+    for n in range(which.size):
+        t = which[n]
+        origin, rows, cols = corner_of(grid, across, t)
+        for row in range(rows):
+            for col in range(cols):
+                i = t * CELLS + (row << BITS) + col
+                v = origin + row * stride + col
+                if not total[t * ROOM + np.int64(piece[i]), TOTAL] < np.inf and v != root:
+                    parent[v] = NONE
+                    piece[i] = NO_PIECE
+                    local[i] = 0.0
+        count = 0
+        for j in range(many[t]):
+            name = np.int64(exits[t * ROOM + j])
+            if total[t * ROOM + name, TOTAL] < np.inf:
+                exits[t * ROOM + count] = name
+                count += 1
+        many[t] = count

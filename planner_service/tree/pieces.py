@@ -1,0 +1,163 @@
+"""The exact tree of one target over a large map: it stays exact at every move, at a fraction of a growth.
+
+`kernels.pieces` says how it is laid out, `kernels.pieces_mend` why it ends, never has a cycle, and is optimal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels import pieces, pieces_mend
+from planner_service.kernels.cell_costs import cut_window
+from planner_service.kernels.layout import NONE, PaddedGrid, step_offsets
+from planner_service.kernels.pieces import CELLS, LOOK, NO_PIECE, REHOOK, ROOM, SIDE
+from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
+from planner_service.tree.growth import KeptScratch, grow_tree
+from swarm.errors import OutsideGridError
+from swarm.grid import Window
+
+MOST_LOOKS = 3.0
+"""A move or a repair gives way to a growth once it has looked at so many times as many tiles as the map has; to
+mend one counts double."""
+
+
+class PieceTree:
+    """The exact tree of one root on a `CostGrid` without climbs.
+
+    cost_grid  the map that the tree lies on. Whoever changes it calls `repair`, or `take`
+    parent     uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way. Empty
+               before the first `take`
+    root       the target's cell, of the grid; -1 before the first `take`
+    exact      whether all costs are the least there are. `take` sets it; a `move` or a `repair` that gives way
+    resets
+               it. The tree then still leads to its root, and states what is driven
+    """
+
+    def __init__(self, cost_grid: CostGrid) -> None:
+        if cost_grid.climbs is not None:
+            raise ValueError("a tree of pieces is for maps where a cell costs the same from everywhere")
+        self.cost_grid = cost_grid
+        self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
+        self.root = -1
+        self.exact = False
+        self._across = -(-cost_grid.grid.cols // SIDE)
+        self._count = count = -(-cost_grid.grid.rows // SIDE) * self._across
+        self._piece = np.full(count * CELLS, NO_PIECE, np.uint8)
+        self._local = np.zeros(count * CELLS, np.float64)
+        self._pieces = pieces.make_pieces(count)
+        exits, many, span = np.zeros(count * ROOM, np.uint8), np.zeros(count, np.int32), np.zeros(count, np.float64)
+        self._wanted = np.zeros(count, np.uint8)
+        falls, self._ends = np.zeros((3, count), np.float64), np.zeros((2, count), np.float64)
+        self._tiles: pieces.Tiles = exits, many, span, self._wanted, falls, self._ends, self._across
+        self._bench = pieces.make_bench()
+        self._now = 0
+        self._stack = np.empty(count * ROOM, np.int32)
+        self._todo = np.empty(count, np.int64)
+        self._kept: KeptScratch = {}
+        self.work = (0, 0, 0)
+        """Tiles looked at, tiles mended and rounds of the last call."""
+
+    @property
+    def _labels(self) -> pieces.Cells:
+        return self.parent, self._piece, self._local, self.cost_grid.pad(self.root)
+
+    def take(self, root: int, parent: NDArray[np.uint8]) -> None:
+        """Become the tree that somebody grew, exactly or nearly so, on the map as it is now; make it exact. The
+        array is taken over."""
+        self.cost_grid.check_root(root)
+        if parent.shape != (self.cost_grid.size,) or parent.dtype != np.uint8:
+            raise ValueError(f"parents of this map are uint8, {self.cost_grid.size} cells")
+        self.parent = parent
+        self.root = root
+        self._wanted[:] = LOOK | REHOOK
+        self._relabel(np.arange(self._count))
+        self._settle(math.inf)
+
+    def move(self, root: int, window: Window) -> int:
+        """Lead to a new root, exactly; the window holds it and the old root.
+
+        Returns tiles looked at; 0 if nothing was done because the old root has no way to the new one inside the
+        window; -1 if it gave way to a growth.
+        """
+        grid = self.cost_grid
+        if self.root < 0:
+            raise ValueError("the tree has no root: grow it first")
+        grid.check_root(root)
+        row0, col0, row1, col1 = box = window.row0, window.col0, window.row1, window.col1
+        if not (0 <= row0 < row1 <= grid.grid.rows and 0 <= col0 < col1 <= grid.grid.cols):
+            raise OutsideGridError(f"{window} is not inside the grid")
+        width = col1 - col0 + 2
+        start, old = self._in_window(root, window), self._in_window(self.root, window)
+        part = np.empty((row1 - row0 + 2) * width, np.float32)
+        bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
+        cost, parent = np.empty_like(part), np.full(part.size, NONE, np.uint8)
+        padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
+        grow_tree(padded, None, (*floats_of_bits(bits), grid.dearest_step), start, cost, parent, self._kept)
+        way = float(cost[old])
+        if not way < math.inf:
+            return 0
+        old_root = grid.pad(self.root)
+        self.root = root
+        changed = np.zeros(self._count, np.uint8)
+        pieces_mend.merge_parents(
+            *(grid.padded, self._labels, self._pieces, self._across),
+            *(cost, parent, box, old_root, way, changed),
+        )
+        self._relabel(np.flatnonzero(changed))
+        return self._settle(MOST_LOOKS * self._count + 64)
+
+    def _in_window(self, cell: int, window: Window) -> int:
+        row, col = self.cost_grid.grid.row_col(cell)
+        if not window.contains(row, col):
+            raise OutsideGridError(f"cell {cell} is not in {window}")
+        return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1
+
+    def repair(self, changes: Changes) -> int:
+        """Bring the tree up to date after the map changed. Returns tiles looked at, or -1 if it gave way to a
+        growth: then cells may be without a way that have one."""
+        if changes.cells.size == 0:
+            return 0
+        changed = np.zeros(self._count, np.uint8)
+        pieces_mend.cut_ways(
+            self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
+        )
+        self._relabel(np.flatnonzero(changed))
+        looked = self._settle(MOST_LOOKS * self._count + 64)
+        lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
+        pieces_mend.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
+        return looked
+
+    def cost_at(self, cells: Cells) -> NDArray[np.float64]:
+        """float64, s: cost-to-go of padded cells, inf where there is no way."""
+        costs = np.empty(cells.size, np.float64)
+        pieces.costs_at(self.cost_grid.padded, self._labels, self._pieces, self._across, cells, costs)
+        return costs
+
+    def _relabel(self, which: Cells) -> None:
+        pieces.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
+
+    def _settle(self, most: float) -> int:
+        grid = self.cost_grid.padded
+        order = np.argsort(self._ends[0])
+        looked = rounds = mended = 0
+        while True:
+            self._now += 1
+            rounds += 1
+            count = pieces.evaluate(
+                *(grid, self._labels, self._pieces, self._tiles, self._bench[0]),
+                *(self._now, order, self._stack, self._todo),
+            )
+            if not count or looked + 2 * mended > most:
+                break
+            todo = self._todo[:count]
+            todo = todo[np.argsort(self._ends[0][todo])]
+            looked += count
+            mended += pieces_mend.mend_tiles(
+                *(grid, self._labels, self._pieces, self._tiles, self._bench, todo),
+            )
+        self.exact = not count
+        self.work = looked, mended, rounds
+        return looked if self.exact else -1

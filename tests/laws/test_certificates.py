@@ -1,0 +1,118 @@
+"""What planners say of their routes holds under every rule, strategy and life; and checks see what does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.planner_strategies import random_pace
+
+from launch_scripts.bench.planning.certificate_checks import Findings, Life, run_checks
+from planner_service.kernels.layout import NONE
+from planner_service.tree.bounds import LowerBounds
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec
+
+GRID = GridSpec(40, 60, 2.0)
+
+
+def checked(seeds: range) -> Findings:
+    findings = Findings()
+    for seed in seeds:
+        Life(seed, findings).live()
+    return findings
+
+
+def test_no_life_breaks_a_law() -> None:
+    findings = checked(range(8))
+    assert findings.checks > 50_000
+    assert {law for law, many in findings.violations.items() if many} == set()
+
+
+@pytest.mark.thorough
+def test_no_life_of_many_breaks_a_law() -> None:
+    assert run_checks(3_000_000, seed=1000, seconds=300)["violations"] == 0
+
+
+def test_a_stated_cost_that_is_not_driven_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = CostToGoTree.time_at
+    monkeypatch.setattr(CostToGoTree, "time_at", lambda tree, cells: true(tree, cells) * (1 + 1e-5) + 1e-5)
+    found = checked(range(2)).violations
+    assert found["stated"] > 0
+    assert found["cut"] > 0
+
+
+def test_a_bound_that_is_too_high_is_counted_and_its_life_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = LowerBounds.at
+    monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1.01)
+    findings = checked(range(3, 5))
+    assert findings.violations["bound"] > 0
+    assert 0.009 < findings.worst["bound"] <= 0.01
+    assert findings.example["bound"] in (3, 4)
+
+
+def test_a_route_whose_numbers_depend_on_who_else_asks_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = CostToGoTree.time_at
+
+    def told(tree: CostToGoTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.nextafter(true(tree, cells), np.inf if cells.size > 1 else 0.0)
+
+    monkeypatch.setattr(CostToGoTree, "time_at", told)
+    assert checked(range(2)).violations["batch"] > 0
+
+
+def slow_rest(tree: CostToGoTree, cell: int) -> float:
+    """From the cell on, step by step, in float64."""
+    grid, total = tree.cost_grid, 0.0
+    steps = np.array((-grid.stride, 1 - grid.stride, 1, grid.stride + 1, grid.stride, grid.stride - 1, -1))
+    steps = np.append(steps, -grid.stride - 1)
+    while tree.parent[cell] != NONE:
+        code = tree.parent[cell]
+        cell += int(steps[code])
+        total += float(grid.cell_cost[cell]) * (np.sqrt(2.0) if code % 2 else 1.0)
+    return total if cell == grid.pad(tree.root) else np.inf
+
+
+def a_tree(seed: int, length_weight: float = 0.0) -> tuple[CostToGoTree, NDArray[np.float32]]:
+    pace = random_pace(np.random.default_rng(seed), GRID.rows, GRID.cols, 30.0, 0.25)
+    pace[20, 30] = 1.0
+    costs = CostGrid(GRID, PlannerConfig(length_weight=length_weight))
+    costs.load(pace)
+    tree = CostToGoTree(costs)
+    tree.grow(GRID.cell(20, 30))
+    return tree, pace
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_costs_asked_of_a_tree_are_those_of_its_parents_and_to_the_bit_the_same_alone(seed: int) -> None:
+    tree, _ = a_tree(seed)
+    tree.move(GRID.cell(20, 30), GRID.around(GRID.cell(20, 30), 5))
+    cells = tree.cost_grid.pad_all(np.random.default_rng(seed).permutation(GRID.cells)[:700])
+    together = tree.cost_at(cells)
+    np.testing.assert_allclose(together, [slow_rest(tree, cell) for cell in cells.tolist()], rtol=1e-13)
+    alone = [tree.cost_at(cells[n : n + 1])[0] for n in range(0, cells.size, 7)]
+    np.testing.assert_array_equal(together[::7], alone)
+    assert np.isinf(together).any()
+    assert tree.cost_at(np.array([tree.cost_grid.pad(tree.root)]))[0] == 0
+
+
+def test_a_tree_with_a_cycle_is_told_of_and_walked_no_further() -> None:
+    tree, _ = a_tree(1)
+    here = tree.cost_grid.pad(GRID.cell(5, 5))
+    tree.parent[here], tree.parent[here + 1] = 2, 6
+    with pytest.raises(AssertionError, match="broken"):
+        tree.cost_at(np.array([here]))
+
+
+def test_time_is_told_where_the_price_of_length_rounds_it_away() -> None:
+    """A metre costs a million times what a cell's time does: float32 sums of both hold no digit of the time."""
+    tree, pace = a_tree(2, length_weight=1e8)
+    costs = tree.cost_grid
+    cells = costs.pad_all(np.flatnonzero(np.isfinite(pace)))
+    cells = cells[np.isfinite(tree.cost_at(cells))]
+    walks = costs.walk(tree.parent, costs.pad(tree.root), cells, 0, costs.time_cost)
+    np.testing.assert_allclose(tree.time_at(cells), walks.driven, rtol=1e-13)
+    np.testing.assert_array_equal(costs.time_cost[costs.pad_all(np.arange(GRID.cells))], pace.reshape(-1) * 2)
+    assert costs.time_share == pytest.approx(2 * pace.min() / (2 * pace.min() + 2e8), rel=1e-6)

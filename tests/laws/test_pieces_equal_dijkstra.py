@@ -1,0 +1,149 @@
+"""A tree of pieces after any moves, jumps and marks: costs are scipy's, and what is driven along the parents."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from support import slow_twins as naive
+from support.planner_strategies import RULES, random_pace
+
+from planner_service.kernels.layout import NONE
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.pieces import PieceTree
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window
+
+FINE = 1e-11
+"""Relative. A step may be left 2**-46 of a cost too dear, and float64 rounds."""
+
+
+class Chase:
+    """A map, a target that moves on it, and its tree."""
+
+    def __init__(self, seed: int, most: int) -> None:
+        self.rng = rng = np.random.default_rng(seed)
+        rows, cols = (int(side) for side in rng.integers(max(most // 8, 1), most, 2))
+        self.rules = RULES[seed % 5]
+        ratio, walls = (1.0, 3.0, 30.0, 1000.0)[seed // 5 % 4], (0.0, 0.1, 0.25, 0.4)[seed // 3 % 4]
+        self.pace = random_pace(rng, rows, cols, ratio, walls)
+        if seed % 4 == 3:
+            self.pace[:] = np.where(np.isfinite(self.pace), np.float32(1.1), np.inf)  # many ways cost the same
+        self.ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**self.rules))
+        self.ground.load(self.pace)
+        self.cells = self.ground.pad_all(np.arange(rows * cols))
+        self.tree = PieceTree(self.ground)
+        self.gave_way = 0
+        self.grow(int(rng.choice(np.flatnonzero(np.isfinite(self.pace)))))
+
+    def grow(self, root: int) -> None:
+        grown = CostToGoTree(self.ground)
+        grown.grow(root)
+        self.tree.take(root, grown.parent)
+
+    def go(self, far: int) -> None:
+        rows, cols = self.pace.shape
+        row, col = divmod(self.tree.root, cols)
+        row = int(np.clip(row + self.rng.integers(-far, far + 1), 0, rows - 1))
+        col = int(np.clip(col + self.rng.integers(-far, far + 1), 0, cols - 1))
+        if not np.isfinite(self.pace[row, col]):
+            return
+        root = row * cols + col
+        if self.tree.move(root, self.ground.grid.around(root, 2 * far + int(self.rng.integers(1, 24)))) <= 0:
+            self.gave_way += 1
+            self.grow(root)
+
+    def mark(self) -> None:
+        rows, cols = self.pace.shape
+        windows = []
+        for _ in range(int(self.rng.integers(1, 4))):
+            row, col, side = (
+                int(self.rng.integers(rows)),
+                int(self.rng.integers(cols)),
+                int(self.rng.integers(1, 9)),
+            )
+            window = Window(row, col, min(row + side, rows), min(col + side, cols))
+            patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
+            factor = float(self.rng.choice([0.0, 0.3, 0.7, 3.0, np.inf]))
+            patch[:] = patch * np.float32(factor) if factor else random_pace(self.rng, *patch.shape, 5.0, 0.3)
+            windows.append(window)
+        if not np.isfinite(self.pace.flat[self.tree.root]):
+            self.pace.flat[self.tree.root] = 1.0
+        if self.tree.repair(self.ground.apply(self.pace, windows)) < 0:
+            self.gave_way += 1
+            self.grow(self.tree.root)
+
+    def check(self) -> None:
+        assert self.tree.exact
+        optimum = naive.cost_to_go(self.pace, self.tree.root, **self.rules).reshape(-1)
+        given = np.isfinite(optimum) & np.isfinite(self.pace.reshape(-1))
+        cost = self.tree.cost_at(self.cells)
+        np.testing.assert_array_equal(np.isfinite(cost), given)
+        leads = self.tree.parent[self.cells] != NONE
+        np.testing.assert_array_equal(leads, given & (np.arange(given.size) != self.tree.root))
+        np.testing.assert_allclose(cost[given], optimum[given], rtol=FINE)
+        starts = self.cells[given]
+        some = self.rng.permutation(starts.size)[:400]
+        root = self.ground.pad(self.tree.root)
+        walks = self.ground.walk(self.tree.parent, root, starts[some], 0, self.ground.cell_cost)
+        assert (walks.ends >= 0).all(), "a cycle, or a hole"
+        np.testing.assert_allclose(walks.driven, cost[given][some], rtol=FINE)
+        end = 0
+        for start, stop in zip(starts[some][:20], walks.ends[:20], strict=True):
+            cell = int(self.ground.unpad_all(np.array([start]))[0])
+            steps = walks.directions[end:stop].tobytes()
+            assert naive.follow(self.pace, cell, steps, **self.rules) is not None, "a step that no rule allows"
+            end = stop
+
+
+def chases(seeds: range, most: int, happenings: int) -> int:
+    """Returns how often trees gave way."""
+    gave_way = 0
+    for seed in seeds:
+        chase = Chase(seed, most)
+        chase.check()
+        for n in range(happenings):
+            chase.mark() if n % 3 == 2 else chase.go(12 if n % 4 == 3 else 1)
+            if n % 2:
+                chase.check()
+        gave_way += chase.gave_way
+    return gave_way
+
+
+def test_random_chases() -> None:
+    assert chases(range(20), 140, 6) < 40
+
+
+@pytest.mark.thorough
+def test_many_random_chases() -> None:
+    assert chases(range(1000, 1300), 260, 12) < 1200
+
+
+@pytest.mark.parametrize(
+    ("how", "count"),
+    [("NUMBA_DISABLE_JIT", 3), pytest.param("NUMBA_BOUNDSCHECK", 40, marks=pytest.mark.thorough)],
+)
+def test_slow_twin(how: str, count: int) -> None:
+    """Uncompiled, and with every index checked, the kernels do the same."""
+    program = f"from laws.test_pieces_equal_dijkstra import chases; chases(range({count}), 40, 3)"
+    paths = os.pathsep.join(path for path in sys.path if path)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program],
+        env={**os.environ, how: "1", "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_long_walk_stays_exact() -> None:
+    """Costs that change evenly, move after move, do not drift apart."""
+    chase = Chase(5, 200)
+    for _ in range(120):
+        chase.go(1)
+    chase.check()
