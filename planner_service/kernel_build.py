@@ -44,7 +44,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    wide_buckets.grow_by_wide_buckets,
+    StepKernel(wide_buckets.grow_by_wide_buckets, None),
     parents_from_root.find_parents_from_root,
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
@@ -99,9 +99,10 @@ def all_kernels() -> list[Kernel]:
 
 
 def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
-    return [
+    found = [
         (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each for each in kernels
     ]
+    return [kernel for kernel in found if kernel is not None]
 
 
 def name_of(kernel: Kernel) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import warnings
 
 import numpy as np
@@ -20,7 +19,7 @@ from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
-EXAMPLES = int(os.environ.get("X", "120"))
+EXAMPLES = 60
 TINY, HUGE = float(np.float32(1e-45)), float(np.finfo(np.float32).max)
 PACES = st.one_of(
     st.sampled_from([TINY, 1e-38, 1e-6, 1 / 340, 1.0, 100.0, 1e7, 1e30, HUGE, float("inf")]),
@@ -32,8 +31,8 @@ WEIGHTS = st.sampled_from([0.0, 0.0, 1e-30, 0.5, 1e12])
 
 def said_cost(pace: np.ndarray, resolution_m: float, weight: float) -> np.ndarray:
     """float64: what cells cost by the rule."""
-    cost = pace.astype(np.float64) * resolution_m + weight * resolution_m
-    return np.where(np.isfinite(pace), np.clip(cost, CHEAPEST_S, DEAREST_S), np.inf)
+    cost = np.maximum(pace.astype(np.float64) * resolution_m, CHEAPEST_S) + weight * resolution_m
+    return np.where(np.isfinite(pace), np.minimum(cost, DEAREST_S), np.inf)
 
 
 def assert_exact(ground: CostGrid, tree: CostToGoTree, target: int, rules: dict) -> None:
@@ -140,7 +139,7 @@ def test_shared_cell_costs_that_no_map_has_are_refused(bad: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("metres", "weight"), [(float("inf"), 0.0), (1.0, -1.0), (1.0, float("nan")), (1e200, 1e200)]
+    ("metres", "weight"), [(float("inf"), 0.0), (1e200, 0.0), (1.0, -1.0), (1.0, float("nan"))]
 )
 def test_lengths_that_no_map_has_are_refused(metres: float, weight: float) -> None:
     with pytest.raises(ValueError, match="length_weight"):
