@@ -26,6 +26,7 @@ from planner_service.kernels import (
     cell_costs,
     directed_buckets,
     lower_bounds,
+    mend,
     parents,
     parents_from_root,
     pieces,
@@ -58,6 +59,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
 takes longest comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
+    mend.mend,
     repair.repair,
     stride_growth.grow_strides,
     lower_bounds.bound_by_heuristic,
