@@ -180,7 +180,7 @@ def _strategy(plugin: Plugin, seed: int) -> Broken:
     told: list[str] = []
     config, grid = PlannerConfig(k_min=1), GridSpec(48, 48, 10.0)
     chance = np.random.default_rng(seed)
-    asked = [Growths(10.0**n, 1e7, int(chance.integers(1, 512)), 4**n) for n in (3, 9, 5, 11, 4)]
+    asked = [Growths(10.0**n, 1e7, int(chance.integers(1, 512)), 4**n, 10.0**n / 3) for n in (3, 9, 5, 11, 4)]
     world = StrategyWorld("t", grid, config)
 
     def choose() -> list[object]:
@@ -196,7 +196,7 @@ def _strategy(plugin: Plugin, seed: int) -> Broken:
     for n, growths in enumerate(asked * 4):
         target = grid.cell(24, 10 + n)
         tree.update(pace, target, [], 0)
-        tree.observe_full_ns(int(growths.full_ns))
+        tree.times.observe_full_ns(int(growths.full_ns))
         for route in tree.routes(asked_from):
             cells = walk(grid, route.start, route.directions)
             if route.status is RouteStatus.OK and (cells[-1] != target or np.isinf(pace.flat[cells]).any()):

@@ -26,15 +26,16 @@ from planner_service.kernels import (
     cell_costs,
     directed_buckets,
     lower_bounds,
+    mend,
     parents,
-    parents_from_root,
     pieces,
     pieces_mend,
-    radix_heap,
     repair,
     route_walk,
     stride_growth,
     stride_network,
+    tied_parents,
+    wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -45,7 +46,8 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, parents_from_root.find_parents_from_root),
+    StepKernel(wide_buckets.grow_by_wide_buckets, None),
+    tied_parents.untie_parents,
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
@@ -59,6 +61,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
 takes longest comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
+    mend.mend,
     repair.repair,
     stride_growth.grow_strides,
     lower_bounds.bound_by_heuristic,
@@ -103,9 +106,10 @@ def all_kernels() -> list[Kernel]:
 
 
 def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
-    return [
+    found = [
         (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each for each in kernels
     ]
+    return [kernel for kernel in found if kernel is not None]
 
 
 def name_of(kernel: Kernel) -> str:

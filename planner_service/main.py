@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 
+from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
-from planner_service.target_tree import is_slow_to_grow
 from shared_map.terrain.kept import kept_key
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus

@@ -10,7 +10,8 @@ from planner_service.actions import Action, FindStrides, GrowTree, Refusal
 from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
-from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree
+from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
+from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
 from planner_service.update import Update
@@ -113,6 +114,7 @@ class Planner:
         self._growth_ms = 0.0
         self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
         self._took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
+        self._moves_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._status_due_ns = 0
         for name in COUNTS:
             counters.count(name, 0)
@@ -127,7 +129,7 @@ class Planner:
     def set_pace(self, cpu_budget: float, push_s: float) -> None:
         """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
         self._push_ns = int(push_s * NS_PER_S)
-        self.tree.set_budget(cpu_budget)
+        self.tree.times.set_budget(cpu_budget)
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
@@ -262,22 +264,24 @@ class Planner:
     def _timed(self, update: Update, took_ns: int, now_ns: int) -> None:
         """Note what work on this thread cost."""
         if self._stopwatch is None:
-            took_ns = update.cells * MODEL_NS_PER_CELL
-        if update.kind == "full":
+            took_ns = update.cells * (MODEL_EXACT_NS_PER_CELL if update.kind == "exact" else MODEL_NS_PER_CELL)
+        if update.kind in ("full", "exact"):
             self._exact_ns = now_ns
-            self._record_growth(took_ns)
+            self._record_growth(took_ns, exact_move=update.kind == "exact")
             self._gaps.record_growth(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
         elif update.kind != "none":
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)
 
-    def _record_growth(self, took_ns: int) -> None:
+    def _record_growth(self, took_ns: int, exact_move: bool = False) -> None:
         self.counters.count("growths")
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
         if self._stopwatch is not None:
-            self._took_ns.append(took_ns)
-            self.tree.observe_full_ns(sorted(self._took_ns)[len(self._took_ns) // 2])
+            took = self._moves_took_ns if exact_move else self._took_ns
+            took.append(took_ns)
+            median_ns = sorted(took)[len(took) // 2]
+            (self.tree.times.observe_exact_ns if exact_move else self.tree.times.observe_full_ns)(median_ns)
 
     def _now(self) -> int:
         return 0 if self._stopwatch is None else self._stopwatch()

@@ -170,7 +170,7 @@ class PlannerService:
         self._answer(now_ns)
         if self._search is not None and not self._searching:
             self._searching = True
-            self._worker.submit(_SEARCH, self._search.step, self._post, self._planner.tree.measured_model_ns())
+            self._worker.submit(_SEARCH, self._search.step, self._post, self._planner.tree.times.model_ns)
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]
         if self._planner.tree.ready and not self._served:
@@ -242,7 +242,7 @@ class PlannerService:
         for action in actions:
             match action:
                 case GrowTree(job):
-                    self._worker.submit(_GROW, job, self._post, self._planner.tree.measured_model_ns())
+                    self._worker.submit(_GROW, job, self._post, self._planner.tree.times.model_ns)
                 case FindStrides(search):
                     self._search = search
                 case PushedRoute(vehicle=vehicle) as pushed:

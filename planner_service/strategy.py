@@ -25,6 +25,9 @@ class OnMove(Enum):
 
     WHOLE_TREE = "whole tree"
     """Brute force, section 3.3.1: the exact tree, with every move."""
+    EXACT_MOVE = "exact move"
+    """Ours: the exact tree, with every move, from the one that there is: a small window around the old and the new
+    root, then every cost along the parents, and the few cells that a better neighbour has now."""
     BLOCK_WINDOW = "block window"
     """Variable range, section 3.3.2: a window around the target, as wide as the largest block of 2**k cells whose
     border the target crossed."""
@@ -40,7 +43,7 @@ class FullGrowth(Enum):
     EVERY_FEW_MOVES = "every few moves"
     """Every `planner.full_every` moves, on small maps sooner."""
     WITHIN_BUDGET = "within the budget"
-    """As often as `planner.cpu_budget` allows, but no sooner than a window as wide as the map were due."""
+    """As often as `planner.cpu_budget` allows."""
 
 
 class WidestWindow(Enum):
@@ -68,13 +71,14 @@ class StrategyRow:
     renews_loose_bounds: bool = False
 
     @property
+    def is_exact(self) -> bool:
+        """Whether the tree is exact after every move."""
+        return self.on_move in (OnMove.WHOLE_TREE, OnMove.EXACT_MOVE)
+
+    @property
     def grows_whole_trees(self) -> bool:
         """Whether whole trees are grown without a vehicle's asking: with every move, in turn, or for networks."""
-        return (
-            self.on_move is OnMove.WHOLE_TREE
-            or self.full_growth is not FullGrowth.WHEN_FORCED
-            or self.thins_far_cells
-        )
+        return self.is_exact or self.full_growth is not FullGrowth.WHEN_FORCED or self.thins_far_cells
 
     def row(self, growths: Growths) -> StrategyRow:
         """Itself: a strategy of one row."""
@@ -89,12 +93,14 @@ class Growths:
     budget_ns     CPU time that a tick may take, by `planner.cpu_budget`
     widest_cells  how far the widest window reaches that is grown without a worker
     map_cells     cells of the map
+    exact_ns      CPU time that an exact move takes: in proportion to `full_ns` until one has been measured
     """
 
     full_ns: float
     budget_ns: float
     widest_cells: int
     map_cells: int
+    exact_ns: float
 
 
 class Strategy(Protocol):
@@ -120,6 +126,7 @@ class StrategyWorld:
 
 ROWS: Mapping[str, StrategyRow] = {
     "full": StrategyRow(OnMove.WHOLE_TREE),
+    "exact": StrategyRow(OnMove.EXACT_MOVE),
     "variable_range": StrategyRow(OnMove.BLOCK_WINDOW),
     "multi_resolution": StrategyRow(
         OnMove.SCHEDULED_WINDOW, thins_far_cells=True, widest_window=WidestWindow.SHARE_OF_MAP
@@ -133,11 +140,11 @@ Stage = Literal["exact", "rotate", "coarsen"]
 
 _ROTATE = StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET, renews_loose_bounds=True)
 STAGES: Mapping[Stage, StrategyRow] = {
-    "exact": StrategyRow(OnMove.WHOLE_TREE, renews_loose_bounds=True),
+    "exact": StrategyRow(OnMove.EXACT_MOVE, renews_loose_bounds=True),
     "rotate": _ROTATE,
     "coarsen": replace(_ROTATE, thins_far_cells=True),
 }
-"""`auto`: exact trees while one fits into a tick; then windows, with full growths in turn; and where these come so
+"""`auto`: exact moves while one fits into a tick; then windows, with exact trees in turn; and where these come so
 seldom that the target leaves what the widest window can make up for, strides beyond that."""
 
 HYSTERESIS = 0.7
@@ -159,7 +166,7 @@ class Auto:
         slowest_rotation = max(growths.budget_ns * growths.widest_cells / AHEAD, slowest_exact)
         if full_ns > slowest_rotation * (HYSTERESIS if self.stage == "coarsen" else 1.0):
             self.stage = "coarsen"
-        elif full_ns > slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
+        elif growths.exact_ns > slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
             self.stage = "rotate"
         else:
             self.stage = "exact"
@@ -181,7 +188,7 @@ def strategy_of(plugin: Plugin, world: StrategyWorld, tell: Tell) -> Strategy:
 
 
 class PluginStrategy:
-    """The rows of a plug-in; whole trees, which are exact, once it has failed."""
+    """The rows of a plug-in; exact moves once it has failed."""
 
     def __init__(self, strategy: Strategy, guard: Guard) -> None:
         self._strategy = strategy
@@ -203,4 +210,4 @@ def _checked(row: object) -> StrategyRow:
 
 def whole_trees_only(row: StrategyRow) -> StrategyRow:
     """A row until other kernels are compiled: only whole trees are grown."""
-    return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds)
+    return StrategyRow(OnMove.WHOLE_TREE, renews_loose_bounds=row.renews_loose_bounds)

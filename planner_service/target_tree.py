@@ -7,7 +7,6 @@ the tree that `routes` reads has no cycle and crosses no lethal cell.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,41 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
-from planner_service.strategy import (
-    STRATEGIES,
-    FullGrowth,
-    Growths,
-    OnMove,
-    Strategy,
-    StrategyRow,
-    WidestWindow,
-    whole_trees_only,
-)
+from planner_service.growth_times import GrowthTimes
+from planner_service.strategy import FullGrowth, OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.pieces import PieceTree
 from planner_service.tree.route_reading import read_routes
-from planner_service.tree.strides import FINE, LEAST, StrideSearch, StrideShelf, StrideUpkeep
-from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
+from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
+from planner_service.tree.windows import WindowSchedule, block_half, exact_half
 from planner_service.update import Update
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import NO_TARGET, RouteBatch
-
-MODEL_NS_PER_CELL = 15
-"""What a full growth costs per cell, for choices that must come out alike on every machine."""
-INLINE_NS = 100_000_000
-"""What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
-takes less, and where there is a worker, so is any other."""
-FINE_SHARE = 16
-"""How far the fine windows of multi-resolution reach, as a share of the map's side."""
-
-
-def is_slow_to_grow(grid: GridSpec) -> bool:
-    """Whether a whole tree of this grid is nothing to be grown between two answers."""
-    return grid.cells * MODEL_NS_PER_CELL > INLINE_NS
 
 
 class TargetTree:
@@ -63,6 +42,7 @@ class TargetTree:
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
                  the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
     chosen_by    the strategy; the built-in one that `config` names if not given
+    times        what growths take, to be told; by these the strategy chooses
     last_gaps    float64, driven cost over optimum of what was offered to each followed vehicle, measured by the
                  last `adopt`; empty before
     """
@@ -89,39 +69,30 @@ class TargetTree:
         # The cell costs of the map as it was last told, and whether it was told at all.
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
-        self._tree = CostToGoTree(self._costs)
+        self._tree: CostToGoTree | PieceTree = CostToGoTree(self._costs)
         # The tree is of no use and must be grown: before the first, and when the map changed without a target.
         self._stale = True
-        # Moves of the target since the last full growth, and where that was rooted.
+        # Moves of the target since the whole tree was last exact.
         self._moves = 0
-        self._full_root = 0
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
         # A full growth was left to the worker: until it is adopted, moves are not followed.
         self._left_to_worker = False
         # The networks of strategies that thin far cells.
         self._strides = StrideUpkeep()
-        # What a full growth takes, ns: the model's figure until `observe_full_ns` tells a measured one.
-        self._full_ns = self.measured_model_ns()
+        self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
-        self._schedule = WindowSchedule(grid, self._narrowest)
-        self._budget_ns = config.cpu_budget * 1e9 / config.tick_hz
-        self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
-        # The row that the strategy has chosen: by its model until a growth has been measured.
-        self._row = StrategyRow(OnMove.WHOLE_TREE)
-        self._choose_row()
+        self._schedule = WindowSchedule(grid, self.times.narrowest)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
+        # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
+        self._is_better_bound = False
 
     @property
     def strategy(self) -> StrategyRow:
         """The row in force now; it changes with `observe_full_ns`, as under `auto`."""
-        return self._row if self._all_kernels() else whole_trees_only(self._row)
-
-    def set_budget(self, cpu_budget: float) -> None:
-        """The share of one core that this tree may take from now on, under `auto`."""
-        self._budget_ns = cpu_budget * 1e9 / self._config.tick_hz
-        self._choose_row()
+        row = self.times.row
+        return row if self._all_kernels() else whole_trees_only(row)
 
     def share(self, cell_cost: Floats) -> None:
         """Begin with the cell costs of the map as it is before any mark, which other processes share; `update` is
@@ -149,8 +120,9 @@ class TargetTree:
         if self._stale:
             return self._grow_full(target_cell)
         self._moves += moved
-        whole = self.strategy.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact)
-        if whole and self._is_quick(self._grid.cells):
+        row = self.strategy
+        whole = row.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact)
+        if whole and self.times.is_quick(self._grid.cells):
             return self._grow_full(target_cell)
         repaired = self._repair(changes)
         if repaired is None:
@@ -158,20 +130,26 @@ class TargetTree:
         done = repaired
         if whole:
             done = self._leave_to_worker()
+        elif row.on_move is OnMove.EXACT_MOVE and (moved or not self._tree.exact):
+            done = self._move_exactly(target_cell)
         elif moved:
             done = self._move(target_cell)
+        if self._is_full_due(done):
+            done = self._renew(done)
         if repaired.kind != "none" and done.kind == "none":
             done = Update(repaired.kind, repaired.window, repaired.cells, done.wants_full)
-        elif repaired.kind != "none" and done.kind != "full" and moved:
-            done = Update("window", done.window.union(repaired.window), done.cells + repaired.cells)
-        return Update(done.kind, done.window, done.cells, done.wants_full or self._is_full_due(done))
+        elif repaired.kind != "none" and done.kind not in ("full", "exact") and moved:
+            done = Update(
+                "window", done.window.union(repaired.window), done.cells + repaired.cells, done.wants_full
+            )
+        return done
 
     def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
         """A full growth for a worker, on the map as it was told last: see `growth_job`."""
         leads_there = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
-        return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered)
+        return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces)
 
     @property
     def wants_strides(self) -> bool:
@@ -211,23 +189,26 @@ class TargetTree:
         tree = self._tree
         if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
             repaired = None if self._stale else self._repair(changes)
-            if repaired is None or self._is_quick(self._grid.cells):
+            if repaired is None or self.times.is_quick(self._grid.cells):
                 return self._grow_full(target_cell)
             return self._leave_to_worker() if target_cell != tree.root else repaired
-        tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
+        tree = self._tree = self._taken(grown)
         self._note_full_growth(grown.target_cell)
         self._bounds.take(grown.heuristic)
+        self._is_better_bound = False
         self._learn_bounds(since)
         self._stale = False
         moved = target_cell != tree.root
-        whole = moved and (self.strategy.on_move is OnMove.WHOLE_TREE or not tree.fine)
-        if whole and self._is_quick(self._grid.cells):
+        row = self.strategy
+        whole = moved and (row.on_move is OnMove.WHOLE_TREE or not tree.fine)
+        if whole and self.times.is_quick(self._grid.cells):
             return self._grow_full(target_cell)
         repaired = self._repair(since)
         if repaired is None:
             return self._grow_full(target_cell)
         cells = self._grid.cells + repaired.cells
-        then = self._leave_to_worker() if whole else self._move(target_cell) if moved else repaired
+        follow = self._move_exactly if row.on_move is OnMove.EXACT_MOVE else self._move
+        then = self._leave_to_worker() if whole else follow(target_cell) if moved else repaired
         return Update("full", self._grid.window, cells + then.cells * moved, then.wants_full)
 
     def force(self, cells: Any) -> Update:
@@ -242,8 +223,10 @@ class TargetTree:
         wanted = self._inside(cells)
         if wanted.size == 0 or self._tree.exact:
             return Update("none")
-        if self._full_ns <= INLINE_NS:
+        if self.times.is_short(self.times.full_ns):
             return self._grow_full(target)
+        if self._can_mend and self.times.is_short(self.times.exact_ns):
+            return self._mend()
         row, col = self._grid.row_col(target)
         rows, cols = np.divmod(wanted, self._grid.cols)
         half = int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) * 5 // 4 + 1
@@ -255,19 +238,6 @@ class TargetTree:
         if not grown_cells:
             return Update("none", wants_full=not self._job_out)
         return Update("forced", window, grown_cells, wants_full=not self._job_out)
-
-    def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took, for the strategy to choose by; not one that found networks too. A
-        simulation does not call it."""
-        self._full_ns = max(1, took_ns)
-        self._choose_row()
-
-    def _choose_row(self) -> None:
-        self._row = self._chosen_by.row(Growths(self._full_ns, self._budget_ns, self._widest, self._grid.cells))
-
-    def measured_model_ns(self) -> int:
-        """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
-        return self._grid.cells * MODEL_NS_PER_CELL
 
     # --- answers ------------------------------------------------------------------------------------------------
 
@@ -291,24 +261,8 @@ class TargetTree:
     # --- how ----------------------------------------------------------------------------------------------------
 
     @property
-    def _narrowest(self) -> int:
-        """How far the narrowest scheduled window reaches, in cells."""
-        return 4 << self._config.k_min
-
-    @property
-    def _fine(self) -> int:
-        """How far strides are so short that all cells are grown, in cells: no less than the least block. On a map
-        where that is half of it there are no others."""
-        return max(FINE << self._config.k_min, 1 << LEAST)
-
-    @property
     def _widest(self) -> int:
-        """How far the widest window reaches that is grown without a worker, in cells."""
-        if self.strategy.widest_window is WidestWindow.SHARE_OF_MAP:
-            return max(self._fine if 4 * self._fine <= self._side else self._narrowest, self._side // FINE_SHARE)
-        # Over half of the map, a full growth costs as much: that is the worker's.
-        share = min(INLINE_NS / self._full_ns, 1.0) / 2
-        return math.isqrt(int(share * self._grid.cells)) // 2
+        return self.times.widest(self.strategy.widest_window)
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
         """Take the map's changes. None the first time: everything is new."""
@@ -337,10 +291,6 @@ class TargetTree:
             self._stale = True
         return self.ready
 
-    def _is_quick(self, cells: int) -> bool:
-        """Whether so many cells may be grown on the thread that answers."""
-        return not self._has_worker or cells * self._full_ns <= INLINE_NS * self._grid.cells
-
     def _leave_to_worker(self) -> Update:
         """Ask for a full growth, and lead to the old root until it is adopted."""
         self.target_cell = self._tree.root
@@ -350,19 +300,48 @@ class TargetTree:
     def _grow_full(self, target_cell: int) -> Update:
         """Grow the whole tree: here or, where that would take too long, on the worker. The one that there is serves
         no more."""
-        if not self._is_quick(self._grid.cells):
+        if not self.times.is_quick(self._grid.cells):
             self._stale, self.ready, self.target_cell = True, False, None
             return Update("none", wants_full=not self._job_out)
+        if isinstance(self._tree, PieceTree) is not self._in_pieces:
+            self._tree = PieceTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
         self._tree.grow(target_cell)
         self._stale = False
         self._note_full_growth(target_cell)
-        if self.strategy.on_move is not OnMove.WHOLE_TREE:
-            self._bounds.take(self._tree.cost.copy())
+        self._bounds_are_old()
         return Update("full", self._grid.window, self._grid.cells)
+
+    @property
+    def _in_pieces(self) -> bool:
+        """Whether the row in force wants the tree in pieces."""
+        return self.times.in_pieces and self.strategy.on_move is OnMove.EXACT_MOVE
+
+    def _taken(self, grown: GrownTree) -> CostToGoTree | PieceTree:
+        """What a worker grew, as a tree on the map as it is now."""
+        if grown.pieces is not None and self._in_pieces:
+            grown.pieces.cost_grid = self._costs
+            return grown.pieces
+        tree = self._tree if isinstance(self._tree, CostToGoTree) else CostToGoTree(self._costs)
+        tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
+        return tree
+
+    def _whole(self) -> CostToGoTree:
+        """The tree, no longer in pieces."""
+        tree = self._tree
+        if isinstance(tree, PieceTree):
+            exact = tree.exact
+            self._tree = whole = CostToGoTree(self._costs)
+            whole.take_parents(tree.root, tree.parent)
+            whole.exact = exact
+            return whole
+        return tree
+
+    def _bounds_are_old(self) -> None:
+        self._bounds.forget()
+        self._is_better_bound = True
 
     def _note_full_growth(self, root: int) -> None:
         self._moves = 0
-        self._full_root = root
         self._schedule.note_grown(root, self._side)
 
     def _repair(self, changes: Changes | None) -> Update | None:
@@ -384,61 +363,119 @@ class TargetTree:
         window = Window(int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1)
         return Update("repair", window, visited)
 
+    @property
+    def _can_mend(self) -> bool:
+        """Whether the tree can be made exact here and now, by the parents that it has."""
+        return self.times.mends_quickly and self._all_kernels() and self._tree.fine
+
+    def _mend(self) -> Update:
+        """Make the tree exact; where a growth costs less, grow it or ask a worker to."""
+        tree = self._tree
+        cells = tree.mend()
+        if not tree.exact:
+            if not tree.fine or self.times.is_quick(self._grid.cells):
+                return self._grow_full(tree.root)
+            return Update("window", self._grid.window, cells, wants_full=not self._job_out)
+        self._note_full_growth(tree.root)
+        self._bounds_are_old()
+        return Update("exact", self._grid.window, cells)
+
+    def _renew(self, done: Update) -> Update:
+        """The whole tree is due, after what was `done`."""
+        if not self._can_mend or self._left_to_worker:
+            return Update(done.kind, done.window, done.cells, wants_full=True)
+        mended = self._mend()
+        return Update(mended.kind, mended.window, done.cells + mended.cells, mended.wants_full)
+
+    def _move_exactly(self, target_cell: int) -> Update:
+        """Lead to the target's new cell, exactly."""
+        if self._left_to_worker or not self._can_mend:
+            return self._leave_to_worker() if self._left_to_worker else self._give_up(target_cell)
+        if self._in_pieces and not isinstance(self._tree, PieceTree):
+            if not self.times.is_quick(self._grid.cells):
+                return self._leave_to_worker()
+            pieces = PieceTree(self._costs)
+            pieces.take(self._tree.root, self._tree.parent)
+            self._tree = pieces
+        cells = 0
+        if target_cell != self._tree.root:
+            half = exact_half(self._grid, self._tree.root, target_cell)
+            window, cells = self._grow_window(target_cell, half)
+            if window is None:
+                return self._give_up(target_cell)
+        mended = self._mend()
+        return Update(mended.kind, mended.window, mended.cells + cells, mended.wants_full)
+
     def _move(self, target_cell: int) -> Update:
         """Grow a window around the target's new cell, a wider one where that fails, at last the whole tree."""
-        tree = self._tree
-        if self._left_to_worker or not (tree.fine or self._is_quick(self._grid.cells)):
+        tree = self._whole()
+        if self._left_to_worker or not (tree.fine or self.times.is_quick(self._grid.cells)):
             return self._leave_to_worker()
         if not tree.fine:
             return self._grow_full(target_cell)
         if not tree.precise:
             tree.relabel()
+        if self._is_better_bound and tree.exact:
+            self._bounds.take(tree.cost.copy())
+        self._is_better_bound = False
         half, far = self._reach(target_cell)
         network = self._strides.network if far > half else None
-        window = self._grid.around(target_cell, half)
+        window, cells = self._grow_window(target_cell, half)
+        if window is None:
+            return self._give_up(target_cell)
+        if network is not None:
+            self._schedule.note_grown(target_cell, far)
+            cells += tree.grow_strides(window, network, far)
+            return Update("coarse", self._grid.around(target_cell, far), cells)
+        return Update("window", window, cells)
+
+    def _grow_window(self, target_cell: int, half: int) -> tuple[Window | None, int]:
+        """Lead to the target's new cell by a window that reaches so far to every side, or further where that does
+        not connect it to the old one. Returns it, None where a growth of the whole tree costs less; and the cells
+        grown."""
         cells = 0
-        while window.cells * 2 < self._grid.cells and self._is_quick(window.cells):
-            connected = tree.move(target_cell, window)
+        window = self._grid.around(target_cell, half)
+        while window.cells * 2 < self._grid.cells and self.times.is_quick(window.cells):
+            connected = self._tree.move(target_cell, window)
             cells += window.cells
-            if connected and network is not None:
-                self._schedule.note_grown(target_cell, far)
-                cells += tree.grow_strides(window, network, far)
-                return Update("coarse", self._grid.around(target_cell, far), cells)
             if connected:
                 self._schedule.note_grown(target_cell, half)
-                return Update("window", window, cells)
+                return window, cells
             half *= 2
             window = self._grid.around(target_cell, half)
-        return self._grow_full(target_cell) if self._is_quick(self._grid.cells) else self._leave_to_worker()
+        return None, cells
+
+    def _give_up(self, target_cell: int) -> Update:
+        """No window leads to the target's new cell."""
+        return self._grow_full(target_cell) if self.times.is_quick(self._grid.cells) else self._leave_to_worker()
 
     def _reach(self, target_cell: int) -> tuple[int, int]:
         """How far to every side of the target all cells are grown now, and how far strides are: no further
         where both are the same."""
-        row, old = self.strategy, self._tree.root
-        has_strides = row.thins_far_cells and self._strides.network is not None and 4 * self._fine <= self._side
+        row, old, fine = self.strategy, self._tree.root, self.times.fine
+        has_strides = row.thins_far_cells and self._strides.network is not None and 4 * fine <= self._side
         least = 2 * self._grid.distance_cells(old, target_cell)
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, target_cell, self._config.k_min)
-            return (min(half, max(self._fine, least)) if has_strides else half), half
+            return (min(half, max(fine, least)) if has_strides else half), half
         widest = self._widest
         if has_strides and self._schedule.beyond(target_cell, widest):
-            return max(widest, self._fine, least), self._side
+            return max(widest, fine, least), self._side
         half = max(self._schedule.half(target_cell, widest), least)
         return half, half
 
     def _is_full_due(self, done: Update) -> bool:
         """Whether to ask for a full growth after what was done: the row says when, unless one is under way."""
-        if done.kind == "full" or self._job_out:
+        if done.kind in ("full", "exact") or done.wants_full or self._job_out:
             return False
         row = self.strategy
         if row.full_growth is FullGrowth.EVERY_FEW_MOVES:
             # On a small map a full growth is due as soon as windows have cost half as much.
-            twice = 2 * (2 * self._narrowest) ** 2
+            twice = 2 * (2 * self.times.narrowest) ** 2
             return self._moves >= min(self._config.full_every, self._grid.cells // twice + 1)
         if row.full_growth is FullGrowth.WITHIN_BUDGET:
-            # As often as the budget allows, but no sooner than the whole map were due as a window.
-            come = self._grid.distance_cells(self._full_root, self._tree.root)
-            return 2 * AHEAD * come >= self._side and self._moves * self._budget_ns >= self._full_ns
+            costs_ns = self.times.exact_ns if self._can_mend else self.times.full_ns
+            return self._moves > 0 and self._moves * self.times.budget_ns >= costs_ns
         return False
 
     def _inside(self, cells: Any) -> NDArray[np.int64]:

@@ -8,15 +8,15 @@ from typing import Literal
 from swarm.grid import Window
 
 _EMPTY = Window(0, 0, 0, 0)
-Kind = Literal["none", "full", "window", "repair", "coarse", "forced"]
+Kind = Literal["none", "full", "exact", "window", "repair", "coarse", "forced"]
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
     """What one call changed.
 
-    kind        the dearest thing that was done: nothing, the exact tree, a window, a repair after map changes, a
-                window and strides beyond it, a window that was forced
+    kind        the dearest thing that was done: nothing, the whole tree grown, the tree made exact by its parents,
+                a window, a repair after map changes, a window and strides beyond it, a window that was forced
     window      the cells that may have a new cost or parent; empty if none
     cells       how many cells the kernels visited
     wants_full  please run `full_job` on a worker, and `adopt` what it returns

@@ -16,7 +16,7 @@ _ONE = np.uint64(1)
 
 
 @helper
-def _parents_of_four(cell_cost, cost, s, first, last, parent):
+def _parents_of_four(cell_cost, cost, s, first, last, parent, least):
     for i in range(first, last):
         best = cost[i - s] + cell_cost[i - s]
         code = np.uint8(0)
@@ -30,10 +30,12 @@ def _parents_of_four(cell_cost, cost, s, first, last, parent):
         code = np.uint8(6) if key < best else code
         best = min(best, key)
         parent[i] = code if max(cost[i], best) < INF else NONE
+        if least is not None:
+            least[i - first] = best
 
 
 @helper
-def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
+def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
     """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
     vectorises."""
     for i in range(first, last):
@@ -66,6 +68,8 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
         code = np.uint8(7) if key < best else code
         best = min(best, key)
         parent[i] = code if max(cost[i], best) < INF else NONE
+        if least is not None:
+            least[i - first] = best
 
 
 @helper
@@ -87,7 +91,7 @@ def _shut_diagonals(cell_cost, climbs, first, n, one, other):
 
 
 @helper
-def _parents_by_climb(grid, climbs, cost, first, last, parent):
+def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
     """As the others here, direction by direction, so that it vectorises."""
     cell_cost, offsets, _, rule, corners = grid
     best, codes = climbs[4], climbs[5]
@@ -105,20 +109,25 @@ def _parents_by_climb(grid, climbs, cost, first, last, parent):
         _take_less(climbs, n, np.float32(k))
     for i in range(n):
         parent[first + i] = np.uint8(codes[i]) if cost[first + i] < INF else NONE
+        if least is not None:
+            least[i] = best[i]
 
 
 @helper
-def point_row_to_parents(grid, climbs, cost, first, last, parent):
-    """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out."""
+def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
+    """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out.
+
+    least  float32 (last - first,), written: the least that each is offered, s; None where nobody asks
+    """
     cell_cost, _, stride, rule, corners = grid
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
     if climbs is not None:
-        _parents_by_climb(grid, climbs, cost, begin, end, parent)
+        _parents_by_climb(grid, climbs, cost, begin, end, parent, least)
     elif rule == RULE_FOUR:
-        _parents_of_four(cell_cost, cost, s, begin, end, parent)
+        _parents_of_four(cell_cost, cost, s, begin, end, parent, least)
     else:
         limit = INF if corners else HUGE
-        _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent)
+        _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
 
 
 @step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, {BOX}, u1[::1])", CLIMBS)
@@ -129,5 +138,5 @@ def point_to_parents(grid, climbs, cost, root, box, parent):
     stride = grid[2]
     for row in range(row0, row1):
         start = (row + 1) * stride + 1
-        point_row_to_parents(grid, climbs, cost, start + col0, start + col1, parent)
+        point_row_to_parents(grid, climbs, cost, start + col0, start + col1, parent, None)
     parent[root] = NONE

@@ -33,7 +33,7 @@ from planner_service.kernels.parents import point_row_to_parents
 
 _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)
-_FINE = np.uint64(44)
+FINE_ROW = np.uint64(44)
 _STRAIGHT = np.float32(1.0)
 
 
@@ -41,7 +41,7 @@ Rows = tuple[NDArray[np.int64], NDArray[np.int64]]
 Entries = tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.int32]]
 Scratch = tuple[Rows, Rows, NDArray[np.int64], NDArray[np.uint32], NDArray[np.float32], Entries, NDArray[np.int32]]
 _ROWS = "UniTuple(i8[::1], 2)"
-_SCRATCH = f"Tuple(({_ROWS}, {_ROWS}, i8[::1], u4[::1], f4[::1], Tuple((f4[::1], u4[::1], i4[::1])), i4[::1]))"
+SCRATCH = f"Tuple(({_ROWS}, {_ROWS}, i8[::1], u4[::1], f4[::1], Tuple((f4[::1], u4[::1], i4[::1])), i4[::1]))"
 
 
 def make_scratch(size: int, stride: int, buckets: int) -> Scratch:
@@ -58,7 +58,7 @@ def make_scratch(size: int, stride: int, buckets: int) -> Scratch:
 
 
 @helper
-def _clear(rows, size):
+def clear_rows(rows, size):
     """`rows` := of nothing, in arrays of `size` padded cells."""
     first, last = rows
     for row in range(first.size):
@@ -86,7 +86,7 @@ def _any_cheaper(cell_cost, changed, before):
 @helper
 def _note_cheaper(rows, cell_cost, stride, changed, before):
     """`rows` := of the cells that got cheaper."""
-    _clear(rows, cell_cost.size)
+    clear_rows(rows, cell_cost.size)
     first, last = rows
     for i in range(changed.size):
         cell = changed[i]
@@ -97,7 +97,7 @@ def _note_cheaper(rows, cell_cost, stride, changed, before):
 
 
 @helper
-def _near_rows(first, last):
+def near_rows(first, last):
     """The inner rows in which something has changed, the rows beside these, and all between: begin <= row < end."""
     begin, end = 0, first.size
     while begin < end and last[begin] < first[begin]:
@@ -108,7 +108,7 @@ def _near_rows(first, last):
 
 
 @helper
-def _span(first, last, stride, row):
+def span_near(first, last, stride, row):
     """The cells of a row that something has changed about in it or in the rows beside it, and their neighbours:
     begin <= cell < end, empty if there are none."""
     # Columns, so that three rows can be laid over each other.
@@ -165,9 +165,9 @@ def _sweep(grid, climbs, cost, rows, floor, best, lowered, count):
     cell_cost, _, stride, rule, corners = grid
     first, last = rows
     diagonal = diagonal_length(rule)
-    from_row, to_row = _near_rows(first, last)
+    from_row, to_row = near_rows(first, last)
     for row in range(from_row, to_row):
-        begin, end = _span(first, last, stride, row)
+        begin, end = span_near(first, last, stride, row)
         if end <= begin:
             continue
         s, at, until = np.uint64(stride), np.uint64(begin), np.uint64(end)
@@ -202,19 +202,19 @@ def _begin_anew(keys, behind, heads, overflow, inverse):
 
 
 @helper
-def _spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, heads):
+def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, heads):
     """Let costs that have fallen spread, until no cell is offered less than it costs.
 
     buckets  width: up to the lowest cell cost no cell is served twice; beyond, costs are right too
     lowered  `count` cells whose cost has fallen; taken over
-    Notes the cells that have fallen in `rows`. Returns (cells served, or -1 beyond `limit` or the queue's room; the
-    largest cost served).
+    Notes the cells that have fallen in `rows`. Returns (cells served; the largest cost served). -1 cells beyond
+    `limit`: then costs have fallen as far as offers went, all of it noted; -2 beyond the queue's room, not all
+    noted.
     """
     cell_cost, offsets, stride, rule, corners = grid
     first, last = rows
     keys, items, behind = entries
-    # cell // stride, by a multiplication: exact while the grid's size * stride is below 2**44.
-    per_row = np.uint64((1 << 44) // stride + 1)
+    per_row = row_factor(stride)
     width, overflow = buckets
     inverse = np.float32(1.0) / np.float32(width)
     top = np.float32(overflow)
@@ -233,10 +233,10 @@ def _spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, h
     # entering a bucket's cells was a call, and treble the time where making offers is one.
     while True:
         if used + np.int64(n) > keys.size:
-            return -1, highest
+            return -2, highest
         for i in range(n):
             v = lowered[i]
-            row = np.int64(np.uint64(v) * per_row >> _FINE)
+            row = np.int64(np.uint64(v) * per_row >> FINE_ROW)
             first[row] = min(first[row], np.int64(v))
             last[row] = max(last[row], np.int64(v))
             key = cost[v]
@@ -251,6 +251,8 @@ def _spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, h
             items[e] = v
             behind[e] = heads[b]
             heads[b] = e
+        if served > limit:
+            return -1, highest
         n = np.uint64(0)
         while current < overflow and heads[current] == _NOBODY:
             current += 1
@@ -274,7 +276,7 @@ def _spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, h
             served += 1
             highest = max(highest, key)
             if n + np.uint64(8) > room:
-                return -1, highest
+                return -2, highest
             own = cell_cost[u]
             # Branches, unlike in a growth: few neighbours are offered less, so that these are foretold.
             for k in range(4):
@@ -301,8 +303,26 @@ def _spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, h
                     cost[v] = diagonal
                     lowered[n] = v
                     n += _ONE
-        if served > limit:
-            return -1, highest
+
+
+@helper
+def point_near(grid, climbs, labels, rows):
+    """Write the parents of the cells of `rows`, and of those next to them."""
+    stride = grid[2]
+    cost, parent, root = labels
+    first, last = rows
+    from_row, to_row = near_rows(first, last)
+    for row in range(from_row, to_row):
+        begin, end = span_near(first, last, stride, row)
+        if begin < end:
+            point_row_to_parents(grid, climbs, cost, begin, end, parent, None)
+    parent[root] = NONE
+
+
+@helper
+def row_factor(stride):
+    """cell // stride is cell * this >> FINE_ROW, unsigned: exact while the grid's size * stride is below 2**44."""
+    return np.uint64((1 << 44) // stride + 1)
 
 
 @helper
@@ -354,11 +374,11 @@ def _detach_behind(cost, parent, offsets, detached, count, limit):
     return count
 
 
-@step_kernel(f"({GRID}, CLIMBS, {LABELS}, i8[::1], f4[::1], {BUCKETS}, UniTuple(i8, 3), {_SCRATCH})", CLIMBS)
+@step_kernel(f"({GRID}, CLIMBS, {LABELS}, i8[::1], f4[::1], {BUCKETS}, UniTuple(i8, 3), {SCRATCH})", CLIMBS)
 def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     """Bring a tree up to date after the costs of `changed` cells became what they are now.
 
-    buckets  as `_spread` says
+    buckets  as `spread` says
     most     (detached, with_cheaper, served): how many cells may lose their way, the same where some cells got
              cheaper, and how many may be served besides twice as many as lost theirs
     scratch  as `make_scratch` returns it, for as many buckets
@@ -368,7 +388,7 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     cost, s); -1 cells where that is more than `most`: then the tree is of no use any more and must be grown.
     """
     cell_cost, _, stride, _, _ = grid
-    cost, parent, root = labels
+    cost, parent, _ = labels
     rows, cheaper, detached, lowered, best, entries, heads = scratch
     first, last = rows
     any_cheaper = _any_cheaper(cell_cost, changed, before)
@@ -378,7 +398,7 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
         many = _detach(grid, cost, parent, changed, before, most_detached, detached)
     if many > most_detached:
         return -1, INF
-    _clear(rows, cell_cost.size)
+    clear_rows(rows, cell_cost.size)
     count = np.int64(0)  # a literal would have `_sweep` compiled twice
     if many:
         _note(first, last, stride, detached, many)
@@ -386,17 +406,12 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     if any_cheaper:
         _note_cheaper(cheaper, cell_cost, stride, changed, before)
         count = _sweep(grid, climbs, cost, cheaper, np.float32(-INF), best, lowered, count)
-    served, highest = _spread(grid, climbs, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
+    served, highest = spread(grid, climbs, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
     if served < 0:
         return -1, INF
     if not parent.size:
         return served, highest
     # A cell beside one that changed may have a better neighbour now.
     _note(first, last, stride, changed, changed.size)
-    from_row, to_row = _near_rows(first, last)
-    for row in range(from_row, to_row):
-        begin, end = _span(first, last, stride, row)
-        if begin < end:
-            point_row_to_parents(grid, climbs, cost, begin, end, parent)
-    parent[root] = NONE
+    point_near(grid, climbs, labels, rows)
     return served + many, highest

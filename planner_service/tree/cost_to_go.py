@@ -19,6 +19,7 @@ from planner_service.kernels import route_walk, stride_growth
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
 from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
+from planner_service.kernels.mend import Walk, make_walk, mend
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
@@ -33,6 +34,9 @@ NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.
 
 _SMALL = 1 << 16
 """Padded cells of a small window."""
+MOST_SPREAD_SHARE = 48
+"""While a tree is mended, what costs fall to spreads over one cell in so many at once, ten times as dear as
+evaluating it: beyond, whole branches have moved, and their trees are evaluated first."""
 
 
 class CostToGoTree:
@@ -43,7 +47,7 @@ class CostToGoTree:
         """The map that the tree lies on. Whoever changes it calls `repair`, or grows the tree anew."""
         self.cost: Floats = np.empty(0, np.float32)
         """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. Empty
-        before the first growth. `grow` and `take` set it, `move`, `grow_strides`, `tighten`, `relabel` and
+        before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten`, `relabel` and
         `repair` change it."""
         self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way."""
@@ -51,10 +55,10 @@ class CostToGoTree:
         """The target's cell, of the grid; -1 before the first growth. `grow`, `take` and `move` set it."""
         self.offset = 0.0
         """s; how much the stored costs lack at most. `move` adds the cost from the old root to the new one; `grow`,
-        `take` and `relabel` reset it."""
+        `take`, `mend` and `relabel` reset it."""
         self.exact = False
-        """Whether cost-to-go is exact on the map as it is now (then the offset is 0). `grow` and `take` set it,
-        `move` to another root and `grow_strides` reset it, `repair` keeps it."""
+        """Whether cost-to-go is exact on the map as it is now (then the offset is 0). `grow`, `take` and `mend` set
+        it, `move` to another root and `grow_strides` reset it, `repair` keeps it."""
         self.reach = 0.0
         """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
         self.window_bound: WindowBound | None = None
@@ -62,6 +66,8 @@ class CostToGoTree:
         so does the owner (to None) when a cell gets cheaper: it bounds from below."""
         self._kept: KeptScratch = {}
         """Scratch of the last small window."""
+        self._walk: Walk | None = None
+        """Scratch of `mend`. None until needed."""
         self._stamps: NDArray[np.uint8] | None = None
         """uint8, padded: `_now` where a cost was recomputed since ways changed last. None until
         needed."""
@@ -90,6 +96,13 @@ class CostToGoTree:
         self.parent = parent
         self.reach = reach
         self._become_exact(root)
+
+    def take_parents(self, root: int, parent: NDArray[np.uint8]) -> None:
+        """Become a tree that somebody else made on the map as it is now; costs are what is driven along it. Raises
+        as `take`."""
+        self.take(root, np.empty(self.cost_grid.size, np.float32), parent, 0.0)
+        self.relabel()
+        self.reach = float(self.cost[np.isfinite(self.cost)].max())
 
     def _become_exact(self, root: int) -> None:
         self.root = root
@@ -151,7 +164,7 @@ class CostToGoTree:
         kept = self._kept if part.size <= _SMALL else None
         grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, None, kept)
         way = float(cost[old])
-        if not way < math.inf:
+        if not (way < math.inf and self.offset + way <= FINE * grid.lowest_cell_cost):
             return 0
         self.offset += way
         merge_window(cost, box, self.offset, grid.pad(self.root), self.cost, grid.stride)
@@ -196,6 +209,30 @@ class CostToGoTree:
         )
         self.reach = max(self.reach, float(highest))
         self._ways_changed()
+        return int(visited)
+
+    def mend(self) -> int:
+        """Make the tree exact by the parents that it has, after whatever windows, moves and repairs.
+
+        It equals one grown from scratch then, in costs and parents, bit for bit. Returns cells visited. `exact`
+        tells whether it worked: if not, to grow the tree takes less time. Either way the offset is 0. Raises
+        ValueError unless the tree is `fine`.
+        """
+        labels = self._labels
+        if not self.fine:
+            raise ValueError("costs are too large for float32 to tell parents by: grow the tree")
+        grid = self.cost_grid
+        if self._walk is None:
+            self._walk = make_walk(grid.size, grid.stride, grid.rule)
+        farthest, most = FINE * grid.lowest_cell_cost, grid.grid.cells // MOST_SPREAD_SHARE + 64
+        visited, highest, exact = mend(
+            *(grid.padded, grid.climbs, labels, grid.buckets),
+            *(farthest, most, grid.repair_scratch, self._walk),
+        )
+        self.reach = float(highest)
+        self._ways_changed()
+        self._become_exact(self.root)
+        self.exact = bool(exact)
         return int(visited)
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
@@ -247,6 +284,7 @@ class CostToGoTree:
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents, and the offset 0."""
         route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
+        self.reach += self.offset
         self.offset = 0.0
 
     @property

@@ -65,3 +65,14 @@ def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
     k = ((row ^ old_row) | (col ^ old_col)).bit_length() - 1
     half = 2 << k if k >= k_min else 1 << k_min
     return max(half, 2 * grid.distance_cells(old, new))
+
+
+def exact_half(grid: GridSpec, old: int, new: int) -> int:
+    """How far, in cells, the window of an exact move reaches to every side.
+
+    Near the root the ways of whole trunks change, which a window finds at the cost of a growth, a cell of it; what
+    it does not find costs several times as much a cell, but nobody's exactness. Measured on four elevation models
+    and made-up terrain of 512 to 2048 cells a side.
+    """
+    side = min(grid.rows, grid.cols)
+    return max(16, min(side // 12, 64), 2 * grid.distance_cells(old, new))

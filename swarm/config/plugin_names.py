@@ -65,7 +65,7 @@ _KINDS = (
         2.0,
         "this agent spreads its vehicles evenly now",
     ),
-    PluginKind("strategy", "planner", typing.get_args(Strategy), "row", 2.0, "this planner grows whole trees now"),
+    PluginKind("strategy", "planner", typing.get_args(Strategy), "row", 2.0, "this planner keeps exact trees now"),
     PluginKind(
         "dynamics",
         "agent",

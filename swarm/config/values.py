@@ -29,7 +29,7 @@ MOST_TARGETS = 1000
 """Of all entries together."""
 
 Strategy = Literal[
-    "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
+    "auto", "exact", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
 SlopeRule = Literal[
     "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"

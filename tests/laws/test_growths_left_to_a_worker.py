@@ -12,14 +12,14 @@ from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, happenings, paces, planner_configs, random_pace
 from support.planner_swarm import GRID, Swarm, flat
 
-from planner_service import target_tree
+from planner_service import growth_times
 from planner_service.tree.windows import WindowSchedule
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import ROUTE
 
-LARGE = mock.patch.object(target_tree, "INLINE_NS", 100)
+LARGE = mock.patch.object(growth_times, "INLINE_NS", 100)
 """As if every map were so large that growing seven of its cells took too long."""
 
 
@@ -63,10 +63,10 @@ def test_after_a_jump_the_older_tree_leads_where_it_led_and_follows_the_map() ->
 
 
 def test_a_query_waits_for_the_first_tree_but_not_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(target_tree, "INLINE_NS", 100)
+    monkeypatch.setattr(growth_times, "INLINE_NS", 100)
     swarm = Swarm(flat())
     for growth_s, expected in ((0.4, RouteStatus.OK), (30.0, RouteStatus.NO_TARGET)):
-        monkeypatch.setattr(target_tree, "MODEL_NS_PER_CELL", int(growth_s * 1e9 / GRID.cells))
+        monkeypatch.setattr(growth_times, "MODEL_NS_PER_CELL", int(growth_s * 1e9 / GRID.cells))
         swarm = Swarm(flat())
         swarm.cells["t"] = GRID.cell(20, 30)
         swarm.run(0.25)
@@ -79,8 +79,8 @@ def test_a_query_waits_for_the_first_tree_but_not_for_long(monkeypatch: pytest.M
 def test_while_a_worker_grows_after_a_jump_routes_say_where_they_lead_and_how_old_they_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(target_tree, "INLINE_NS", 100)
-    monkeypatch.setattr(target_tree, "MODEL_NS_PER_CELL", int(0.4e9 / GRID.cells))
+    monkeypatch.setattr(growth_times, "INLINE_NS", 100)
+    monkeypatch.setattr(growth_times, "MODEL_NS_PER_CELL", int(0.4e9 / GRID.cells))
     monkeypatch.setattr(WindowSchedule, "half", lambda *_: 40)
     swarm = Swarm(flat(), "rotation")
     first, second = GRID.cell(20, 5), GRID.cell(20, 45)

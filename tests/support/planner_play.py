@@ -13,6 +13,8 @@ from support.planner_strategies import Job, Marks, Move
 from planner_service.full_growth import GrownTree
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.pieces import PieceTree
 from planner_service.tree.strides import StrideSearch
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -100,6 +102,21 @@ class Play:
         self.check()
         return kinds
 
+    def check_equals_a_growth(self) -> None:
+        """The tree is, in costs and parents, the one that is grown from scratch; in pieces, its costs are nearer to
+        the optimum."""
+        mine = self.tree._tree
+        if isinstance(mine, PieceTree):
+            cells = mine.cost_grid.pad_all(np.arange(self.grid.cells))
+            optimum = naive.cost_to_go(self.pace, mine.root, **self.rules).reshape(-1)
+            optimum[~np.isfinite(self.pace.reshape(-1))] = np.inf
+            np.testing.assert_allclose(mine.cost_at(cells), optimum, rtol=1e-11)
+            return
+        fresh = CostToGoTree(mine.cost_grid)
+        fresh.grow(mine.root)
+        np.testing.assert_array_equal(mine.inner(mine.cost), fresh.inner(fresh.cost))
+        np.testing.assert_array_equal(mine.inner(mine.parent), fresh.inner(fresh.parent))
+
     def _mark(self, event: Marks) -> Window:
         rng = np.random.default_rng(event.seed)
         window = Window(0, 0, 0, 0)
@@ -144,5 +161,6 @@ class Play:
         assert (bound <= best * (1 + 1e-12)).all()
         assert (cost >= best * (1 - 1e-6)).all()
         assert (upper >= driven * (1 - 1e-4)).all()
-        if self.config.strategy == "full" and not self.has_worker:
+        if self.config.strategy in ("full", "exact") and not self.has_worker:
             np.testing.assert_allclose(cost, best, rtol=1e-5)
+            self.check_equals_a_growth()

@@ -13,6 +13,7 @@ from swarm.config.scenario import PlannerConfig
 
 STRATEGIES = (
     "full",
+    "exact",
     "variable_range",
     "rotation",
     "multi_resolution",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from planner_service.actions import Action, GrowTree, Tell
 from planner_service.full_growth import GrownTree
+from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Planner
 from planner_service.target_tree import TargetTree
 from planner_service.update import Update
@@ -32,12 +33,27 @@ GRID = GridSpec(ROWS, COLS, 10.0)
 TICK = NS_PER_S // 10
 
 
+class NotedTimes(GrowthTimes):
+    """Notes what it is told, and goes by the model."""
+
+    def __init__(self, calls: list[tuple[Any, ...]]) -> None:
+        super().__init__(GRID, PlannerConfig(), False, None)
+        self._calls = calls
+
+    def observe_full_ns(self, took_ns: int) -> None:
+        self._calls.append(("observe", took_ns))
+
+    def observe_exact_ns(self, took_ns: int) -> None:
+        self._calls.append(("observe exact", took_ns))
+
+
 class ScriptedTree(TargetTree):
     """Straight routes without any growth; each call is noted, and answers what the test says."""
 
     def __init__(self) -> None:
         super().__init__(GRID, PlannerConfig())
         self.calls: list[tuple[Any, ...]] = []
+        self.times = NotedTimes(self.calls)
         self.answers: list[Update] = []
         self.told_version = -1
         self.gap = 1.0
@@ -77,12 +93,6 @@ class ScriptedTree(TargetTree):
 
     def cost_to_go_at(self, cells: Any) -> NDArray[np.float32]:
         return np.array([cell if 0 <= cell < GRID.cells else math.inf for cell in cells], np.float32)
-
-    def measured_model_ns(self) -> int:
-        return 1
-
-    def observe_full_ns(self, took_ns: int) -> None:
-        self.calls.append(("observe", took_ns))
 
     def named(self, name: str) -> list[tuple[Any, ...]]:
         return [call for call in self.calls if call[0] == name]

@@ -23,7 +23,7 @@ from launch_scripts.bench.planning.fields import Field
 from launch_scripts.bench.planning.route_oracle import drive
 from launch_scripts.bench.tables import Progress
 from launch_scripts.world.walks import WALKS, Budget, Walker, WalkWorld
-from planner_service.strategy import ROWS, STAGES, OnMove
+from planner_service.strategy import ROWS, STAGES
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import Strategy, Walk
@@ -288,7 +288,7 @@ class _Racer:
         in the same frame ever after."""
         # The row of `auto` is that of the stage in which it has windows.
         row = ROWS.get(self._strategy, STAGES["rotate"])
-        if row.on_move is OnMove.WHOLE_TREE:
+        if row.is_exact:
             return
         grows = row.grows_whole_trees
 
@@ -334,7 +334,9 @@ class _Racer:
         began_ns = time.thread_time_ns()
         update = tree.update(self._field.pace, cell, [], 0)
         if update.kind == "full":
-            tree.observe_full_ns(time.thread_time_ns() - began_ns)
+            tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
+        elif update.kind == "exact":
+            tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
         if tree.wants_strides:
             tree.take_strides(tree.stride_job().run())
         if count:
@@ -343,7 +345,7 @@ class _Racer:
             return
         began_ns = time.thread_time_ns()
         grown = tree.full_job(cell)()
-        tree.observe_full_ns(time.thread_time_ns() - began_ns)
+        tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
         tree.adopt(grown, self._field.pace, cell, [], 0, followed)
         if count:
             self.tally.count("job")

@@ -23,6 +23,7 @@ from swarm.config.values import Strategy
 
 _COLOURS: dict[Strategy, str] = {
     "full": INK,
+    "exact": VIOLET,
     "auto": BLUE,
     "rotation": GREEN,
     "variable_range": ORANGE,

@@ -244,7 +244,7 @@ def test_auto_grows_windows_where_whole_trees_are_too_dear():
     climb = climb_on(ramp(60, 60))
     pace = np.full((60, 60), 0.1, np.float32)
     tree = TargetTree(climb.grid, PlannerConfig(cpu_budget=0.01, k_min=0), climb)
-    tree.observe_full_ns(10**9)
+    tree.times.observe_full_ns(10**9)
     kinds = [tree.update(pace, 1830 + step, [], step).kind for step in range(5)]
     assert kinds == ["full", *["window"] * 4]
 

@@ -57,13 +57,15 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
         (StrategyRow(OnMove.BLOCK_WINDOW), ["window"] * 5),
         (StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
         (StrategyRow(OnMove.SCHEDULED_WINDOW), ["window"] * 5),
-        (StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES), [*["window"] * 2, *["window!"] * 3]),
+        (StrategyRow(OnMove.EXACT_MOVE), ["exact"] * 5),
+        (StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES), ["window", "window", "exact"] * 2),
     ],
 )
 def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(
     row: StrategyRow, expected: list[str]
 ) -> None:
-    assert kinds_of_moves(PlannerConfig(strategy="auto", k_min=0, full_every=3), row, 5) == expected
+    config = PlannerConfig(strategy="auto", k_min=0, full_every=3)
+    assert kinds_of_moves(config, row, len(expected)) == expected
 
 
 def test_until_all_kernels_are_compiled_every_row_grows_whole_trees() -> None:
@@ -113,9 +115,9 @@ def test_whatever_rows_a_strategy_chooses_routes_keep_the_laws(seed: int) -> Non
             play.happen(Job("begin"))
         if step % 10 == 8:
             play.happen(Job("end"))
-            play.tree.observe_full_ns(int(chance.integers(1, 10**8)))
+            play.tree.times.observe_full_ns(int(chance.integers(1, 10**8)))
         play.check()
-    assert not play.tree._chosen_by.rows  # type: ignore[attr-defined]
+    assert not play.tree.times._chosen_by.rows  # type: ignore[attr-defined]
 
 
 # --- plug-ins ---------------------------------------------------------------------------------------------------
@@ -134,7 +136,7 @@ def plugged(answer: Any) -> tuple[Any, list[str]]:
     return strategy_of(plugin, StrategyWorld("t", GRID, PlannerConfig()), told.append), told
 
 
-ASKED = Growths(1e6, 1e7, 64, GRID.cells)
+ASKED = Growths(1e6, 1e7, 64, GRID.cells, 4e5)
 
 
 def test_a_plugins_row_is_in_force() -> None:
@@ -155,11 +157,11 @@ def test_a_plugins_row_is_in_force() -> None:
         (StrategyRow(OnMove.WHOLE_TREE, thins_far_cells=1), "thins_far_cells is 1, expected a bool"),  # type: ignore[arg-type]
     ],
 )
-def test_a_strategy_that_fails_is_named_and_whole_trees_are_grown(answer: object, said: str) -> None:
+def test_a_strategy_that_fails_is_named_and_trees_stay_exact(answer: object, said: str) -> None:
     strategy, told = plugged(answer)
-    assert strategy.row(ASKED).on_move is OnMove.WHOLE_TREE
-    assert strategy.row(ASKED).on_move is OnMove.WHOLE_TREE
+    assert strategy.row(ASKED).on_move is OnMove.EXACT_MOVE
+    assert strategy.row(ASKED).on_move is OnMove.EXACT_MOVE
     (fault,) = told
     assert "strategy plug-in 'my:Own' of planner.strategy: row r" in fault
     assert said in fault
-    assert fault.endswith("this planner grows whole trees now")
+    assert fault.endswith("this planner keeps exact trees now")

@@ -12,7 +12,7 @@ from support import slow_twins as naive
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
-from planner_service import target_tree
+from planner_service import growth_times
 from planner_service.strategy import Auto, Growths
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
@@ -39,9 +39,9 @@ def thin_walls(rng: np.random.Generator, side: int, doors: float) -> np.ndarray:
 def short_strides(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows and strides as they are on a large map, in the sizes of a small one."""
     monkeypatch.setattr(strides, "LEAST", 1)
-    monkeypatch.setattr(target_tree, "LEAST", 1)
-    monkeypatch.setattr(target_tree, "FINE", 2)
-    monkeypatch.setattr(target_tree, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
+    monkeypatch.setattr(growth_times, "LEAST", 1)
+    monkeypatch.setattr(growth_times, "FINE", 2)
+    monkeypatch.setattr(growth_times, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
 
 
 @pytest.mark.usefixtures("short_strides")
@@ -130,7 +130,9 @@ def test_auto_grows_exactly_then_rotates_then_coarsens_and_does_not_flap() -> No
     auto = Auto()
     stages = []
     for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 330, 300, 250, 200, 50, 6):
-        auto.row(Growths(full_ms * 1e6, budget_ns=10e6, widest_cells=512, map_cells=1 << 20))
+        auto.row(
+            Growths(full_ms * 1e6, budget_ns=10e6, widest_cells=512, map_cells=1 << 20, exact_ns=full_ms * 1e6)
+        )
         stages.append(auto.stage)
     assert stages == [
         *("exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate"),
@@ -192,7 +194,7 @@ def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() ->
 def test_on_a_large_map_a_forced_range_is_a_window_over_vehicle_and_target_until_a_worker_has_grown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(target_tree, "INLINE_NS", 60_000)
+    monkeypatch.setattr(growth_times, "INLINE_NS", 50_000)
     pace = random_pace(np.random.default_rng(1), 100, 100, 5.0, 0.1)
     play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
     for _ in range(4):

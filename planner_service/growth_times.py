@@ -1,0 +1,111 @@
+"""What growing a tree takes, and what follows: the row in force, and what may be grown between answers."""
+
+from __future__ import annotations
+
+import math
+
+from planner_service.strategy import STRATEGIES, Growths, OnMove, Strategy, StrategyRow, WidestWindow
+from planner_service.tree.strides import FINE, LEAST
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec
+
+MODEL_NS_PER_CELL = 15
+"""What a full growth costs per cell, for choices that must come out alike on every machine."""
+MODEL_EXACT_NS_PER_CELL = 6
+"""The same of an exact move."""
+MODEL_PIECES_NS_PER_CELL = 2
+"""The same of a tree in pieces."""
+PIECES_CELLS = 1 << 19
+"""Maps of so many cells have their exact trees in pieces."""
+INLINE_NS = 100_000_000
+"""What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
+takes less, and where there is a worker, so is any other."""
+FINE_SHARE = 16
+"""How far the fine windows of multi-resolution reach, as a share of the map's side."""
+
+
+def is_slow_to_grow(grid: GridSpec) -> bool:
+    """Whether a whole tree of this grid is nothing to be grown between two answers."""
+    return grid.cells * MODEL_NS_PER_CELL > INLINE_NS
+
+
+class GrowthTimes:
+    """The times of one tree: by the model until one has been measured. A simulation measures none.
+
+    row       of the strategy, in force now
+    full_ns   CPU time of a full growth
+    exact_ns  CPU time of an exact move, or of mending the tree
+    in_pieces whether exact trees are `PieceTree`s: on large maps, where a cell costs the same from everywhere
+    """
+
+    def __init__(
+        self, grid: GridSpec, config: PlannerConfig, has_worker: bool, climbs: bool, chosen_by: Strategy | None
+    ) -> None:
+        self._grid = grid
+        self.full_ns = self.model_ns
+        self.in_pieces = grid.cells >= PIECES_CELLS and not climbs
+        self.exact_ns = grid.cells * (MODEL_PIECES_NS_PER_CELL if self.in_pieces else MODEL_EXACT_NS_PER_CELL)
+        self.row = StrategyRow(OnMove.WHOLE_TREE)
+        self.narrowest = 4 << config.k_min
+        """How far the narrowest scheduled window reaches, in cells."""
+        self.fine = max(FINE << config.k_min, 1 << LEAST)
+        """How far strides are so short that all cells are grown, in cells: no less than the least block. On a map
+        where that is half of it there are no others."""
+        self.budget_ns = config.cpu_budget * 1e9 / config.tick_hz
+        """CPU time that a tick may take. Written by `set_budget`."""
+        self._tick_hz = config.tick_hz
+        self._has_worker = has_worker
+        self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
+        self._exact_measured = False
+        self._choose()
+
+    def set_budget(self, cpu_budget: float) -> None:
+        """The share of one core that the tree may take from now on."""
+        self.budget_ns = cpu_budget * 1e9 / self._tick_hz
+        self._choose()
+
+    def observe_full_ns(self, took_ns: int) -> None:
+        """What a full growth really took; not one that found networks too. A simulation does not call it."""
+        if not self._exact_measured:
+            self.exact_ns = self.exact_ns * took_ns // self.full_ns
+        self.full_ns = max(1, took_ns)
+        self._choose()
+
+    def observe_exact_ns(self, took_ns: int) -> None:
+        """What an exact move really took."""
+        self._exact_measured = True
+        self.exact_ns = max(1, took_ns)
+        self._choose()
+
+    def _choose(self) -> None:
+        widest = self.widest(WidestWindow.WHILE_CHEAPER)
+        times = Growths(self.full_ns, self.budget_ns, widest, self._grid.cells, self.exact_ns)
+        self.row = self._chosen_by.row(times)
+
+    def widest(self, rule: WidestWindow) -> int:
+        """How far the widest window reaches that is grown without a worker, in cells."""
+        if rule is WidestWindow.SHARE_OF_MAP:
+            side = max(self._grid.rows, self._grid.cols)
+            return max(self.fine if 4 * self.fine <= side else self.narrowest, side // FINE_SHARE)
+        # Over half of the map, a full growth costs as much: that is the worker's.
+        share = min(INLINE_NS / self.full_ns, 1.0) / 2
+        return math.isqrt(int(share * self._grid.cells)) // 2
+
+    def is_quick(self, cells: int) -> bool:
+        """Whether so many cells may be grown on the thread that answers."""
+        return not self._has_worker or cells * self.full_ns <= INLINE_NS * self._grid.cells
+
+    @staticmethod
+    def is_short(took_ns: float) -> bool:
+        """Whether work of so long holds up no answer for long."""
+        return took_ns <= INLINE_NS
+
+    @property
+    def model_ns(self) -> int:
+        """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
+        return self._grid.cells * MODEL_NS_PER_CELL
+
+    @property
+    def mends_quickly(self) -> bool:
+        """Whether the whole tree may be made exact on the thread that answers."""
+        return not self._has_worker or self.is_short(self.exact_ns)
