@@ -37,7 +37,7 @@ def bound_by_heuristic(heuristic, root, stride, part, box, rim, rim_cost, starts
 
     part, box, rim, rim_cost  a `WindowBound`, in parts: a single route feels what a nested tuple takes to read
     rounding                  float64 (n,), relative; what float32 may add to labels on the best way from each
-    most                      the same of any way
+    most                      the same of the best way from any cell of the rim
     """
     if heuristic.size > 0:
         check_cells(starts, heuristic.size)

@@ -474,7 +474,7 @@ class CostGrid:
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
 
-    def rounding(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rounding(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
         """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
 
         One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
