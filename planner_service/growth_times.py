@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from planner_service.strategy import STRATEGIES, Growths, OnMove, Strategy, StrategyRow, WidestWindow
+from planner_service.tree.strides import FINE, LEAST
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
@@ -47,6 +48,9 @@ class GrowthTimes:
         self.row = StrategyRow(OnMove.WHOLE_TREE)
         self.narrowest = 4 << config.k_min
         """How far the narrowest scheduled window reaches, in cells."""
+        self.fine = max(FINE << config.k_min, 1 << LEAST)
+        """How far strides are so short that all cells are grown, in cells: no less than the least block. On a map
+        where that is half of it there are no others."""
         self.budget_ns = config.cpu_budget * 1e9 / config.tick_hz
         """CPU time that a tick may take. Written by `set_budget`."""
         self._tick_hz = config.tick_hz
@@ -61,7 +65,7 @@ class GrowthTimes:
         self._choose()
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took; not one that found corridors too. A simulation does not call it."""
+        """What a full growth really took; not one that found networks too. A simulation does not call it."""
         if not self._exact_measured:
             self.exact_ns = self.exact_ns * took_ns // self.full_ns
         self.full_ns = max(1, took_ns)
@@ -81,7 +85,8 @@ class GrowthTimes:
     def widest(self, rule: WidestWindow) -> int:
         """How far the widest window reaches that is grown without a worker, in cells."""
         if rule is WidestWindow.SHARE_OF_MAP:
-            return max(self.narrowest, max(self._grid.rows, self._grid.cols) // FINE_SHARE)
+            side = max(self._grid.rows, self._grid.cols)
+            return max(self.fine if 4 * self.fine <= side else self.narrowest, side // FINE_SHARE)
         # Over half of the map, a full growth costs as much: that is the worker's.
         share = min(INLINE_NS / self.full_ns, 1.0) / 2
         return math.isqrt(int(share * self._grid.cells)) // 2

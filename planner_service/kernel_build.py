@@ -24,17 +24,18 @@ from typing import Any
 from planner_service.kernels import (
     bucket_queue,
     cell_costs,
-    corridor_growth,
     directed_buckets,
     lower_bounds,
     mend,
     parents,
-    parents_from_root,
     pieces,
     pieces_mend,
     radix_heap,
     repair,
     route_walk,
+    stride_growth,
+    stride_network,
+    tied_parents,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -45,7 +46,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, parents_from_root.find_parents_from_root),
+    StepKernel(radix_heap.grow_by_radix_heap, tied_parents.untie_parents),
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
@@ -60,13 +61,16 @@ takes longest comes first, so that builders end together."""
 LATER: tuple[Kernel | StepKernel, ...] = (
     mend.mend,
     repair.repair,
-    corridor_growth.grow_corridors,
+    stride_growth.grow_strides,
     lower_bounds.bound_by_heuristic,
     cell_costs.cut_window,
     cell_costs.merge_window,
     cell_costs.find_rim,
-    corridor_growth.tighten,
-    corridor_growth.mark_levels,
+    stride_network.cut_blocks,
+    stride_network.find_ways_to_centres,
+    stride_network.join_nodes,
+    stride_growth.tighten,
+    stride_network.write_paths,
     route_walk.relabel,
     pieces_mend.mend_tiles,
     pieces.relabel_tiles,
@@ -76,7 +80,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     pieces_mend.drop_lost,
     pieces.costs_at,
 )
-"""For windows, repairs, corridors and pieces, which save growing whole trees."""
+"""For windows, repairs, strides and pieces, which save growing whole trees."""
 
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"

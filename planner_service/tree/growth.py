@@ -13,7 +13,7 @@ from planner_service.kernels.cell_costs import cell_cost_range
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import TOO_FINE, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
-from planner_service.kernels.parents_from_root import find_parents_from_root
+from planner_service.kernels.tied_parents import untie_parents
 from planner_service.tree.directed_growth import grow_directed_costs
 from shared_map.arrays import Floats
 
@@ -56,10 +56,9 @@ def grow_tree(
         if parent is None:
             return math.inf
         reach = float(np.array(cell_cost_range(cost.view(np.int32)), np.int32).view(np.float32)[1])
-        if reach <= FINE * lowest:
-            point_to_parents(padded, climbs, cost, root, box, parent)
-        else:
-            find_parents_from_root(padded, climbs, (cost, parent, root), np.empty(size, np.uint32))
+        point_to_parents(padded, climbs, cost, root, box, parent)
+        if reach > FINE * lowest:
+            untie_parents(padded, climbs, (cost, parent, root), np.empty(2 * size, np.uint32))
         return reach
     width = float(np.float32(lowest * 0.98))
     last = _grow_by_buckets(padded, bounds, width, root, cost, {} if kept is None else kept)
