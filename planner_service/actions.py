@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from planner_service.full_growth import GrownTree
-from planner_service.tree.corridors import CorridorSearch
+from planner_service.tree.strides import StrideSearch
 from swarm.wire.messages.planning import PlannerStatus, PushedRoute
 
 
@@ -25,11 +25,11 @@ class GrowTree:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FindCorridors:
+class FindStrides:
     """Take the steps of `search` on a worker, one now and then, until it has found them; bring it to
-    `Planner.adopt_corridors`."""
+    `Planner.adopt_strides`."""
 
-    search: CorridorSearch
+    search: StrideSearch
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,5 +41,5 @@ class Tell:
     cell: int | None = None
 
 
-Action = GrowTree | FindCorridors | PushedRoute | PlannerStatus | Tell
-"""What a planner wants done: a growth run, corridors found, a message published."""
+Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Tell
+"""What a planner wants done: a growth run, networks of strides found, a message published."""

@@ -65,14 +65,17 @@ def growth_job(
 def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
     """Driven cost over optimum of what the earlier tree offered cells of the grid, on the snapshot of `grown`.
 
-    Cells without a way in either tree are left out.
+    Cells without a way in either tree are left out. An offer may be better than the exact tree's by what float32
+    takes for equal, and is then 1; what is less than 1 is better than the exact tree proves that any can be: a bug.
     """
     offered = grown.offered
     assert offered is not None
     starts = cost_grid.pad_all(cells)
-    starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != NONE)]
-    walks = cost_grid.walk(offered, cost_grid.pad(grown.target_cell), starts, 0, grown.cell_cost)
+    root = cost_grid.pad(grown.target_cell)
+    starts = starts[(grown.parent[starts] != NONE) & (offered[starts] != NONE)]
+    walks = cost_grid.walk(offered, root, starts, 0, grown.cell_cost)
     whole = walks.ends >= 0
-    optimum = grown.cost[starts[whole]].astype(np.float64)
-    gaps: NDArray[np.float64] = np.maximum(walks.driven[whole] / optimum, 1.0)
-    return gaps
+    best = cost_grid.rests(grown.parent, root, starts[whole], grown.cell_cost)
+    driven = walks.driven[whole]
+    gaps: NDArray[np.float64] = driven / best
+    return np.where((gaps < 1.0) & (driven >= best * (1.0 - cost_grid.rounding(best))), 1.0, gaps)

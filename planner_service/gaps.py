@@ -2,6 +2,8 @@
 
 certified_gap_excess  proven, of every route served: its cost over its lower bound, less 1
 gap_excess            measured at full growths: driven cost over optimum of what the tree offered each follower
+broken_certificates   routes whose cost is below their lower bound, and offers below what an exact tree proves:
+                      none, unless there is a bug
 held_gap_excess       measured at full growths: driven cost over optimum of going on along the route that a
                       follower was given last, and from its end by the cheapest way
 """
@@ -48,6 +50,8 @@ class GapStatistics:
     def certify(self, routes: RouteBatch) -> float:
         """Note the proven gaps of served routes. Returns the widest, at least 1."""
         gaps = routes.gaps
+        # The histogram and `gaps` would take a route below its bound for one that is proven optimal.
+        self._count_broken(int(np.count_nonzero(routes.lower_bound_s > routes.cost_s)))
         self._counters.observe_all("certified_gap", gaps)
         self._counters.observe_all("certified_gap_excess", gaps - 1.0)
         return float(gaps.max(initial=1.0))
@@ -55,6 +59,7 @@ class GapStatistics:
     def adopted(self, tree: TargetTree, followers: Followers, pace: NDArray[np.float32], now_ns: int) -> None:
         """A worker's tree has replaced the one that was offered until now, and has been compared with it."""
         self._offered(tree.last_gaps)
+        self._count_broken(int(np.count_nonzero(tree.last_gaps < 1.0)))
         self._due_ns = now_ns + _EVERY_NS
         self._held(tree, _some(followers), pace)
 
@@ -77,6 +82,10 @@ class GapStatistics:
         self.last = (float(gaps.mean()), float(np.quantile(gaps, 0.95)), float(gaps.max()))
         self._counters.observe_all("gap", gaps)
         self._counters.observe_all("gap_excess", gaps - 1.0)
+
+    def _count_broken(self, many: int) -> None:
+        if many:
+            self._counters.count("broken_certificates", many)
 
     def _held(self, tree: TargetTree, followers: Sequence[Follower], pace: NDArray[np.float32]) -> None:
         rests = [(follower.cell, self._rest(follower, pace)) for follower in followers]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from planner_service.strategy import STRATEGIES, Growths, OnMove, Strategy, StrategyRow, WidestWindow
+from planner_service.tree.strides import FINE, LEAST
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
@@ -37,6 +38,10 @@ class GrowthTimes:
         self.full_ns = self.model_ns
         self.exact_ns = grid.cells * MODEL_EXACT_NS_PER_CELL
         self.row = StrategyRow(OnMove.WHOLE_TREE)
+        self.fine = max(FINE << config.k_min, 1 << LEAST)
+        """How far strides are so short that all cells are grown, in cells: no less than the least block."""
+        self.has_wide_strides = 4 * self.fine <= max(grid.rows, grid.cols)
+        """Whether there are others on this map."""
         self.narrowest = 4 << config.k_min
         """How far the narrowest scheduled window reaches, in cells."""
         self.budget_ns = config.cpu_budget * 1e9 / config.tick_hz
@@ -73,7 +78,8 @@ class GrowthTimes:
     def widest(self, rule: WidestWindow) -> int:
         """How far the widest window reaches that is grown without a worker, in cells."""
         if rule is WidestWindow.SHARE_OF_MAP:
-            return max(self.narrowest, max(self._grid.rows, self._grid.cols) // FINE_SHARE)
+            side = max(self._grid.rows, self._grid.cols)
+            return max(self.fine if self.has_wide_strides else self.narrowest, side // FINE_SHARE)
         # Over half of the map, a full growth costs as much: that is the worker's.
         share = min(INLINE_NS / self.full_ns, 1.0) / 2
         return math.isqrt(int(share * self._grid.cells)) // 2

@@ -24,7 +24,6 @@ from typing import Any
 from planner_service.kernels import (
     bucket_queue,
     cell_costs,
-    corridor_growth,
     directed_buckets,
     lower_bounds,
     mend,
@@ -35,6 +34,8 @@ from planner_service.kernels import (
     radix_heap,
     repair,
     route_walk,
+    stride_growth,
+    stride_network,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -60,13 +61,16 @@ takes longest comes first, so that builders end together."""
 LATER: tuple[Kernel | StepKernel, ...] = (
     mend.mend,
     repair.repair,
-    corridor_growth.grow_corridors,
+    stride_growth.grow_strides,
     lower_bounds.bound_by_heuristic,
     cell_costs.cut_window,
     cell_costs.merge_window,
     cell_costs.find_rim,
-    corridor_growth.tighten,
-    corridor_growth.mark_levels,
+    stride_network.cut_blocks,
+    stride_network.find_ways_to_centres,
+    stride_network.join_nodes,
+    stride_growth.tighten,
+    stride_network.write_paths,
     route_walk.relabel,
     pieces_mend.mend_tiles,
     pieces.relabel_tiles,
@@ -76,7 +80,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     pieces_mend.drop_lost,
     pieces.costs_at,
 )
-"""For windows, repairs, corridors and pieces, which save growing whole trees."""
+"""For windows, repairs, strides and pieces, which save growing whole trees."""
 
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"

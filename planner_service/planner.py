@@ -6,14 +6,14 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
+from planner_service.actions import Action, FindStrides, GrowTree, Refusal
 from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
-from planner_service.tree.corridors import CorridorSearch, CorridorShelf
+from planner_service.tree.strides import StrideSearch, StrideShelf
 from planner_service.update import Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
@@ -58,7 +58,7 @@ class Planner:
 
     stopwatch       CPU time of this thread, ns; without one growths take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
-    shelf           where the planners of a machine leave corridors for each other
+    shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     time_scale      seconds on the terrain per second: by it a target is taken for teleported
     """
@@ -75,7 +75,7 @@ class Planner:
         route_cells: int = 0,
         stopwatch: Callable[[], int] | None = None,
         newest_mark_ns: Callable[[], int | None] = lambda: None,
-        shelf: CorridorShelf | None = None,
+        shelf: StrideShelf | None = None,
         leads: bool = True,
         time_scale: float = 1.0,
     ) -> None:
@@ -156,8 +156,8 @@ class Planner:
     def tick(self, now_ns: int) -> list[Action]:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
         actions = self._keep_up(now_ns)
-        if self.tree.ready and self.tree.wants_corridors:
-            actions.append(FindCorridors(self.tree.corridor_job(self._shelf)))
+        if self.tree.ready and self.tree.wants_strides:
+            actions.append(FindStrides(self.tree.stride_job(self._shelf)))
         self.followers.drop_silent(now_ns)
         told = self._watch.take_told(now_ns)
         if self.leads:
@@ -195,9 +195,9 @@ class Planner:
         self._changed(update, dirty, now_ns)
         return [self._grow(now_ns)] if self._wants_full else []
 
-    def adopt_corridors(self, search: CorridorSearch) -> None:
+    def adopt_strides(self, search: StrideSearch) -> None:
         """Go by what the worker found."""
-        self.tree.take_corridors(search)
+        self.tree.take_strides(search)
 
     @property
     def must_wait(self) -> bool:

@@ -17,10 +17,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.tree import corridors
+from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from shared_map import arrays
-from shared_map.arrays import Floats, open_array, private_copy, save_array
+from shared_map.arrays import Bytes, Floats, open_array, private_copy, save_array
 from shared_map.source_digest import source_digest
 from shared_map.terrain.kept import keep_beside
 from shared_map.terrain.terrain import Terrain
@@ -38,22 +38,25 @@ PREPARED_COSTS = Outside(
 """What a planner uses of them."""
 
 
+_DIGEST_BYTES = 16
+
+
 class PreparedCosts:
-    """Cell costs before any mark, and a `CorridorShelf` beside them.
+    """Cell costs before any mark, and a `StrideShelf` beside them.
 
     cell_cost  float32, padded, s: what a `CostGrid` loads; mapped read-only
-    kept       of the terrain, if it is kept from run to run; its corridors are then, too
+    kept       of the terrain, if it is kept from run to run; its networks of strides are then, too
     """
 
     def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: str | None = None) -> None:
         cost_grid = CostGrid(terrain.grid, config, terrain.climb)
         of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.metres}"
         rules = f"{cost_grid.length_weight_s} {cost_grid.rule} {cost_grid.corners}"
-        of_ways = f"{of_costs} {rules} {corridors.LEAST} {corridors.SAMPLES}"
+        of_ways = f"{of_costs} {rules} {strides.LEAST} {strides.MOST_SHARE}"
         self._size = cost_grid.size
         self._folder = folder
         self._kept = kept
-        self._corridors = folder / f"corridors-{_digest(of_ways)}.npy"
+        self._strides = folder / f"strides-{_digest(of_ways)}.npy"
         self._claimed: IO[bytes] | None = None
         path = folder / f"cell-costs-{_digest(of_costs)}.npy"
         with _locked(folder / "cell-costs.lock"):
@@ -64,29 +67,29 @@ class PreparedCosts:
                 found = open_array(path)
         self.cell_cost: Floats = found
 
-    def load(self) -> NDArray[np.uint8] | None:
-        found = _read(self._corridors, np.uint8, self._size)
-        return None if found is None else private_copy(found)
+    def load(self) -> Bytes | None:
+        found = _read(self._strides, np.uint8, None)
+        return None if found is None else private_copy(found)[:-_DIGEST_BYTES]
 
     def claim(self) -> bool:
         """Released by the system if this process ends."""
         try:
             if self._claimed is None:
-                self._claimed = (self._folder / "corridors.lock").open("wb")
+                self._claimed = (self._folder / "strides.lock").open("wb")
             fcntl.flock(self._claimed, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         except OSError as error:  # a full disk: then each finds its own
-            log.warning("cannot share corridors in %s: %s", self._folder, error.strerror or error)
+            log.warning("cannot share networks of strides in %s: %s", self._folder, error.strerror or error)
         return True
 
-    def leave(self, level: NDArray[np.uint8]) -> None:
+    def leave(self, packed: Bytes) -> None:
         try:
-            save_array(self._corridors, level)
+            save_array(self._strides, np.concatenate((packed, _digest_of(packed))))
             if self._kept is not None:
-                keep_beside(self._kept, self._corridors)
+                keep_beside(self._kept, self._strides)
         except OSError as error:
-            log.warning("cannot share corridors in %s: %s", self._folder, error.strerror or error)
+            log.warning("cannot share networks of strides in %s: %s", self._folder, error.strerror or error)
         if self._claimed is not None:
             self._claimed.close()
             self._claimed = None
@@ -111,12 +114,19 @@ def _digest(text: str) -> str:
     return hashlib.blake2b(f"{code} {text}".encode(), digest_size=8).hexdigest()
 
 
-def _read(path: Path, dtype: type[np.generic], size: int) -> NDArray[Any] | None:
-    """None where the file is not there; a damaged one is as none, and is said."""
+def _digest_of(packed: Bytes) -> Bytes:
+    return np.frombuffer(hashlib.blake2b(packed.data, digest_size=_DIGEST_BYTES).digest(), np.uint8)
+
+
+def _read(path: Path, dtype: type[np.generic], size: int | None) -> NDArray[Any] | None:
+    """None where the file is not there; a damaged one is as none, and is said. Of no given size: one that ends with
+    its digest, as kernels check no index that they read from it."""
     try:
         found = open_array(path)
-        if found.shape != (size,) or found.dtype != dtype:
+        if found.shape != (size or found.size,) or found.dtype != dtype:
             raise ValueError(f"it is {found.shape} {found.dtype}")
+        if size is None and (found[-_DIGEST_BYTES:] != _digest_of(found[:-_DIGEST_BYTES])).any():
+            raise ValueError("its digest is another")
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:

@@ -120,5 +120,5 @@ class RouteFinder:
         if update.wants_full:
             grown = tree.full_job(self._target)()
             tree.adopt(grown, pace, self._target, [], self._version, [])
-        if tree.wants_corridors:
-            tree.take_corridors(tree.corridor_job().run())
+        if tree.wants_strides:
+            tree.take_strides(tree.stride_job().run())

@@ -6,13 +6,13 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from planner_service.actions import Action, FindCorridors, GrowTree, Refusal, Tell
+from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
-from planner_service.tree.corridors import CorridorSearch
+from planner_service.tree.strides import StrideSearch
 from shared_map.cost_map import CostMap
 from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
@@ -36,7 +36,7 @@ from swarm.wire.topics import CHASERS, COST, POSE, PUSHED_ROUTE, ROUTE, SIGHTED,
 
 log = logging.getLogger(__name__)
 
-_GROW, _SEARCH = "grow-tree", "find-corridors"
+_GROW, _SEARCH = "grow-tree", "find-strides"
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
 """A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
 
@@ -112,7 +112,7 @@ class PlannerService:
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
-        self._search: CorridorSearch | None = None
+        self._search: StrideSearch | None = None
         """What the worker is looking for, a step at a time; `_searching` while it has a step."""
         self._searching = False
         self.counters.count("marks_merged", 0)
@@ -145,11 +145,11 @@ class PlannerService:
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
                 self._perform(self._planner.adopt(grown, took_ns, now_ns), now_ns)
                 self._answer(now_ns)
-            case WorkDone(tag=tag, result=CorridorSearch() as search) if tag == _SEARCH:
+            case WorkDone(tag=tag, result=StrideSearch() as search) if tag == _SEARCH:
                 self._searching = False
-                if search.level is not None:
+                if search.network is not None:
                     self._search = None
-                    self._planner.adopt_corridors(search)
+                    self._planner.adopt_strides(search)
             case _:
                 pass
 
@@ -243,7 +243,7 @@ class PlannerService:
             match action:
                 case GrowTree(job):
                     self._worker.submit(_GROW, job, self._post, self._planner.tree.times.model_ns)
-                case FindCorridors(search):
+                case FindStrides(search):
                     self._search = search
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)

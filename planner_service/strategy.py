@@ -51,15 +51,15 @@ class WidestWindow(Enum):
 
     WHILE_CHEAPER = "while cheaper than a full growth"
     SHARE_OF_MAP = "a 16th of the map's side"
-    """The fine part of multi-resolution: what lies beyond belongs to the corridors."""
+    """The fine part of multi-resolution: what lies beyond belongs to the strides."""
 
 
 @dataclass(frozen=True, slots=True)
 class StrategyRow:
     """One strategy.
 
-    thins_far_cells     section 3.3.3, multi-resolution: far from the target only cells that carry traffic are
-                        grown. The paper takes every second, fourth, ... cell instead, and so jumps over walls
+    thins_far_cells     section 3.3.3, multi-resolution: far from the target only the ways between blocks of 16,
+                        32, ... cells are grown, a stride that doubles with the distance
     renews_loose_bounds a served route whose certified gap exceeds `planner.MAX_GAP` asks for a full growth; the
                         strategies of the paper never do
     """
@@ -77,7 +77,7 @@ class StrategyRow:
 
     @property
     def grows_whole_trees(self) -> bool:
-        """Whether whole trees are grown without a vehicle's asking: with every move, in turn, or for corridors."""
+        """Whether whole trees are grown without a vehicle's asking: with every move, in turn, or for networks."""
         return self.is_exact or self.full_growth is not FullGrowth.WHEN_FORCED or self.thins_far_cells
 
     def row(self, growths: Growths) -> StrategyRow:
@@ -145,7 +145,7 @@ STAGES: Mapping[Stage, StrategyRow] = {
     "coarsen": replace(_ROTATE, thins_far_cells=True),
 }
 """`auto`: exact moves while one fits into a tick; then windows, with exact trees in turn; and where these come so
-seldom that the target leaves what the widest window can make up for, corridors beyond that."""
+seldom that the target leaves what the widest window can make up for, strides beyond that."""
 
 HYSTERESIS = 0.7
 """`auto` returns to the better stage only below this share of the budget: times are noisy."""

@@ -17,10 +17,10 @@ from planner_service.full_growth import GrownTree, can_be_root, growth_job, offe
 from planner_service.growth_times import GrowthTimes
 from planner_service.strategy import FullGrowth, OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf, CorridorUpkeep
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_reading import read_routes
+from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
 from planner_service.tree.windows import WindowSchedule, block_half, exact_half
 from planner_service.update import Update
 from shared_map.arrays import Floats
@@ -28,9 +28,6 @@ from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import NO_TARGET, RouteBatch
-
-WIDE_SHARE = 16
-"""A block window over one cell in so many gives way to the corridors, where there are any."""
 
 
 class TargetTree:
@@ -40,7 +37,7 @@ class TargetTree:
     map_version  of the last update; -1 before the first
     ready        whether routes can be given; if not, every route's status is NO_TARGET
     all_kernels  whether kernels beside those for whole trees may be called by now. While it says no, windows,
-                 repairs and corridors give way to whole trees, so that nothing waits for a compilation
+                 repairs and strides give way to whole trees, so that nothing waits for a compilation
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
                  the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
     chosen_by    the strategy; the built-in one that `config` names if not given
@@ -80,8 +77,8 @@ class TargetTree:
         self._job_out = False
         # A full growth was left to the worker: until it is adopted, moves are not followed.
         self._left_to_worker = False
-        # The corridors of strategies that thin far cells.
-        self._corridors = CorridorUpkeep()
+        # The networks of strategies that thin far cells.
+        self._strides = StrideUpkeep()
         self.times = GrowthTimes(grid, config, has_worker, chosen_by)
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
         self._schedule = WindowSchedule(grid, self.times.narrowest)
@@ -154,17 +151,17 @@ class TargetTree:
         return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered)
 
     @property
-    def wants_corridors(self) -> bool:
-        """Please run `corridor_job` on a worker, and `take_corridors` once it has found them."""
-        return self.strategy.thins_far_cells and self._loaded and self._corridors.wanted
+    def wants_strides(self) -> bool:
+        """Please run `stride_job` on a worker, and `take_strides` once it has found them."""
+        return self.strategy.thins_far_cells and self._loaded and self._strides.wanted
 
-    def corridor_job(self, shelf: CorridorShelf | None = None) -> CorridorSearch:
-        """See `CorridorUpkeep.search`."""
-        return self._corridors.search(self._costs, shelf)
+    def stride_job(self, shelf: StrideShelf | None = None) -> StrideSearch:
+        """See `StrideUpkeep.search`."""
+        return self._strides.search(self._costs, shelf)
 
-    def take_corridors(self, search: CorridorSearch) -> None:
-        """Go by the corridors that were found."""
-        self._corridors.take(self._costs, search)
+    def take_strides(self, search: StrideSearch) -> None:
+        """Go by the networks that were found."""
+        self._strides.take(self._costs, search)
 
     def adopt(
         self,
@@ -273,7 +270,7 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._costs.apply(pace, dirty)
-        self._corridors.learn(self._costs, changes)
+        self._strides.learn(self._costs, changes)
         if changes.any_lower:
             self._tree.window_bound = None
         self._learn_bounds(changes)
@@ -387,13 +384,15 @@ class TargetTree:
         if self._is_better_bound and tree.exact:
             self._bounds.take(tree.cost.copy())
         self._is_better_bound = False
-        half, corridors = self._window_reach(target_cell)
+        half, far = self._reach(target_cell)
+        network = self._strides.network if far > half else None
         window, cells = self._grow_window(target_cell, half)
         if window is None:
             return self._give_up(target_cell)
-        if corridors is not None:
-            self._schedule.note_grown(target_cell, self._side)
-            return Update("coarse", self._grid.window, cells + tree.grow_corridors(window, corridors))
+        if network is not None:
+            self._schedule.note_grown(target_cell, far)
+            cells += tree.grow_strides(window, network, far)
+            return Update("coarse", self._grid.around(target_cell, far), cells)
         return Update("window", window, cells)
 
     def _grow_window(self, target_cell: int, half: int) -> tuple[Window | None, int]:
@@ -416,21 +415,20 @@ class TargetTree:
         """No window leads to the target's new cell."""
         return self._grow_full(target_cell) if self.times.is_quick(self._grid.cells) else self._leave_to_worker()
 
-    def _window_reach(self, target_cell: int) -> tuple[int, CorridorGraph | None]:
-        """How far to every side of the target the tree is grown now, and over which corridors beyond; None for not
-        at all."""
+    def _reach(self, target_cell: int) -> tuple[int, int]:
+        """How far to every side of the target all cells are grown now, and how far strides are: no further
+        where both are the same."""
         row, old = self.strategy, self._tree.root
-        corridors = self._corridors.graph if row.thins_far_cells else None
+        has_strides = row.thins_far_cells and self._strides.network is not None and self.times.has_wide_strides
         least = 2 * self._grid.distance_cells(old, target_cell)
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, target_cell, self._config.k_min)
-            if corridors is None or self._grid.around(target_cell, half).cells * WIDE_SHARE <= self._grid.cells:
-                return half, None
-            return max(self.times.narrowest, least), corridors
+            return (min(half, max(self.times.fine, least)) if has_strides else half), half
         widest = self._widest
-        if corridors is not None and self._schedule.beyond(target_cell, widest):
-            return max(widest, least), corridors
-        return max(self._schedule.half(target_cell, widest), least), None
+        if has_strides and self._schedule.beyond(target_cell, widest):
+            return max(widest, self.times.fine, least), self._side
+        half = max(self._schedule.half(target_cell, widest), least)
+        return half, half
 
     def _is_full_due(self, done: Update) -> bool:
         """Whether to ask for a full growth after what was done: the row says when, unless one is under way."""

@@ -16,7 +16,7 @@ class Update:
     """What one call changed.
 
     kind        the dearest thing that was done: nothing, the whole tree grown, the tree made exact by its parents,
-                a window, a repair after map changes, a window and the corridors beyond it, a window that was forced
+                a window, a repair after map changes, a window and strides beyond it, a window that was forced
     window      the cells that may have a new cost or parent; empty if none
     cells       how many cells the kernels visited
     wants_full  please run `full_job` on a worker, and `adopt` what it returns

@@ -81,6 +81,7 @@ HELP = {
     "tick_ms": "Time that a tick took",
     "mark_to_tree_ms": "Time from a mark to the tree that knows it",
     "certified_gap_excess": "Proven distance of served routes from the optimum, as a share of the optimum",
+    "broken_certificates": "Routes that were better than their proven bound: more than none is a bug",
     "followed_gap_excess": "The same of routes that vehicles have begun",
     "saves_failed": "Writes that the keeper's store refused",
     "blocked_ticks": "Ticks at which a vehicle had to wait for another",

@@ -18,7 +18,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ from launch_scripts.reference.printed import lattice_route, printed_costs, print
 from launch_scripts.report.pictures.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
 from launch_scripts.report.pictures.plot_style import STYLE
 from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.strides import one_stride
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -61,8 +63,8 @@ class Chase:
         if done.wants_full:
             grown = self.tree.full_job(cell)()
             done = self.tree.adopt(grown, self.pace, cell, [], self.version, [])
-        if self.tree.wants_corridors:
-            self.tree.take_corridors(self.tree.corridor_job().run())
+        if self.tree.wants_strides:
+            self.tree.take_strides(self.tree.stride_job().run())
         self.widths.append(done.window.row1 - done.window.row0)
         return done
 
@@ -268,35 +270,53 @@ def schedule() -> Figure:
 
 
 def strides() -> Figure:
-    """A thin wall, under strides of four cells and under corridors."""
+    """A thin wall, under a lattice of every eighth cell and under blocks of as many."""
     pace = _hills(64, 96, seed=8, strength=0.9)
     pace[14:64, 30] = np.inf
     pace[0:46, 62] = np.inf
-    start, target = (50, 8), (18, 84)
-    chase = Chase(pace, target, strategy="full")
+    start, target = (52, 4), (20, 84)
     figure, (left, right) = _figure(2, (9.2, 3.6))
     _ground(left, pace)
-    jumped = lattice_route(pace, start, target, stride=4)
+    jumped = lattice_route(pace, start, target, stride=8)
     crossed = [
         (a, b) for a, b in pairwise(jumped) if any(not math.isfinite(pace[row, col]) for row, col in _between(a, b))
     ]
-    rows, cols = np.mgrid[2:64:4, 0:96:4]
-    left.plot(cols.ravel(), rows.ravel(), ".", ms=1.6, color="#8b8371")
+    rows, cols = np.mgrid[4:64:8, 4:96:8]
+    left.plot(cols.ravel(), rows.ravel(), ".", ms=2.4, color="#8b8371")
     _route(left, jumped, RED)
     for a, b in crossed:
         left.plot((a[1] + b[1]) / 2, (a[0] + b[0]) / 2, "x", ms=11, mew=2.6, color=BLACK)
-    left.set_title("Strides of 4: the route passes through two walls")
-    traffic = _traffic(chase)
-    right.imshow(np.where(traffic > 0, traffic, np.nan), cmap="Blues", norm=LogNorm(4, traffic.max()))
-    right.imshow(np.where(np.isfinite(pace), np.nan, 1.0), cmap=_WALL)
-    right.grid(False)
-    right.set(xticks=[], yticks=[])
-    _route(right, chase.trail(start), GREEN)
-    right.set_title("Corridors: dark cells carry the traffic of many")
+    left.set_title("Every eighth cell: the route passes through two walls")
+    _ground(right, pace)
+    for line in range(0, 97, 8):
+        right.axvline(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
+        right.axhline(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
+    centres, ways = _network(pace, stride=8)
+    for way in ways:
+        right.plot(way[:, 1], way[:, 0], color=BLUE, lw=0.8, alpha=0.7)
+    right.plot(centres[:, 1], centres[:, 0], "o", ms=2.6, color=BLUE)
+    _route(right, Chase(pace, target, strategy="full").trail(start), GREEN)
+    right.set(xlim=(-0.5, 95.5), ylim=(63.5, -0.5), title="Nodes and links of a stride of 8, and the route")
     for axes in (left, right):
         _vehicle(axes, start)
         _target(axes, target)
     return figure
+
+
+def _network(pace: Pace, stride: int) -> tuple[Trail, list[Trail]]:
+    """(n, 2) places of the centres of a stride's nodes, and those of the way of each link."""
+    grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
+    costs = CostGrid(grid, PlannerConfig())
+    costs.load(pace)
+    centre, links = one_stride(costs, stride)
+    moves = np.stack((STEP_ROW, STEP_COL), axis=1)
+    begins = np.cumsum(links.length) - links.length
+    ways = []
+    for node, begin, length in zip(links.ends[0], begins, links.length, strict=True):
+        steps = moves[links.paths[begin : begin + length]]
+        start = np.array(divmod(int(centre[node]), costs.stride)) - 1
+        ways.append(np.concatenate([[start], start + np.cumsum(steps, axis=0)]))
+    return np.stack(np.divmod(centre.astype(np.int64), costs.stride), axis=1) - 1, ways
 
 
 def _between(a: Any, b: Any) -> list[Place]:
@@ -304,15 +324,6 @@ def _between(a: Any, b: Any) -> list[Place]:
     return [
         (round(a[0] + (b[0] - a[0]) * n / many), round(a[1] + (b[1] - a[1]) * n / many)) for n in range(many + 1)
     ]
-
-
-def _traffic(chase: Chase) -> NDArray[np.int64]:
-    """(rows, cols): how many cells' routes pass each cell."""
-    passed = np.zeros(chase.pace.shape, np.int64)
-    for row, col in np.argwhere(np.isfinite(chase.pace)):
-        trail = chase.trail((int(row), int(col)))
-        passed[trail[:, 0], trail[:, 1]] += 1
-    return passed
 
 
 # --- how it looks -----------------------------------------------------------------------------------------------

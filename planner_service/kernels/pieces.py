@@ -65,7 +65,7 @@ ROOT_PIECE = np.uint8(252)
 _UNKNOWN = np.uint8(254)
 NO_PIECE = np.uint8(255)
 
-LOOK, REHOOK = np.uint8(1), np.uint8(2)
+LOOK, REHOOK, _WAITS, _CHANGED = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
 FINEST = 2.0**-46
 """Of a cost: what is offered less than by this is not taken. Sums of the same numbers in another order differ by a
 32nd of it; it keeps costs within so much a step of the optimum."""
@@ -288,26 +288,31 @@ def _hook_tile(t, grid, labels, pieces, tiles, names):
         total[y, LENGTH] = local[i] + step_cost(rule, cell_cost[v + offsets[way]], way)
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i4, i8[::1], i4[::1], i8[::1])")
-def evaluate(grid, labels, pieces, tiles, names, now, order, stack, todo):
-    """Totals := what is driven from each exit to the root. Returns how many tiles are to be looked at, and writes
-    them to `todo`: those where it is wanted, and where totals have changed unevenly about them.
-
-    now    a number greater than in the last call
-    order  all tiles; it is quicker where those nearest the root come first, as then what is read was just written
-    """
+@helper
+def _add_up(t, pieces, tiles):
+    """Totals of a tile := what its exits are offered. Returns whether one has changed."""
     total, hook = pieces
-    exits, many, _, wanted, falls, ends, across = tiles
-    for t in range(many.size):
-        if wanted[t] & REHOOK:
-            _hook_tile(t, grid, labels, pieces, tiles, names)
-            wanted[t] &= ~REHOOK
+    exits, many = tiles[0], tiles[1]
+    changed = False
+    for j in range(many[t]):
+        y = t * ROOM + np.int64(exits[t * ROOM + j])
+        next = np.int64(hook[y, HOOK])
+        cost = total[y, LENGTH] + (total[next, TOTAL] if next >= 0 else 0.0)
+        changed |= cost != total[y, TOTAL]
+        total[y, TOTAL] = cost
+    return changed
+
+
+@helper
+def _add_up_all(pieces, tiles, order, now, stack):
+    """The same for all tiles, each piece after the one that it leads into."""
+    total, hook = pieces
+    exits, many, _, wanted, _, _, _ = tiles
     for n in range(order.size):
         t = order[n]
-        least, most, near, far = np.inf, -np.inf, np.inf, 0.0
+        wanted[t] = (wanted[t] & LOOK) | _CHANGED
         for j in range(many[t]):
-            own = t * ROOM + np.int64(exits[t * ROOM + j])
-            y = own
+            y = t * ROOM + np.int64(exits[t * ROOM + j])
             steps = 0
             while y >= 0 and hook[y, STAMP] != now:
                 stack[steps] = y
@@ -319,21 +324,69 @@ def evaluate(grid, labels, pieces, tiles, names, now, order, stack, todo):
                 cost += total[y, LENGTH]
                 total[y, TOTAL] = cost
                 hook[y, STAMP] = now
-            cost = total[own, TOTAL]
-            change = 0.0
-            if cost < np.inf or total[own, BEFORE] < np.inf:
-                change = cost - total[own, BEFORE]
-            total[own, BEFORE] = cost
-            least = min(least, change)
-            most = max(most, change)
-            near = min(near, cost)
-            far = max(far, cost)
-        falls[0, t] = least
-        falls[1, t] = most
-        ends[0, t] = near
-        ends[1, t] = far
-    count = 0
+
+
+@helper
+def _note_changes(t, pieces, tiles):
+    """Write `falls` and `ends` of a tile whose totals have changed."""
+    total = pieces[0]
+    exits, many, _, _, falls, ends, _ = tiles
+    least, most, near, far = np.inf, -np.inf, np.inf, 0.0
+    for j in range(many[t]):
+        y = t * ROOM + np.int64(exits[t * ROOM + j])
+        cost = total[y, TOTAL]
+        change = 0.0
+        if cost < np.inf or total[y, BEFORE] < np.inf:
+            change = cost - total[y, BEFORE]
+        total[y, BEFORE] = cost
+        least = min(least, change)
+        most = max(most, change)
+        near = min(near, cost)
+        far = max(far, cost)
+    falls[0, t] = least
+    falls[1, t] = most
+    ends[0, t] = near
+    ends[1, t] = far
+
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i8[::1], i4, i4[::1], i8[::1])")
+def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
+    """Totals := what is driven from each exit to the root. Returns how many tiles are to be looked at, and writes
+    them to `todo`: those where it is wanted, and where totals have risen by more than others about them.
+
+    order  all tiles, those nearest the root first
+    now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
+    If not, tiles about one whose totals have changed are added up, sweep by sweep. That takes a tenth of the time
+    where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way it ends, as
+    no piece leads to itself.
+    """
+    _, many, _, wanted, falls, ends, across = tiles
     down = many.size // across
+    for t in range(many.size):
+        falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
+        if wanted[t] & REHOOK:
+            _hook_tile(t, grid, labels, pieces, tiles, names)
+            wanted[t] = (wanted[t] & ~REHOOK) | _WAITS | _CHANGED
+    if now:
+        _add_up_all(pieces, tiles, order, now, stack)
+    again = not now
+    while again:
+        again = False
+        for n in range(order.size):
+            t = order[n]
+            if not wanted[t] & _WAITS:
+                continue
+            wanted[t] &= ~_WAITS
+            if _add_up(t, pieces, tiles):
+                wanted[t] |= _CHANGED
+                want(tiles, t, _WAITS)
+                wanted[t] &= ~_WAITS
+                again = True
+    for t in range(many.size):
+        if wanted[t] & _CHANGED:
+            wanted[t] &= ~_CHANGED
+            _note_changes(t, pieces, tiles)
+    count = 0
     for row in range(down):
         for col in range(across):
             t = row * across + col

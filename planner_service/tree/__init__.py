@@ -1,1 +1,1 @@
-"""The cost-to-go tree of one target: edge costs, growth, windows, corridors, lower bounds, routes."""
+"""The cost-to-go tree of one target: edge costs, growth, windows, strides, lower bounds, routes."""

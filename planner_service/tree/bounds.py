@@ -61,18 +61,17 @@ class LowerBounds:
         Raises ValueError where a start is no padded cell.
         """
         grid = self._grid
-        lowest, most = grid.lowest_cell_cost, grid.grid.cells
         if tree.exact:
             cost = tree.cost_at(starts) if cost is None else cost
-            steps = np.minimum(cost / lowest, most) + 4.0  # as `kernels` bounds them
-            bound = cost * np.maximum(1.0 - steps * kernels.ROUNDING, 0.0)
+            bound = cost * (1.0 - grid.rounding(cost))
         else:
             bound = np.zeros(starts.size)
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
+            steps = self._lowest, grid.grid.cells
             kernels.bound_by_heuristic(
-                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, self._lowest, most, bound
+                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, *steps, bound
             )
         # Of the optimum only the share that is travel time counts.
         return bound * grid.time_share

@@ -25,6 +25,7 @@ from planner_service.kernels.layout import (
     PaddedGrid,
     step_offsets,
 )
+from planner_service.kernels.lower_bounds import ROUNDING
 from planner_service.tree.growth import grow_tree
 from planner_service.tree.padded_climbs import padded_climbs, with_scratch
 from shared_map.arrays import Bools, Floats, private_copy
@@ -407,6 +408,13 @@ class CostGrid:
         ):
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
+
+    def rounding(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far float32 may have put the labels of an exact tree off that cost so much (s), relatively: a route
+        has no more steps than its cost has lowest cell costs, or than there are cells. `kernels.lower_bounds` takes
+        the same."""
+        steps = np.minimum(cost / self.lowest_cell_cost, self.grid.cells) + 4.0
+        return np.minimum(steps * ROUNDING, 1.0)
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

@@ -15,17 +15,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import corridor_growth, route_walk
+from planner_service.kernels import route_walk, stride_growth
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
 from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.mend import Walk, make_walk, mend
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
-from planner_service.tree.corridors import INNER, CorridorGraph
 from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
 from planner_service.tree.growth import FINE, KeptScratch, grow_tree
 from planner_service.tree.padded_climbs import climbs_in
+from planner_service.tree.strides import StrideNetwork
 from shared_map.arrays import Floats
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
@@ -47,8 +47,8 @@ class CostToGoTree:
         """The map that the tree lies on. Whoever changes it calls `repair`, or grows the tree anew."""
         self.cost: Floats = np.empty(0, np.float32)
         """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. Empty
-        before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_corridors`, `tighten`, `relabel`
-        and `repair` change it."""
+        before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten`, `relabel` and
+        `repair` change it."""
         self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way."""
         self.root = -1
@@ -58,7 +58,7 @@ class CostToGoTree:
         `take`, `mend` and `relabel` reset it."""
         self.exact = False
         """Whether cost-to-go is exact on the map as it is now (then the offset is 0). `grow`, `take` and `mend` set
-        it, `move` to another root and `grow_corridors` reset it, `repair` keeps it."""
+        it, `move` to another root and `grow_strides` reset it, `repair` keeps it."""
         self.reach = 0.0
         """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
         self.window_bound: WindowBound | None = None
@@ -69,10 +69,10 @@ class CostToGoTree:
         self._walk: Walk | None = None
         """Scratch of `mend`. None until needed."""
         self._stamps: NDArray[np.uint8] | None = None
-        """uint8, padded: `_now` or `_now + 1` where a cost was recomputed since ways changed last. None until
+        """uint8, padded: `_now` where a cost was recomputed since ways changed last. None until
         needed."""
-        self._now = 2
-        """Raised by 2 whenever ways change, so that all stamps are old; begins anew with new stamps at 254."""
+        self._now = 1
+        """Raised whenever ways change, so that all stamps are old; begins anew with new stamps at 255."""
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -110,23 +110,24 @@ class CostToGoTree:
             raise ValueError("the tree has no root: grow it first")
         return self.cost, self.parent, self.cost_grid.pad(self.root)
 
-    def grow_corridors(self, window: Window, corridors: CorridorGraph) -> int:
-        """After a window around the root was grown: renew what lies beyond, on the cells of corridors only, from
-        distance to twice that distance for four times the traffic. All others keep their parents. Returns cells
-        visited. Raises OutsideGridError on a window that is not inside the grid."""
-        labels = self._labels
+    def grow_strides(self, window: Window, network: StrideNetwork, far: int) -> int:
+        """After a window around the root was grown: renew what lies beyond, on the ways of ever wider strides only.
+        All other cells keep their parents.
+
+        far  cells; how far from the root
+        The least stride is for distances up to twice as far as the window reaches, the next for twice that, and so
+        on. Returns cells visited. Raises OutsideGridError on a window that is not inside the grid.
+        """
+        grid = self.cost_grid
         box = self._box(window)
+        row, col = divmod(self.root, grid.grid.cols)
+        half = max(row - box[0], col - box[1], box[2] - 1 - row, box[3] - 1 - col)
+        scratch = stride_growth.make_scratch(len(network.arrays[0]), grid.size)
+        stamps = self._stamps_now(), self._now
+        visited: int = stride_growth.grow_strides(
+            *(grid.padded, grid.climbs, self._labels, network.arrays, stamps, box, (2 * half, far), scratch)
+        )
         self.exact = False
-        inner = min(max(window.row1 - window.row0, window.col1 - window.col0), INNER)
-        heap, waiting, visited = corridor_growth.make_heap(box), -1, 0
-        while waiting:
-            more, waiting = corridor_growth.grow_corridors(
-                *(self.cost_grid.padded, self.cost_grid.climbs, labels),
-                *(corridors.level, self._stamps_now(), self._now),
-                *(box, inner, heap, waiting, self._trail),
-            )
-            visited += more
-            heap = corridor_growth.larger_heap(heap)
         self._ways_changed()
         return visited
 
@@ -254,7 +255,7 @@ class CostToGoTree:
             grid = self.cost_grid
             stamps = self._stamps_now()
             ways = grid.padded, grid.climbs, self._labels
-            corridor_growth.tighten(*ways, stamps, self._now, cells, self._trail)
+            stride_growth.tighten(*ways, stamps, self._now, cells, self._trail)
 
     @property
     def _trail(self) -> NDArray[np.uint32]:
@@ -270,7 +271,7 @@ class CostToGoTree:
         """What was tightened before need not be right any more."""
         self._now += 2
         if self._now > 254:
-            self._now = 2
+            self._now = 1
             self._stamps = None
 
     def relabel(self) -> None:

@@ -32,8 +32,7 @@ class PieceTree:
                before the first `take`
     root       the target's cell, of the grid; -1 before the first `take`
     exact      whether all costs are the least there are. `take` sets it; a `move` or a `repair` that gives way
-    resets
-               it. The tree then still leads to its root, and states what is driven
+               resets it. The tree then still leads to its root, and states what is driven
     """
 
     def __init__(self, cost_grid: CostGrid) -> None:
@@ -73,8 +72,11 @@ class PieceTree:
         self.parent = parent
         self.root = root
         self._wanted[:] = LOOK | REHOOK
+        row, col = (at // SIDE for at in self.cost_grid.grid.row_col(root))
+        rows, cols = np.divmod(np.arange(self._count), self._across)
+        self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
         self._relabel(np.arange(self._count))
-        self._settle(math.inf)
+        self._settle(math.inf, True)
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, exactly; the window holds it and the old root.
@@ -107,7 +109,7 @@ class PieceTree:
             *(cost, parent, box, old_root, way, changed),
         )
         self._relabel(np.flatnonzero(changed))
-        return self._settle(MOST_LOOKS * self._count + 64)
+        return self._settle(MOST_LOOKS * self._count + 64, True)
 
     def _in_window(self, cell: int, window: Window) -> int:
         row, col = self.cost_grid.grid.row_col(cell)
@@ -125,7 +127,7 @@ class PieceTree:
             self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
         )
         self._relabel(np.flatnonzero(changed))
-        looked = self._settle(MOST_LOOKS * self._count + 64)
+        looked = self._settle(MOST_LOOKS * self._count + 64, False)
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
         pieces_mend.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
         return looked
@@ -139,17 +141,23 @@ class PieceTree:
     def _relabel(self, which: Cells) -> None:
         pieces.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
 
-    def _settle(self, most: float) -> int:
+    def _settle(self, most: float, moved: bool) -> int:
+        """Look at tiles until the tree is exact, or gives way to a growth once it has looked at `most`.
+
+        moved  totals have changed nearly everywhere
+        """
         grid = self.cost_grid.padded
+        self._now += moved
+        now = self._now if moved else 0
         order = np.argsort(self._ends[0])
         looked = rounds = mended = 0
         while True:
-            self._now += 1
             rounds += 1
             count = pieces.evaluate(
                 *(grid, self._labels, self._pieces, self._tiles, self._bench[0]),
-                *(self._now, order, self._stack, self._todo),
+                *(order, now, self._stack, self._todo),
             )
+            now = 0
             if not count or looked + 2 * mended > most:
                 break
             todo = self._todo[:count]

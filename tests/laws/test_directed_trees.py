@@ -25,9 +25,9 @@ from support.planner_strategies import (
 
 from planner_service.kernels import repair as kernels
 from planner_service.kernels.layout import NONE
-from planner_service.tree.corridors import find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import find_strides
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
@@ -176,17 +176,17 @@ def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_along_corridors_no_cost_is_below_what_is_driven(seed: int) -> None:
+def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
     ground = Ground(seed, RULES[seed], 64, 64)
     tree, costs = ground.tree, ground.costs
-    corridors = find_corridors(costs)
+    network = find_strides(costs)
     visited = 0
     for _ in range(6):
         there = [cell for _, cell in costs.grid.neighbours(tree.root) if np.isfinite(ground.pace.flat[cell])]
         cell = int(ground.rng.choice(there or [tree.root]))
-        window = costs.grid.around(cell, 4)
+        window = costs.grid.around(cell, 16)
         if tree.move(cell, window):
-            visited += tree.grow_corridors(window, corridors)
+            visited += tree.grow_strides(window, network, 64)
         starts = np.flatnonzero(np.isfinite(tree.cost) & (tree.parent != NONE))
         driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
         assert (tree.cost[starts] + tree.offset >= driven * (1 - 1e-5)).all()

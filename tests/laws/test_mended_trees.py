@@ -15,9 +15,9 @@ from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
 from planner_service import target_tree
-from planner_service.tree.corridors import find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import find_strides
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
@@ -51,11 +51,11 @@ class Mended:
         self.costs.load(self.pace)
         self.tree = CostToGoTree(self.costs)
         self.tree.grow(int(self.rng.choice(np.flatnonzero(np.isfinite(self.pace)))))
-        self.corridors = find_corridors(self.costs)
+        self.network = find_strides(self.costs)
         self.mended = self.done = 0
 
     def mistreat(self) -> None:
-        """Moves, of one cell or several, by windows that are narrow; marks; corridors; marks beyond repair."""
+        """Moves, of one cell or several, by windows that are narrow; marks; strides; marks beyond repair."""
         for _ in range(int(self.rng.integers(1, 6))):
             what = int(self.rng.integers(5))
             if what < 3:
@@ -72,7 +72,7 @@ class Mended:
         if np.isfinite(self.pace[row, col]) and tree.move(grid.cell(row, col), window):
             self.done += 1
             if self.rng.integers(4) == 0:
-                tree.grow_corridors(window, self.corridors)
+                tree.grow_strides(window, self.network, 40)
 
     def _mark(self, count: int, side: int) -> None:
         windows = []
@@ -104,7 +104,7 @@ class Mended:
 
 
 @pytest.mark.parametrize("priced", WAYS_TO_PRICE, ids=str)
-def test_after_windows_jumps_marks_and_corridors_a_mended_tree_is_a_grown_one_bit_for_bit(
+def test_after_windows_jumps_marks_and_strides_a_mended_tree_is_a_grown_one_bit_for_bit(
     priced: dict[str, Any],
 ) -> None:
     mended = done = 0

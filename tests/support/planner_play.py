@@ -13,8 +13,8 @@ from support.planner_strategies import Job, Marks, Move
 from planner_service.full_growth import GrownTree
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
-from planner_service.tree.corridors import CorridorSearch
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import StrideSearch
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -45,7 +45,7 @@ class Play:
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])
         self.grown: GrownTree | None = None
-        self.search: CorridorSearch | None = None
+        self.search: StrideSearch | None = None
         self.since: list[Window] = []
         self.rules: dict[str, Any] = {
             "climb": climb,
@@ -70,8 +70,8 @@ class Play:
         elif event.what == "begin":
             job = self.tree.full_job(self.target)
             self.grown = job()
-            if self.tree.wants_corridors:
-                self.search = self.tree.corridor_job()
+            if self.tree.wants_strides:
+                self.search = self.tree.stride_job()
             self.since = []
         elif event.what == "end" and self.grown is not None:
             self.tree.adopt(
@@ -79,7 +79,7 @@ class Play:
             )
             self.grown = None
             if self.search is not None:
-                self.tree.take_corridors(self.search.run())
+                self.tree.take_strides(self.search.run())
                 self.search = None
         elif event.what == "force":
             self.tree.force([0, self.grid.cells - 1])

@@ -16,7 +16,7 @@ import numpy as np
 from rich.table import Table
 
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.planning.route_oracle import Cells, Driven, Ground, Seconds
+from launch_scripts.bench.planning.route_oracle import Cells, Driven, Seconds, best_costs, drive
 from launch_scripts.bench.tables import Progress, table
 from planner_service.full_growth import GrownTree
 from planner_service.kernel_build import load_all
@@ -187,14 +187,14 @@ class Life:
         followed = self._some(5)
         self._tree.adopt(self._grown, self._pace, self._target, self._dirty, self._version, followed)
         self._grown = None
-        if self._tree.wants_corridors:
-            self._tree.take_corridors(self._tree.corridor_job().run())
+        if self._tree.wants_strides:
+            self._tree.take_strides(self._tree.stride_job().run())
 
     def _check(self) -> None:
         if not self._tree.ready:
             return
-        ground = Ground(self._grid, self.config, self._pace, self._climb)
-        best_s = ground.best(self._target)
+        ground = self._grid, self.config, self._pace, self._climb
+        best_s = best_costs(*ground, self._target)
         every = np.arange(self._grid.cells)
         if self._rng.random() < 0.5:  # what a cut route says must not need the whole one to have been asked for
             cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
@@ -206,7 +206,7 @@ class Life:
         self._check_statuses(whole, best_s)
         self._check_statuses(cut, best_s)
         there = np.flatnonzero(np.isfinite(best_s) & (whole.statuses == OK) & (cut.statuses == OK))
-        driven, first = ground.drive(whole), ground.drive(cut)
+        driven, first = drive(*ground, whole), drive(*ground, cut)
         self._note("legal", np.where(driven.last[there] == self._target, 0.0, math.inf), 0.0)
         if not (driven.last[there] == self._target).all():
             return
@@ -215,7 +215,7 @@ class Life:
             self._note("bound", _above(routes.lower_bound_s[there], best_s[there]), _FLOAT64)
         self._note("optimum", _above(best_s[there], driven.time_s[there]), _FLOAT64)
         if self._tree.strategy.on_move is OnMove.WHOLE_TREE:
-            best = ground.best(self._target, self.config.length_weight)[there]
+            best = best_costs(*ground, self._target, self.config.length_weight)[there]
             asked = driven.time_s[there] + self.config.length_weight * whole.length_m[there]
             self._note("exact", _above(asked, best), self._grid.cells * 2.0**-23)
         self._check_alone(whole, cut, there)

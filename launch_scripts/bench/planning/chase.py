@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.bench.machine import memory_free
 from launch_scripts.bench.planning.fields import Field
+from launch_scripts.bench.planning.route_oracle import drive
 from launch_scripts.bench.tables import Progress
 from launch_scripts.world.walks import WALKS, Budget, Walker, WalkWorld
 from planner_service.strategy import ROWS, STAGES
@@ -67,6 +68,11 @@ class Plan:
     seed: int = 1
 
 
+BROKEN = ("below_own_bound", "bound_above_optimum", "below_optimum", "stated_is_not_driven")
+"""Laws, by how a violation is called. An exact tree's routes are upper bounds of the optimum, and what it proves is
+a lower one: neither needs a tolerance. A stated cost is driven within 1e-6."""
+
+
 @dataclasses.dataclass
 class Tally:
     """Measurements of one strategy.
@@ -78,6 +84,7 @@ class Tally:
     batches    in how many groups the targets were run, as their trees did not fit into memory together
     gaps       one array per judged frame: cost of each route over the optimum
     proven     the same over the certificate's lower bound
+    broken     how often a route broke a law of `BROKEN`: of each a figure, that should be 0
     """
 
     frame_ms: list[float] = dataclasses.field(default_factory=list)
@@ -86,18 +93,26 @@ class Tally:
     proven: list[NDArray[np.float64]] = dataclasses.field(default_factory=list)
     updates: dict[str, int] = dataclasses.field(default_factory=dict)
     batches: int = 1
+    broken: dict[str, int] = dataclasses.field(default_factory=lambda: dict.fromkeys(BROKEN, 0))
 
     def count(self, kind: str) -> None:
         self.updates[kind] = self.updates.get(kind, 0) + 1
 
-    def judge(self, routes: RouteBatch, optimum: NDArray[np.float32]) -> None:
-        """Compares routes, whole or with the cost that remains after them, with the costs of an exact tree."""
+    def judge(self, routes: RouteBatch, driven_s: NDArray[np.float64], exact: RouteBatch) -> None:
+        """Compares routes, whole or with the cost that remains after them, with those of an exact tree.
+
+        driven_s  float64 (n,), s; what driving each of them takes, by an oracle; inf where one breaks a rule
+        """
         # The target's own cell has no gap, and cells without a route have none either.
         counts = (routes.statuses == OK) & (routes.cost_s > 0)
         cost, bound = routes.cost_s[counts], routes.lower_bound_s[counts]
+        best, driven = exact.cost_s[counts], driven_s[counts]
+        laws = (cost < bound, bound > best, cost < exact.lower_bound_s[counts], ~(np.abs(cost / driven - 1) < 1e-6))
+        for law, broken in zip(BROKEN, laws, strict=True):
+            self.broken[law] += int(np.count_nonzero(broken))
         with np.errstate(divide="ignore"):
-            self.gaps.append(np.maximum(cost / optimum[counts], 1.0))
-            self.proven.append(np.maximum(cost / bound, 1.0))
+            self.gaps.append(cost / best)
+            self.proven.append(cost / bound)
 
     def add(self, other: Tally) -> None:
         """Adds another run of the same strategy."""
@@ -105,6 +120,8 @@ class Tally:
         self.start_ms = max(self.start_ms, other.start_ms)
         self.gaps += other.gaps
         self.proven += other.proven
+        for law, many in other.broken.items():
+            self.broken[law] += many
         for kind, count in other.updates.items():
             self.updates[kind] = self.updates.get(kind, 0) + count
 
@@ -125,6 +142,7 @@ class Tally:
             "proven_p50": _figure(proven, _p50),
             "proven_p95": _figure(proven, _p95),
             "routes_judged": int(gaps.size),
+            "violations": dict(self.broken),
             "batches": self.batches,
             "updates": dict(sorted(self.updates.items())),
         }
@@ -180,9 +198,9 @@ def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int, tel
             racer.frame(frame, crowd)
         if frame % plan.judge_every == plan.judge_every - 1:
             n = frame // plan.judge_every % len(crowd.targets)
-            cells, optimum = crowd.asked(n)
+            exact = crowd.exact_routes(n)
             for racer in running:
-                racer.judged(n, cells, optimum)
+                racer.judged(n, exact)
         running = [racer for racer in running if not racer.done(frame, plan.seconds / batches)]
         tell(RUN_IN + frame + 1)
         if not running:
@@ -225,10 +243,10 @@ class _Crowd:
             if self._plan.speed:
                 self.places[n] = self._driven(n)
 
-    def asked(self, n: int) -> tuple[Cells, NDArray[np.float32]]:
-        """Cells from which target n is judged, and the optimal costs to it."""
+    def exact_routes(self, n: int) -> RouteBatch:
+        """The first steps of optimal routes to target n, from where it is judged."""
         cells = self.places[n] if self._plan.speed else self._field.draw(self._plan.probes, self._rng)
-        return cells, self._tree_of(n).cost_to_go_at(cells)
+        return self._tree_of(n).routes(cells, 1)
 
     def _driven(self, n: int) -> Cells:
         routes = self._tree_of(n).routes(self.places[n], self._plan.speed)
@@ -249,7 +267,8 @@ class _Racer:
         self, config: PlannerConfig, field: Field, targets: int, tally: Tally, plan: Plan, first: bool
     ) -> None:
         self.tally = tally
-        self._pace = field.pace
+        self._field = field
+        self._config = config
         self._plan = plan
         self._strategy = config.strategy
         self._trees = [TargetTree(field.grid, config) for _ in range(targets)]
@@ -292,8 +311,12 @@ class _Racer:
         else:
             self.tally.frame_ms[frame] += took_ms
 
-    def judged(self, n: int, cells: Cells, optimum: NDArray[np.float32]) -> None:
-        self.tally.judge(self._trees[n].routes(cells, self._plan.max_cells), optimum)
+    def judged(self, n: int, exact: RouteBatch) -> None:
+        routes = self._trees[n].routes(exact.starts, self._plan.max_cells)
+        whole = self._trees[n].routes(exact.starts) if self._plan.max_cells else routes
+        driven = drive(self._field.grid, self._config, self._field.pace, None, whole)
+        there = driven.last == self._trees[n].target_cell
+        self.tally.judge(routes, np.where(there, driven.time_s, math.inf), exact)
 
     def done(self, frame: int, seconds: float) -> bool:
         if self._frames is not None:
@@ -309,13 +332,13 @@ class _Racer:
         """Follows a move of the target. A full growth, asked for or due by `grow`, is adopted at once."""
         tree = self._trees[n]
         began_ns = time.thread_time_ns()
-        update = tree.update(self._pace, cell, [], 0)
+        update = tree.update(self._field.pace, cell, [], 0)
         if update.kind == "full":
             tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
         elif update.kind == "exact":
             tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
-        if tree.wants_corridors:
-            tree.take_corridors(tree.corridor_job().run())
+        if tree.wants_strides:
+            tree.take_strides(tree.stride_job().run())
         if count:
             self.tally.count(update.kind)
         if not (update.wants_full or grow):
@@ -323,7 +346,7 @@ class _Racer:
         began_ns = time.thread_time_ns()
         grown = tree.full_job(cell)()
         tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
-        tree.adopt(grown, self._pace, cell, [], 0, followed)
+        tree.adopt(grown, self._field.pace, cell, [], 0, followed)
         if count:
             self.tally.count("job")
 

@@ -101,3 +101,15 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
             )
         yield shown
     yield "Gap: driven cost over the optimum; proven: over a certificate's lower bound; - is no bound."
+    yield _violations(rows)
+
+
+def _violations(rows: list[dict[str, Any]]) -> str:
+    judged = sum(row["routes_judged"] for row in rows)
+    found = [
+        f"{many:,} of {row['strategy']} {law.replace('_', ' ')}"
+        for row in rows
+        for law, many in row["violations"].items()
+        if many
+    ]
+    return f"{judged:,} routes driven step by step: {', '.join(found) or 'no violation'}."

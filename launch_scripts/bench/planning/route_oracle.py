@@ -17,6 +17,8 @@ from swarm.wire.routes import RouteBatch
 Cells = NDArray[np.int64]
 Seconds = NDArray[np.float64]
 
+_ROWS, _COLS = np.array(STEP_ROW), np.array(STEP_COL)
+
 
 class Driven(NamedTuple):
     """What became of routes that were driven step by step.
@@ -29,62 +31,67 @@ class Driven(NamedTuple):
     time_s: Seconds
 
 
-class Ground:
-    """All steps of a map as it is now.
+def best_costs(
+    grid: GridSpec,
+    config: PlannerConfig,
+    pace: Floats,
+    climb: Climb | None,
+    target: int,
+    length_weight: float = 0.0,
+) -> Seconds:
+    """Of each cell the least sum of time and `length_weight`, s/m, times length over all ways to the target, by
+    scipy on the reversed graph; inf where there is none."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import dijkstra
 
-    to      int64 (8, cells), where each step leads; -1 where there is none
-    time_s  float64 (8, cells), s; inf where there is none
-    length_m  float64 (8,)
-    """
+    every = np.arange(grid.cells)
+    tails, heads, costs = [], [], []
+    for code in range(8):
+        there, taken = _step(grid, config, pace, climb, every, np.full(grid.cells, code))
+        tail = np.flatnonzero(there >= 0)
+        length_m = grid.resolution_m * (math.sqrt(2) if code % 2 and config.edge == "octile" else 1.0)
+        tails.append(tail)
+        heads.append(there[tail])
+        costs.append(taken[tail] + length_weight * length_m)
+    backward = (np.concatenate(heads), np.concatenate(tails))
+    graph = csr_matrix((np.concatenate(costs), backward), shape=(grid.cells, grid.cells))
+    found: NDArray[np.float64] = dijkstra(graph, indices=np.array([target]))
+    best: Seconds = found[0]
+    return best
 
-    def __init__(self, grid: GridSpec, config: PlannerConfig, pace: Floats, climb: Climb | None) -> None:
-        cols = grid.cols
-        row, col = np.divmod(np.arange(grid.cells), cols)
-        free = np.pad(np.isfinite(pace), 1)
-        of_pace = np.pad(pace.astype(np.float64), 1, constant_values=math.inf)
-        self.length_weight = config.length_weight
-        self.length_m = np.full(8, grid.resolution_m)
-        if config.edge == "octile":
-            self.length_m[1::2] *= math.sqrt(2)
-        self.to = np.full((8, grid.cells), -1, np.int64)
-        self.time_s = np.full((8, grid.cells), math.inf)
-        for code in range(0, 8, 2 if config.neighbours == 4 else 1):
-            r, c = row + STEP_ROW[code], col + STEP_COL[code]
-            legal = free[row + 1, col + 1] & free[r + 1, c + 1]
-            if code % 2 and not config.corner_cutting:
-                legal &= free[row + 1, c + 1] & free[r + 1, col + 1]
-            here, there = np.flatnonzero(legal), (r * cols + c)[legal]
-            seconds = of_pace[r + 1, c + 1][legal] * self.length_m[code]
-            if climb is not None:
-                seconds = seconds * climb.along(here, there)
-            allowed = np.isfinite(seconds)
-            self.to[code, here[allowed]] = there[allowed]
-            self.time_s[code, here[allowed]] = seconds[allowed]
 
-    def best(self, target: int, length_weight: float = 0.0) -> Seconds:
-        """Of each cell the least sum of time and `length_weight`, s/m, times length over all ways to the target, by
-        scipy on the reversed graph; inf where there is none."""
-        from scipy.sparse import csr_matrix
-        from scipy.sparse.csgraph import dijkstra
+def drive(grid: GridSpec, config: PlannerConfig, pace: Floats, climb: Climb | None, routes: RouteBatch) -> Driven:
+    """Every route of a batch, step by step from its start to the end of what is given of it."""
+    last, seconds = np.array(routes.starts), np.zeros(len(routes))
+    begin = np.concatenate(([0], routes.ends[:-1])).astype(np.int64)
+    steps = routes.ends - begin
+    order = np.argsort(-steps, kind="stable")
+    for n in range(int(steps.max(initial=0))):
+        going = order[: np.searchsorted(-steps[order], -n, side="left")]
+        going = going[last[going] >= 0]
+        code = routes.directions[begin[going] + n].astype(np.int64)
+        there, taken = _step(grid, config, pace, climb, last[going], code)
+        last[going] = there
+        seconds[going] += taken
+    return Driven(last, seconds)
 
-        code, tail = np.nonzero(self.to >= 0)
-        cost = self.time_s[code, tail] + length_weight * self.length_m[code]
-        cells = self.to.shape[1]
-        backward = csr_matrix((cost, (self.to[code, tail], tail)), shape=(cells, cells))
-        found: NDArray[np.float64] = dijkstra(backward, indices=np.array([target]))
-        best: Seconds = found[0]
-        return best
 
-    def drive(self, routes: RouteBatch) -> Driven:
-        """Every route of a batch from its start to the end of what is given of it."""
-        last, seconds = np.array(routes.starts), np.zeros(len(routes))
-        begin = np.concatenate(([0], routes.ends[:-1])).astype(np.int64)
-        steps = routes.ends - begin
-        order = np.argsort(-steps, kind="stable")
-        for n in range(int(steps.max(initial=0))):
-            going = order[: np.searchsorted(-steps[order], -n, side="left")]
-            going = going[last[going] >= 0]
-            code, cell = routes.directions[begin[going] + n], last[going]
-            seconds[going] += self.time_s[code, cell]
-            last[going] = self.to[code, cell]
-        return Driven(last, seconds)
+def _step(
+    grid: GridSpec, config: PlannerConfig, pace: Floats, climb: Climb | None, here: Cells, code: Cells
+) -> tuple[Cells, Seconds]:
+    """Where a step leads from each cell and what it takes, s; -1 and inf where the rules forbid it."""
+    row, col = np.divmod(here, grid.cols)
+    r, c = row + _ROWS[code], col + _COLS[code]
+    inside = (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.cols)
+    r, c, diagonal = np.where(inside, r, row), np.where(inside, c, col), code % 2 == 1
+    there = r * grid.cols + c
+    length_m = np.where(diagonal & (config.edge == "octile"), math.sqrt(2), 1.0) * grid.resolution_m
+    taken = pace[r, c].astype(np.float64) * length_m
+    if climb is not None:
+        taken = taken * climb.along(here, there)
+    legal = inside & np.isfinite(pace[row, col]) & np.isfinite(taken)
+    if config.neighbours == 4:
+        legal &= ~diagonal
+    elif not config.corner_cutting:
+        legal &= ~diagonal | (np.isfinite(pace[row, c]) & np.isfinite(pace[r, col]))
+    return np.where(legal, there, -1), np.where(legal, taken, math.inf)

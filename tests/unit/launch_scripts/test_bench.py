@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,17 @@ from typer.testing import CliRunner
 from launch_scripts.bench.cli import app
 from launch_scripts.bench.isolated import measure
 from launch_scripts.bench.planning import library_adapters as rivals
-from launch_scripts.bench.planning.chase import FEWEST, Plan, Tally, chase
+from launch_scripts.bench.planning.certificate_checks import LAWS
+from launch_scripts.bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
 from launch_scripts.bench.planning.cold_start import tables
 from launch_scripts.bench.planning.fields import FIELDS, Field, make_field
 from launch_scripts.bench.planning.scale import points_of
 from launch_scripts.bench.planning.tree_process import MODULE
 from launch_scripts.bench.wire import partition
+from planner_service.tree.bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
-from swarm.wire.routes import NO_TARGET, OK, RouteBatch
+from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, RouteStatus
 
 STRATEGIES = (
     "auto",
@@ -193,6 +196,23 @@ def test_the_gap_on_real_elevation_stays_small(model: str) -> None:
     assert report["rows"][0]["proven_p50"] >= report["rows"][0]["gap_p50"]
 
 
+def test_certificates_are_checked_by_a_command() -> None:
+    report = bench("certificates", "--checks", "2000", "--seed", "3")
+    assert report["checks"] >= 2000
+    assert report["violations"] == 0
+    assert set(report["laws"]) == set(LAWS)
+
+
+def test_the_command_says_which_life_broke_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    true = LowerBounds.at
+    monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1.01)
+    done = CliRunner().invoke(app, ["certificates", "--checks", "2000", "--seed", "4", "--json"])
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)["laws"]["bound"]
+    assert found["violations"] > 0
+    assert found["seed"] == 4
+
+
 def test_all_strategies_see_the_same_moves_and_a_seed_repeats_them() -> None:
     field = Field(make_field("terrain", 64))
     plan = Plan(targets=2, vehicles=6, frames=12, seed=5)
@@ -231,11 +251,22 @@ def test_only_routes_that_exist_are_judged() -> None:
         np.zeros(3, np.int64),
         *(np.array(values) for values in ([3.0, np.inf, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0])),
     )
-    tally.judge(routes, np.array([2.0, 1.0, 0.0], np.float32))
+    tally.judge(routes, np.array([3.0, np.inf, 0.0]), replace(routes, cost_s=np.array([2.0, np.inf, 0.0])))
     row = tally.row()
     assert row["gap_mean"] == row["gap_max"] == 1.5
     assert row["routes_judged"] == 1
     assert row["proven_p95"] is None, "no bound is no number"
+    assert set(row["violations"].values()) == {0}
+
+
+def test_a_violation_is_counted_and_clips_no_figure() -> None:
+    tally = Tally(frame_ms=[1.0])
+    one = RouteBatch.of([Route(status=RouteStatus.OK, start=0, cost_s=3.0, lower_bound_s=3.3)])
+    tally.judge(one, np.array([3.1]), replace(one, cost_s=np.array([3.2]), lower_bound_s=np.array([3.15])))
+    row = tally.row()
+    assert row["violations"] == dict.fromkeys(BROKEN, 1)
+    assert row["gap_max"] == round(3.0 / 3.2, 5)
+    assert row["proven_p95"] == round(3.0 / 3.3, 5)
 
 
 def test_the_paper_s_tables_have_its_rows() -> None:

@@ -12,9 +12,9 @@ from support.planner_strategies import random_pace
 
 from planner_service.prepared_costs import PreparedCosts, prepared_costs
 from planner_service.target_tree import TargetTree
-from planner_service.tree import corridors
-from planner_service.tree.corridors import CorridorSearch, find_corridors
+from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.strides import StrideSearch, find_strides
 from shared_map.terrain.kept import fetch_kept, keep
 from shared_map.terrain.terrain import Terrain, load_prepared, save_prepared, terrain_of_pace
 from swarm.config.scenario import PlannerConfig
@@ -47,7 +47,7 @@ def test_a_tree_on_shared_costs_is_the_one_on_its_own_to_the_bit_whatever_is_mar
         for tree in (one, other):
             tree.update(pace, target, dirty, version)
             if version == 4:
-                tree.take_corridors(tree.corridor_job().run())
+                tree.take_strides(tree.stride_job().run())
             if version % 3 == 2:
                 tree.adopt(tree.full_job(target)(), pace, target, [], version, [])
         np.testing.assert_array_equal(one._costs.cell_cost, other._costs.cell_cost)
@@ -61,64 +61,75 @@ def test_a_tree_on_shared_costs_is_the_one_on_its_own_to_the_bit_whatever_is_mar
     assert {path.name: path.read_bytes() for path in tmp_path.glob("*.npy")} == before
 
 
-def test_one_planner_finds_the_corridors_and_all_others_take_them(
+@pytest.fixture
+def short_strides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks of three strides on a small map."""
+    monkeypatch.setattr(strides, "LEAST", 1)
+
+
+@pytest.mark.usefixtures("short_strides")
+def test_one_planner_finds_the_strides_and_all_others_take_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     terrain = mapped(tmp_path)
     ground = CostGrid(terrain.grid, CONFIG)
     ground.load(PACE)
-    expected = find_corridors(ground).level
+    expected = find_strides(ground)
     shelves = [PreparedCosts(tmp_path, terrain, CONFIG) for _ in range(3)]
-    searches = [CorridorSearch(ground, shelf) for shelf in shelves]
-    grown = []
-    grow = CostGrid.grow
-    monkeypatch.setattr(CostGrid, "grow", lambda self, *rest: grown.append(1) or grow(self, *rest))
-    while any(search.level is None for search in searches):
+    searches = [StrideSearch(ground, shelf) for shelf in shelves]
+    found = []
+    find = strides._find_stride
+    monkeypatch.setattr(strides, "_find_stride", lambda *rest: found.append(1) or find(*rest))
+    while any(search.network is None for search in searches):
         for search in searches:
-            if search.level is None:
+            if search.network is None:
                 search.step()
-    assert len(grown) == 8
+    assert len(found) == 3
     for search in searches:
-        np.testing.assert_array_equal(search.level, expected)
-    searches[1].level[:] = 255  # a planner lets cells around its marks take part
-    np.testing.assert_array_equal(shelves[2].load(), expected)
+        assert search.network is not None
+        for one, other in zip(search.network.arrays, expected.arrays, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+    assert searches[1].network is not None
+    searches[1].network.arrays[0][:] = 0  # one planner's own
+    np.testing.assert_array_equal(shelves[2].load(), expected.packed())
 
 
-def test_corridors_are_kept_with_the_terrain_for_the_next_run(
+def test_strides_are_kept_with_the_terrain_for_the_next_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     terrain = mapped(tmp_path / "one")
     keep("key", (tmp_path / "one").glob("*.npy"))
-    level = np.arange(92 * 82, dtype=np.uint8)
-    PreparedCosts(tmp_path / "one", terrain, CONFIG, "key").leave(level)
+    packed = np.arange(92 * 82, dtype=np.uint8)
+    PreparedCosts(tmp_path / "one", terrain, CONFIG, "key").leave(packed)
     assert fetch_kept("key", tmp_path / "two")
     found = PreparedCosts(tmp_path / "two", mapped(tmp_path / "two"), CONFIG, "key").load()
-    np.testing.assert_array_equal(found, level)
-    PreparedCosts(tmp_path / "one", terrain, CONFIG, "missing").leave(level)  # not kept, and nothing is wrong
+    np.testing.assert_array_equal(found, packed)
+    PreparedCosts(tmp_path / "one", terrain, CONFIG, "missing").leave(packed)  # not kept, and nothing is wrong
     with caplog.at_level(logging.WARNING):
-        (corridors,) = (tmp_path / "cache" / "terrain-swarm" / "terrain" / "key").glob("corridors*")
-        corridors.unlink()
-        corridors.write_bytes(b"damaged")
+        (kept,) = (tmp_path / "cache" / "terrain-swarm" / "terrain" / "key").glob("strides*")
+        kept.unlink()
+        kept.write_bytes(b"damaged")
         assert not fetch_kept("key", tmp_path / "three")
     assert "is damaged" in caplog.text
 
 
+@pytest.mark.usefixtures("short_strides")
 def test_where_the_finder_ends_another_goes_on(tmp_path: Path) -> None:
     terrain = mapped(tmp_path)
     ground = CostGrid(terrain.grid, CONFIG)
     ground.load(PACE)
     first, second = (PreparedCosts(tmp_path, terrain, CONFIG) for _ in range(2))
-    CorridorSearch(ground, first).step()
-    waiting = CorridorSearch(ground, second)
-    assert [waiting.step().level for _ in range(20)] == [None] * 20
+    StrideSearch(ground, first).step()
+    waiting = StrideSearch(ground, second)
+    assert [waiting.step().network for _ in range(20)] == [None] * 20
     assert first._claimed is not None
     first._claimed.close()  # as at the end of its process
-    assert waiting.run().level is not None
+    assert waiting.run().network is not None
 
 
-def test_corridors_of_the_map_before_marks_learn_the_marks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(corridors, "AROUND", 2)
+def test_strides_of_the_map_before_marks_learn_the_marks(tmp_path: Path) -> None:
     terrain = mapped(tmp_path)
     tree = TargetTree(terrain.grid, CONFIG)
     shared = PreparedCosts(tmp_path, terrain, CONFIG)
@@ -127,13 +138,10 @@ def test_corridors_of_the_map_before_marks_learn_the_marks(tmp_path: Path, monke
     pace[40, 40] = 9.0
     target = int(np.flatnonzero(np.isfinite(pace))[0])
     tree.update(pace, target, [Window(40, 40, 41, 41)], 1)
-    tree.take_corridors(tree.corridor_job(shared).run())
-    graph = tree._corridors.graph
-    assert graph is not None
-    assert graph.level.reshape(92, 82)[41, 41] == 255
-    found = shared.load()
-    assert found is not None
-    assert found.reshape(92, 82)[41, 41] != 255
+    tree.take_strides(tree.stride_job(shared).run())
+    network = tree._strides.network
+    assert network is not None
+    assert np.flatnonzero(network._changed).tolist() == [2 * (82 // 16 + 1) + 2]
 
 
 @pytest.mark.parametrize(
@@ -141,14 +149,14 @@ def test_corridors_of_the_map_before_marks_learn_the_marks(tmp_path: Path, monke
     [{"length_weight": 1.0}, {"neighbours": 4}, {"corner_cutting": True}, {"edge": "paper"}],
     ids=lambda change: next(iter(change)),
 )
-def test_corridors_of_other_rules_are_never_taken(tmp_path: Path, other: dict[str, object]) -> None:
+def test_strides_of_other_rules_are_never_taken(tmp_path: Path, other: dict[str, object]) -> None:
     terrain = mapped(tmp_path)
     PreparedCosts(tmp_path, terrain, CONFIG).leave(np.zeros(92 * 82, np.uint8))
     assert PreparedCosts(tmp_path, terrain, CONFIG).load() is not None
     assert PreparedCosts(tmp_path, terrain, msgspec.structs.replace(CONFIG, **other)).load() is None
 
 
-def test_costs_and_corridors_of_another_terrain_are_never_taken(tmp_path: Path) -> None:
+def test_costs_and_strides_of_another_terrain_are_never_taken(tmp_path: Path) -> None:
     PreparedCosts(tmp_path, mapped(tmp_path), CONFIG).leave(np.zeros(92 * 82, np.uint8))
     pace = PACE.copy()
     pace[3, 3] *= 2
@@ -164,7 +172,7 @@ def test_damaged_files_are_computed_anew_and_that_is_said(tmp_path: Path, caplog
     good = PreparedCosts(tmp_path, terrain, CONFIG)
     expected = good.cell_cost.copy()
     good.leave(np.zeros(92 * 82, np.uint8))
-    for path in (*tmp_path.glob("cell-costs*.npy"), *tmp_path.glob("corridors*.npy")):
+    for path in (*tmp_path.glob("cell-costs*.npy"), *tmp_path.glob("strides*.npy")):
         whole = path.read_bytes()
         path.unlink()
         path.write_bytes(whole[:-100])
@@ -173,6 +181,21 @@ def test_damaged_files_are_computed_anew_and_that_is_said(tmp_path: Path, caplog
         assert again.load() is None
     assert caplog.text.count("is damaged") == 2
     np.testing.assert_array_equal(again.cell_cost, expected)
+
+
+def test_a_file_of_strides_in_which_a_bit_has_turned_is_not_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Kernels check no index that they read from it."""
+    shelf = PreparedCosts(tmp_path, mapped(tmp_path), CONFIG)
+    shelf.leave(np.arange(200, dtype=np.uint8))
+    (path,) = tmp_path.glob("strides*.npy")
+    turned = bytearray(path.read_bytes())
+    turned[-100] ^= 4
+    path.write_bytes(turned)
+    with caplog.at_level(logging.WARNING):
+        assert shelf.load() is None
+    assert "its digest is another" in caplog.text
 
 
 def test_without_a_folder_that_can_be_written_a_planner_computes_its_own(tmp_path: Path) -> None:

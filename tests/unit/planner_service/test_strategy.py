@@ -41,7 +41,7 @@ def kinds_of_moves(config: PlannerConfig, row: StrategyRow, moves: int) -> list[
     tree = TargetTree(GRID, config, chosen_by=row)
     tree.update(pace, GRID.cell(48, 20), [], 0)
     updates = [tree.update(pace, GRID.cell(48, 21 + n), [], 0) for n in range(moves)]
-    asked = "~" if tree.wants_corridors else ""
+    asked = "~" if tree.wants_strides else ""
     return [update.kind + ("!" if update.wants_full else "") + asked for update in updates]
 
 

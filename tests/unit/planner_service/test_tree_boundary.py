@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
@@ -84,11 +84,11 @@ def test_what_is_read_must_be_a_padded_cell(tree: CostToGoTree, cell: int) -> No
     [Window(-1, 0, 4, 4), Window(0, -1, 4, 4), Window(0, 0, 9, 4), Window(0, 0, 4, 10), Window(4, 4, 4, 8)],
 )
 def test_a_window_lies_inside_the_grid(tree: CostToGoTree, window: Window) -> None:
-    corridors = find_corridors(tree.cost_grid)
+    network = find_strides(tree.cost_grid)
     with pytest.raises(OutsideGridError):
         tree.move(1, window)
     with pytest.raises(OutsideGridError):
-        tree.grow_corridors(window, corridors)
+        tree.grow_strides(window, network, 9)
 
 
 @pytest.mark.parametrize(("root", "window"), [(1, Window(0, 1, 4, 4)), (70, Window(0, 0, 4, 4))])

@@ -1,4 +1,4 @@
-"""WindowSchedule and corridors: what is grown near the target, and what far from it."""
+"""WindowSchedule and strides: what is grown near the target, and what far from it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from support import slow_twins as naive
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
-from planner_service import growth_times, target_tree
+from planner_service import growth_times
 from planner_service.strategy import Auto, Growths
-from planner_service.tree import corridors as corridor_graphs
-from planner_service.tree.corridors import CorridorGraph, find_corridors
+from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import find_strides
 from planner_service.tree.windows import AHEAD, WindowSchedule
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -36,19 +36,18 @@ def thin_walls(rng: np.random.Generator, side: int, doors: float) -> np.ndarray:
 
 
 @pytest.fixture
-def small_corridors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows and corridors as they are on a large map, in the sizes of a small one."""
-    monkeypatch.setattr(corridor_graphs, "LEAST", 3)
-    monkeypatch.setattr(corridor_graphs, "AROUND", 2)
-    monkeypatch.setattr("planner_service.tree.cost_to_go.INNER", 6)
+def short_strides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows and strides as they are on a large map, in the sizes of a small one."""
+    monkeypatch.setattr(strides, "LEAST", 1)
+    monkeypatch.setattr(growth_times, "LEAST", 1)
+    monkeypatch.setattr(growth_times, "FINE", 2)
     monkeypatch.setattr(growth_times, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
-    monkeypatch.setattr(target_tree, "WIDE_SHARE", 64)
 
 
-@pytest.mark.usefixtures("small_corridors")
+@pytest.mark.usefixtures("short_strides")
 @pytest.mark.parametrize("rules", RULES)
 @pytest.mark.parametrize("strategy", COARSE)
-def test_rings_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: dict) -> None:
+def test_strides_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: dict) -> None:
     rng = np.random.default_rng(3)
     config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, **rules)  # type: ignore[arg-type]
     play = Play(thin_walls(rng, 32, 0.5), config)
@@ -68,18 +67,18 @@ def test_rings_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: dic
     play.check()
 
 
-@pytest.mark.usefixtures("small_corridors")
-def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
+@pytest.mark.usefixtures("short_strides")
+def test_far_from_the_target_strides_hold_where_windows_alone_drift() -> None:
     """The target crosses the map; nothing is grown whole. Mean gap of all cells at the end."""
     rng = np.random.default_rng(8)
     pace = random_pace(rng, 60, 60, 30.0, 0.05)
     pace[30] = 1.0
     gaps = {}
-    for has_corridors in (False, True):
+    for has_strides in (False, True):
         play = Play(pace.copy(), PlannerConfig(strategy="multi_resolution", k_min=0))
         play.target = 30 * 60 + 2
         play.tree.update(play.pace, play.target, [], 0)
-        if has_corridors:
+        if has_strides:
             play.happen(Job("begin"))
             play.happen(Job("end"))
         for _ in range(50):
@@ -87,35 +86,22 @@ def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
         routes = play.tree.routes(np.arange(3600))
         optimum = naive.cost_to_go(pace, play.target, **play.rules).reshape(-1)
         some = np.isfinite(optimum) & (optimum > 0)
-        gaps[has_corridors] = float((routes.cost_s[some] / optimum[some]).mean())
+        gaps[has_strides] = float((routes.cost_s[some] / optimum[some]).mean())
     assert gaps[True] < 1.03
     assert gaps[False] > 1.1
 
 
-def test_a_corridor_is_where_the_traffic_is() -> None:
-    """A valley between two plains has one cheap pass: everything drives through it."""
-    pace = np.full((64, 64), 1.0, np.float32)
-    pace[:, 32] = np.inf
-    pace[20, 32] = 1.0
-    ground = CostGrid(GridSpec(64, 64, 1.0), PlannerConfig())
-    ground.load(pace)
-    level = find_corridors(ground).level.reshape(66, 66)[1:-1, 1:-1]
-    assert level[20, 32] == level.max()
-    assert (level[pace == np.inf] == 0).all()
-
-
-def test_marks_let_all_cells_around_them_take_part_until_too_many_do() -> None:
+def test_networks_are_found_anew_once_cells_have_changed_all_over_the_map() -> None:
     ground = CostGrid(GridSpec(128, 128, 1.0), PlannerConfig())
     pace = np.ones((128, 128), np.float32)
     ground.load(pace)
-    corridors = CorridorGraph(np.zeros(ground.size, np.uint8))
-    pace[60, 60] = np.inf
-    assert corridors.learn(ground, ground.apply(pace, [Window(60, 60, 61, 61)]))
-    level = corridors.level.reshape(130, 130)
-    assert (level[54:69, 54:69] == corridor_graphs.EVERYWHERE).all()
-    assert corridors.stale_cells == 24 * 24
+    network = find_strides(ground)
+    pace[60:70, 60:70] = np.inf
+    assert network.learn(ground, ground.apply(pace, [Window(60, 60, 70, 70)]))
+    pace[60:70, 60:70] = 3.0
+    assert network.learn(ground, ground.apply(pace, [Window(60, 60, 70, 70)]))
     pace[:] = 2.0
-    assert not corridors.learn(ground, ground.apply(pace, [Window(0, 0, 128, 128)]))
+    assert not network.learn(ground, ground.apply(pace, [Window(0, 0, 128, 128)]))
 
 
 @given(st.integers(0, 2**31), st.integers(1, 60))

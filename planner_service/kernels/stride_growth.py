@@ -1,0 +1,207 @@
+"""New costs spreading over the networks of strides, ever wider ones the further from the root.
+
+`grow_strides` is Dijkstra's algorithm (E. W. Dijkstra 1959) with a binary heap over the nodes of `stride_network`:
+what a link costs was found with the network and says only in which order nodes are taken and by which link each is
+reached. What cells cost is read from the map as it is now, step by step along that link.
+
+Arrays, beside those of `layout`:
+    stamp  uint8  (size,)  whether a cost has been recomputed: `now` if it has, less if not
+    trail  uint32 (size,)  the cells of a way
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels.climbs import CLIMBS, offered
+from planner_service.kernels.compile import helper, step_kernel
+from planner_service.kernels.heap import heap_lower, heap_pop
+from planner_service.kernels.layout import BOX, GRID, INF, LABELS, NONE, check_cells, step_length
+
+Network = tuple[
+    NDArray[np.uint32],
+    NDArray[np.uint8],
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.float32],
+    NDArray[np.uint32],
+    NDArray[np.int32],
+    NDArray[np.uint8],
+]
+"""The nodes of all strides, and what leads from one to another: (centre, doublings, first, other, price, begin,
+steps, paths).
+
+centre     uint32 (nodes,), a padded cell of each
+doublings  uint8 (nodes,), ascending: its stride is two to the power of this
+first      int32 (nodes + 1,), where each node's links begin in the arrays that follow
+other      int32, the node that a link leads to
+price      float32, s, what its way cost when it was found
+begin      uint32, where its way begins in `paths`
+steps      int32, how many steps that has; where it is `paths` backward, from `begin` down, less than 0: ~steps
+paths      uint8, directions
+"""
+
+NETWORK = "Tuple((u4[::1], u1[::1], i4[::1], i4[::1], f4[::1], u4[::1], i4[::1], u1[::1]))"
+
+Scratch = tuple[
+    NDArray[np.float32],
+    NDArray[np.int64],
+    NDArray[np.int32],
+    NDArray[np.float32],
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.uint32],
+]
+"""Of a heap: keys, items, places; of each node: the lowest key so far, -inf once it is settled or where it takes no
+part; its link, and from which node that leads; a trail."""
+
+
+def make_scratch(nodes: int, cells: int) -> Scratch:
+    """For so many nodes and padded cells."""
+    return (
+        np.empty(nodes, np.float32),
+        np.empty(nodes, np.int64),
+        np.empty(nodes, np.int32),
+        np.empty(nodes, np.float32),
+        np.empty(nodes, np.int32),
+        np.empty(nodes, np.int32),
+        np.empty(cells, np.uint32),
+    )
+
+
+@helper
+def _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail):
+    """As `tighten`, for one padded cell. Returns cells visited."""
+    many = 0
+    while stamp[v] < now and parent[v] != NONE:
+        trail[many] = v
+        many += 1
+        v += offsets[parent[v]]
+    if stamp[v] < now:  # no way leads from here
+        return 0
+    for j in range(many - 1, -1, -1):
+        v = np.int64(trail[j])
+        k = parent[v]
+        u = v + offsets[k]
+        odd = np.int64(k & 1)
+        driven = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
+        cost[v] = min(cost[v], driven)
+        stamp[v] = now
+    return many
+
+
+@step_kernel(f"({GRID}, CLIMBS, {LABELS}, u1[::1], i8, i8[::1], u4[::1])", CLIMBS)
+def tighten(grid, climbs, labels, stamp, now, cells, trail):
+    """Lower costs, which are upper bounds, to what is driven along the parents, less the tree's offset: of `cells`
+    (int64, padded) and of all on their ways to the root.
+
+    They stay at least what the parent offers. Cells whose stamp is `now` are taken to be right, and those that
+    become so are stamped. Returns cells visited. Raises ValueError where one is no padded cell.
+    """
+    check_cells(cells, stamp.size)
+    cell_cost, offsets, _, rule, _ = grid
+    cost, parent, root = labels
+    visited = 0
+    stamp[root] = now
+    for i in range(cells.size):
+        visited += _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, cells[i], trail)
+    return visited
+
+
+@step_kernel(
+    f"({GRID}, CLIMBS, {LABELS}, {NETWORK}, Tuple((u1[::1], i8)), {BOX}, UniTuple(i8, 2),"
+    " Tuple((f4[::1], i8[::1], i4[::1], f4[::1], i4[::1], i4[::1], u4[::1])))",
+    CLIMBS,
+)
+def grow_strides(grid, climbs, labels, network, stamps, box, reach, scratch):
+    """Let the costs of a window around the root spread outward over the networks of strides.
+
+    stamps  (stamp, now)
+    box     the window, whose costs are new
+    reach   cells: the least stride is for distances from the root up to the first, the next one for up to twice
+            that, and so on; none for more than the second
+
+    Along each link a cell is tightened, then offered what the one before it offers. Only what gets cheaper is
+    rewritten, with its parent, so that costs stay upper bounds and grow strictly along every way. Where a step has
+    become impossible the cells beyond keep their own ways, and it goes on from there. Returns cells visited.
+    """
+    cost, _, root = labels
+    centre, _, first, other, price, _, _, _ = network
+    keys, items, place, lowest, by, source, _ = scratch
+    stamps[0][root] = stamps[1]
+    size = _seed(cost, network, grid[2], root, box, reach, scratch)
+    visited = 0
+    while size > 0:
+        n = items[0]
+        heap_pop(keys, items, place, size)
+        size -= 1
+        lowest[n] = -INF
+        if by[n] >= 0:
+            begins = np.int64(centre[source[n]])
+            visited += _follow(grid, climbs, labels, network, stamps, by[n], begins, scratch[6])
+        base = cost[centre[n]]
+        for i in range(first[n], first[n + 1]):
+            key = base + price[i]
+            if key < lowest[other[i]]:
+                lowest[other[i]] = key
+                by[other[i]] = i
+                source[other[i]] = n
+                size = heap_lower(keys, items, place, size, key, np.int64(other[i]))
+    return visited
+
+
+@helper
+def _seed(cost, network, stride, root, box, reach, scratch):
+    """Begin the heap with the nodes of the least stride inside the window, and shut out those of the wrong stride.
+
+    A node takes part where its stride is the one for its distance, or a block nearer or further: the centre of any
+    cell's node is less than a block away. Returns how many are in the heap.
+    """
+    centre, doublings = network[0], network[1]
+    keys, items, place, lowest, by, _, _ = scratch
+    row0, col0, row1, col1 = box
+    root_row, root_col = root // stride, root % stride
+    size = np.int64(0)
+    for n in range(centre.size):
+        v = np.int64(centre[n])
+        row = v // stride
+        col = v - row * stride
+        away = max(abs(row - root_row), abs(col - root_col))
+        block = np.int64(1) << np.int64(doublings[n])
+        far = reach[0] << np.int64(doublings[n] - doublings[0])
+        begins = doublings[n] == doublings[0] or away + block >= far >> 1
+        ends = doublings[n] == doublings[centre.size - 1] or away - block <= far
+        place[n] = -1
+        by[n] = -1
+        lowest[n] = INF if begins and ends and away - block <= reach[1] else -INF
+        inside = row0 < row <= row1 and col0 < col <= col1  # rows and columns are padded ones
+        if inside and doublings[n] == doublings[0] and cost[v] < lowest[n]:
+            lowest[n] = cost[v]
+            size = heap_lower(keys, items, place, size, cost[v], n)
+    return size
+
+
+@helper
+def _follow(grid, climbs, labels, network, stamps, link, u, trail):
+    """Offer costs along the way of a link, from a cell on. Returns cells visited."""
+    cell_cost, offsets, _, rule, corners = grid
+    cost, parent, _ = labels
+    stamp, now = stamps
+    begin, steps, paths = np.int64(network[5][link]), network[6][link], network[7]
+    many = np.int64(max(steps, ~steps))
+    visited = many
+    for j in range(many):
+        k = np.int64(paths[begin + j] if steps >= 0 else (paths[begin - j] + 4) & 7)
+        v = u + offsets[k]
+        if stamp[v] < now:
+            visited += _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail)
+        odd = k & 1
+        offer = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
+        shut = max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
+        if offer < cost[v] and cell_cost[v] < INF and (corners or not odd or not shut):
+            cost[v] = offer
+            parent[v] = (k + 4) & 7
+            stamp[v] = now
+        u = v
+    return visited

@@ -1,0 +1,286 @@
+"""The networks of strides on which far cells are planned (section 3.3.3): found, shared, and found anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels import stride_network
+from planner_service.kernels.stride_growth import Network
+from planner_service.tree.cost_grid import Cells, Changes, CostGrid
+from shared_map.arrays import Bools, Bytes, Floats
+
+LEAST = 4
+"""Doublings of the least stride that has a network: 16 cells. Shorter strides are single steps, near the target: a
+network as dense as they would need holds about as many cells as there are."""
+FINE = 8
+"""Strides below the least one are for so many times the narrowest window: there all cells are grown."""
+MOST_SHARE = 8
+"""The largest stride is at most such a share of the map's side."""
+STALE_SHARE = 16
+"""Networks are found anew when cells have changed in one block of the least stride in so many."""
+
+_DTYPES = (np.uint32, np.int32, np.int32, np.float32, np.uint32, np.int32, np.uint8, np.uint8)
+
+
+class StrideNetwork:
+    """Nodes, links and their ways, of every stride: what a coarse growth goes along.
+
+    Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. So marks
+    never make it wrong, only less good.
+
+    arrays  for kernels
+    """
+
+    def __init__(self, arrays: Network) -> None:
+        self.arrays = arrays
+        self._changed: Bools = np.empty(0, np.bool_)
+        """Blocks of the least stride in which a cell has changed since this was found. `learn` sets it."""
+
+    def learn(self, cost_grid: CostGrid, changes: Changes) -> bool:
+        """Cells have changed. False once the networks should be found anew."""
+        across = (cost_grid.stride >> LEAST) + 1
+        if not self._changed.size:
+            self._changed = np.zeros(((cost_grid.size // cost_grid.stride >> LEAST) + 1) * across, np.bool_)
+        rows, cols = np.divmod(changes.cells, cost_grid.stride)
+        self._changed[(rows >> LEAST) * across + (cols >> LEAST)] = True
+        return int(np.count_nonzero(self._changed)) * STALE_SHARE <= self._changed.size
+
+    def packed(self) -> Bytes:
+        """All of it as uint8, for a file."""
+        centre, doublings, first, other, price, begin, steps, paths = self.arrays
+        counts = np.array((centre.size, other.size, paths.size), np.int64)
+        parts = (counts, centre, first, other, price, begin, steps, doublings, paths)
+        return np.concatenate([part.view(np.uint8) for part in parts])
+
+    @classmethod
+    def unpacked(cls, packed: Bytes) -> StrideNetwork:
+        """From what `packed` has made, whose memory it shares."""
+        nodes, links, steps = packed[:24].view(np.int64).tolist()
+        sizes = (nodes, nodes + 1, links, links, links, links, nodes, steps)
+        ends = 24 + np.cumsum([size * np.dtype(dtype).itemsize for size, dtype in zip(sizes, _DTYPES, strict=True)])
+        parts = np.split(packed, ends[:-1])[0:]
+        parts[0] = parts[0][24:]
+        centre, first, other, price, begin, signed, doublings, paths = (
+            part.view(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)
+        )
+        return cls((centre, doublings, first, other, price, begin, signed, paths))
+
+
+class StrideShelf(Protocol):
+    """Where the planners of a machine leave the networks of the map as it is before any mark, so that one of them
+    finds these for all."""
+
+    def load(self) -> Bytes | None:
+        """What one of them has left, as `StrideNetwork.packed`; the caller may write to it."""
+        ...
+
+    def claim(self) -> bool:
+        """Whether the caller is the one to find them: true again at its next call, until `leave` or its end."""
+        ...
+
+    def leave(self, packed: Bytes) -> None:
+        """Leave what was found to all."""
+        ...
+
+
+class StrideSearch:
+    """Finds the networks of a map, the least stride first, each from the ways of the one before.
+
+    A step finds those of one stride, so that a worker has time for other work between them. With a shelf, a step
+    may do nothing while another process is finding the same.
+
+    cost_grid  a snapshot
+    network    None until the search has ended
+    """
+
+    def __init__(self, cost_grid: CostGrid, shelf: StrideShelf | None = None) -> None:
+        self.cost_grid = cost_grid
+        self.network: StrideNetwork | None = None
+        self._shelf = shelf
+        self._strides: Iterator[StrideNetwork | None] | None = None
+
+    def step(self) -> StrideSearch:
+        """Come a step nearer to `network`, which is None now. Returns itself."""
+        if self._strides is None:
+            if self._shelf is not None:
+                packed = self._shelf.load()
+                if packed is not None:
+                    self.network = StrideNetwork.unpacked(packed)
+                if packed is not None or not self._shelf.claim():
+                    return self
+            self._strides = _find(self.cost_grid)
+        self.network = next(self._strides)
+        if self._shelf is not None and self.network is not None:
+            self._shelf.leave(self.network.packed())
+        return self
+
+    def run(self) -> StrideSearch:
+        """All steps at once; not for a search that may wait for another process."""
+        while self.network is None:
+            self.step()
+        return self
+
+
+class StrideUpkeep:
+    """The networks of one tree, from search to search.
+
+    network  None until found, and again once too much has changed
+    """
+
+    def __init__(self) -> None:
+        self.network: StrideNetwork | None = None
+        self._searching = self._found_before = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether to begin a search."""
+        return self.network is None and not self._searching
+
+    def search(self, cost_grid: CostGrid, shelf: StrideShelf | None) -> StrideSearch:
+        """The first search is on the map as it was before any mark, if that is shared, so that all planners of a
+        machine can take the same. Later ones, of networks that have become stale, are on the map as it is."""
+        self._searching = True
+        shared = None if self._found_before else cost_grid.shared
+        self._found_before = True
+        return StrideSearch(cost_grid.snapshot()) if shared is None else StrideSearch(shared, shelf)
+
+    def take(self, cost_grid: CostGrid, search: StrideSearch) -> None:
+        """Go by what was found; what has changed since counts as learnt."""
+        assert search.network is not None
+        self._searching = False
+        self.network = search.network
+        self.learn(cost_grid, cost_grid.changes_since(search.cost_grid.cell_cost))
+
+    def learn(self, cost_grid: CostGrid, changes: Changes) -> None:
+        """The map has changed."""
+        if self.network is not None and changes.cells.size and not self.network.learn(cost_grid, changes):
+            self.network = None
+
+
+def find_strides(cost_grid: CostGrid) -> StrideNetwork:
+    """The networks of a map, at once."""
+    network = StrideSearch(cost_grid).run().network
+    assert network is not None
+    return network
+
+
+def one_stride(cost_grid: CostGrid, stride: int) -> tuple[NDArray[np.uint32], Links]:
+    """The centres of the nodes of one stride, padded cells, and its links: searched on all cells of the map."""
+    return _find_stride(cost_grid, stride, _all_cells(cost_grid), np.empty(0, np.int64), 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Links:
+    """Links of one stride.
+
+    ends    int64 (links,) each, nodes: where each way begins and ends
+    price   float32 (links,), s
+    length  int64 (links,), steps of each way
+    paths   uint8, directions, way after way
+    """
+
+    ends: tuple[Cells, Cells]
+    price: Floats
+    length: Cells
+    paths: Bytes
+
+
+def _all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
+    return np.where(cost_grid.cell_cost < np.inf, stride_network.OPEN, np.int32(-1))
+
+
+def _find(grid: CostGrid) -> Iterator[StrideNetwork | None]:
+    """Find one stride at a time; the last of what is yielded is the network."""
+    node = _all_cells(grid)
+    centres: list[NDArray[np.uint32]] = []
+    links: list[Links] = []
+    side = max(grid.grid.rows, grid.grid.cols)
+    most = max(LEAST, (side // MOST_SHARE).bit_length() - 1)
+    for doublings in range(LEAST, most + 1):
+        if centres:
+            yield None
+        below = centres[-1].astype(np.int64) if centres else np.empty(0, np.int64)
+        centre, found = _find_stride(grid, 1 << doublings, node, below, sum(map(len, centres)))
+        centres.append(centre)
+        links.append(found)
+    yield _joined(centres, links)
+
+
+def _find_stride(
+    grid: CostGrid, stride: int, node: NDArray[np.int32], below: Cells, before: int
+) -> tuple[NDArray[np.uint32], Links]:
+    """The centres of one stride's nodes, and all links among them and to those of the stride before.
+
+    node    the cells on ways of the stride before, as `cut_blocks` takes them; written: those of this one
+    below   centres of the stride before, the last of `before` nodes
+    """
+    padded, offsets, size = grid.padded, grid.padded[1], grid.size
+    room = min(stride, grid.grid.rows) * min(stride, grid.grid.cols)
+    most = np.empty(size, np.uint32)
+    many = stride_network.cut_blocks(padded, stride, node, most, np.empty(room, np.uint32))
+    centre = most[:many].copy()
+    del most
+    cost, parent = np.empty(size, np.float32), np.empty(size, np.uint8)
+    depth, place = np.empty(size, np.int32), np.empty(size, np.int32)
+    heap = np.empty(room, np.float32), np.empty(room, np.int64)
+    stride_network.find_ways_to_centres(padded, node, centre, cost, parent, depth, (*heap, place))
+    del place, heap
+    steps, price = _joining_steps(grid, node, cost, many)
+    u, v = steps >> 3, (steps >> 3) + offsets[steps & 7]
+    # The centres of the stride before lie on its ways, so that each is in a node of this one.
+    ends = (
+        np.concatenate((node[u], node[below])) + before,
+        np.concatenate((node[v] + before, np.arange(before - below.size, before))),
+    )
+    price = np.concatenate((price, cost[below]))
+    length = np.concatenate((depth[u] + depth[v] + 1, depth[below])).astype(np.int64)
+    paths = np.empty(int(length.sum()), np.uint8)
+    steps = np.concatenate((steps, ~below))
+    stride_network.write_paths(offsets, parent, depth, steps, np.cumsum(length) - length, paths, centre, node)
+    return centre, Links(ends, price, length, paths)
+
+
+def _joining_steps(grid: CostGrid, node: NDArray[np.int32], cost: Floats, many: int) -> tuple[Cells, Floats]:
+    """The cheapest step of each link, and the price of its way, s; in the order of the map."""
+    room = 1 << (8 * many + 16).bit_length()
+    while True:
+        pairs, prices, steps = np.zeros(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int64)
+        if stride_network.join_nodes(grid.padded, node, cost, many, pairs, prices, steps) >= 0:
+            break
+        room *= 2
+    found = np.flatnonzero(pairs)
+    found = found[np.argsort(steps[found])]
+    return steps[found], prices[found]
+
+
+def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> StrideNetwork:
+    """Every link from both of its ends, by the node that it begins at."""
+    centre = np.concatenate(centres)
+    doublings = np.repeat(np.arange(LEAST, LEAST + len(centres)), [len(part) for part in centres]).astype(np.uint8)
+    from_, to = (np.concatenate([part.ends[n] for part in links]) for n in range(2))
+    length = np.concatenate([part.length for part in links])
+    begin = np.cumsum(length) - length
+    price = np.concatenate([part.price for part in links])
+    source = np.concatenate((from_, to))
+    order = np.argsort(source, kind="stable")
+    first = np.zeros(centre.size + 1, np.int32)
+    np.cumsum(np.bincount(source, minlength=centre.size), out=first[1:])
+    # A way without a step, where a node and the one above have the same centre, is never followed backward.
+    backward = np.where(length > 0, begin + length - 1, 0)
+    return StrideNetwork(
+        (
+            centre,
+            doublings,
+            first,
+            np.concatenate((to, from_))[order].astype(np.int32),
+            np.concatenate((price, price))[order],
+            np.concatenate((begin, backward))[order].astype(np.uint32),
+            np.concatenate((length, ~length))[order].astype(np.int32),
+            np.concatenate([part.paths for part in links]),
+        )
+    )
