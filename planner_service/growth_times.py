@@ -13,6 +13,10 @@ MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
+MODEL_PIECES_NS_PER_CELL = 2
+"""The same of a tree in pieces."""
+PIECES_CELLS = 1 << 19
+"""Maps of so many cells have their exact trees in pieces."""
 INLINE_NS = 100_000_000
 """What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
 takes less, and where there is a worker, so is any other."""
@@ -31,19 +35,22 @@ class GrowthTimes:
     row       of the strategy, in force now
     full_ns   CPU time of a full growth
     exact_ns  CPU time of an exact move, or of mending the tree
+    in_pieces whether exact trees are `PieceTree`s: on large maps, where a cell costs the same from everywhere
     """
 
-    def __init__(self, grid: GridSpec, config: PlannerConfig, has_worker: bool, chosen_by: Strategy | None) -> None:
+    def __init__(
+        self, grid: GridSpec, config: PlannerConfig, has_worker: bool, climbs: bool, chosen_by: Strategy | None
+    ) -> None:
         self._grid = grid
         self.full_ns = self.model_ns
-        self.exact_ns = grid.cells * MODEL_EXACT_NS_PER_CELL
+        self.in_pieces = grid.cells >= PIECES_CELLS and not climbs
+        self.exact_ns = grid.cells * (MODEL_PIECES_NS_PER_CELL if self.in_pieces else MODEL_EXACT_NS_PER_CELL)
         self.row = StrategyRow(OnMove.WHOLE_TREE)
-        self.fine = max(FINE << config.k_min, 1 << LEAST)
-        """How far strides are so short that all cells are grown, in cells: no less than the least block."""
-        self.has_wide_strides = 4 * self.fine <= max(grid.rows, grid.cols)
-        """Whether there are others on this map."""
         self.narrowest = 4 << config.k_min
         """How far the narrowest scheduled window reaches, in cells."""
+        self.fine = max(FINE << config.k_min, 1 << LEAST)
+        """How far strides are so short that all cells are grown, in cells: no less than the least block. On a map
+        where that is half of it there are no others."""
         self.budget_ns = config.cpu_budget * 1e9 / config.tick_hz
         """CPU time that a tick may take. Written by `set_budget`."""
         self._tick_hz = config.tick_hz
@@ -58,7 +65,7 @@ class GrowthTimes:
         self._choose()
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took; not one that found corridors too. A simulation does not call it."""
+        """What a full growth really took; not one that found networks too. A simulation does not call it."""
         if not self._exact_measured:
             self.exact_ns = self.exact_ns * took_ns // self.full_ns
         self.full_ns = max(1, took_ns)
@@ -79,7 +86,7 @@ class GrowthTimes:
         """How far the widest window reaches that is grown without a worker, in cells."""
         if rule is WidestWindow.SHARE_OF_MAP:
             side = max(self._grid.rows, self._grid.cols)
-            return max(self.fine if self.has_wide_strides else self.narrowest, side // FINE_SHARE)
+            return max(self.fine if 4 * self.fine <= side else self.narrowest, side // FINE_SHARE)
         # Over half of the map, a full growth costs as much: that is the worker's.
         share = min(INLINE_NS / self.full_ns, 1.0) / 2
         return math.isqrt(int(share * self._grid.cells)) // 2

@@ -28,14 +28,14 @@ from planner_service.kernels import (
     lower_bounds,
     mend,
     parents,
-    parents_from_root,
     pieces,
     pieces_mend,
-    radix_heap,
     repair,
     route_walk,
     stride_growth,
     stride_network,
+    tied_parents,
+    wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -46,7 +46,8 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, parents_from_root.find_parents_from_root),
+    StepKernel(wide_buckets.grow_by_wide_buckets, None),
+    tied_parents.untie_parents,
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
@@ -104,9 +105,10 @@ def all_kernels() -> list[Kernel]:
 
 
 def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
-    return [
+    found = [
         (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each for each in kernels
     ]
+    return [kernel for kernel in found if kernel is not None]
 
 
 def name_of(kernel: Kernel) -> str:

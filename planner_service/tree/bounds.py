@@ -9,6 +9,7 @@ from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
+from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
@@ -53,7 +54,7 @@ class LowerBounds:
             self._heuristic = None
 
     def at(
-        self, tree: CostToGoTree, starts: NDArray[np.int64], cost: NDArray[np.float64] | None = None
+        self, tree: CostToGoTree | PieceTree, starts: NDArray[np.int64], cost: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """Proven lower bounds, s, on the time from padded cells to the target now.
 

@@ -97,6 +97,13 @@ class CostToGoTree:
         self.reach = reach
         self._become_exact(root)
 
+    def take_parents(self, root: int, parent: NDArray[np.uint8]) -> None:
+        """Become a tree that somebody else made on the map as it is now; costs are what is driven along it. Raises
+        as `take`."""
+        self.take(root, np.empty(self.cost_grid.size, np.float32), parent, 0.0)
+        self.relabel()
+        self.reach = float(self.cost[np.isfinite(self.cost)].max())
+
     def _become_exact(self, root: int) -> None:
         self.root = root
         self.offset = 0.0
@@ -157,7 +164,7 @@ class CostToGoTree:
         kept = self._kept if part.size <= _SMALL else None
         grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, None, kept)
         way = float(cost[old])
-        if not way < math.inf:
+        if not (way < math.inf and self.offset + way <= FINE * grid.lowest_cell_cost):
             return 0
         self.offset += way
         merge_window(cost, box, self.offset, grid.pad(self.root), self.cost, grid.stride)
@@ -277,6 +284,7 @@ class CostToGoTree:
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents, and the offset 0."""
         route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
+        self.reach += self.offset
         self.offset = 0.0
 
     @property

@@ -51,7 +51,7 @@ class Mended:
         self.costs.load(self.pace)
         self.tree = CostToGoTree(self.costs)
         self.tree.grow(int(self.rng.choice(np.flatnonzero(np.isfinite(self.pace)))))
-        self.network = find_strides(self.costs)
+        self.strides = find_strides(self.costs)
         self.mended = self.done = 0
 
     def mistreat(self) -> None:
@@ -72,7 +72,7 @@ class Mended:
         if np.isfinite(self.pace[row, col]) and tree.move(grid.cell(row, col), window):
             self.done += 1
             if self.rng.integers(4) == 0:
-                tree.grow_strides(window, self.network, 40)
+                tree.grow_strides(window, self.strides, 64)
 
     def _mark(self, count: int, side: int) -> None:
         windows = []

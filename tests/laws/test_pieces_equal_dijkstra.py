@@ -5,17 +5,22 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from unittest import mock
 
 import numpy as np
 import pytest
 from support import slow_twins as naive
+from support.planner_play import Play
 from support.planner_strategies import RULES, random_pace
 
+from planner_service import growth_times
 from planner_service.kernels.layout import NONE
+from planner_service.strategy import OnMove
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.pieces import PieceTree
 from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy
 from swarm.grid import GridSpec, Window
 
 FINE = 1e-11
@@ -51,9 +56,15 @@ class Chase:
         row = int(np.clip(row + self.rng.integers(-far, far + 1), 0, rows - 1))
         col = int(np.clip(col + self.rng.integers(-far, far + 1), 0, cols - 1))
         if not np.isfinite(self.pace[row, col]):
-            return
+            row, col = divmod(self.tree.root, cols)
         root = row * cols + col
-        if self.tree.move(root, self.ground.grid.around(root, 2 * far + int(self.rng.integers(1, 24)))) <= 0:
+        window = self.ground.grid.around(root, 2 * far + int(self.rng.integers(1, 24)))
+        connected = self.tree.move(root, window)
+        if connected and self.rng.random() < 0.2:
+            self.go(far)  # two moves before the tree is made exact
+        elif connected:
+            self.tree.mend()
+        if not connected or not self.tree.exact:
             self.gave_way += 1
             self.grow(root)
 
@@ -73,7 +84,8 @@ class Chase:
             windows.append(window)
         if not np.isfinite(self.pace.flat[self.tree.root]):
             self.pace.flat[self.tree.root] = 1.0
-        if self.tree.repair(self.ground.apply(self.pace, windows)) < 0:
+        self.tree.repair(self.ground.apply(self.pace, windows))
+        if not self.tree.exact:
             self.gave_way += 1
             self.grow(self.tree.root)
 
@@ -139,6 +151,22 @@ def test_slow_twin(how: str, count: int) -> None:
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("has_worker", [False, True])
+@pytest.mark.parametrize("strategy", ["exact", "auto"])
+def test_a_target_whose_tree_lies_in_pieces_keeps_the_laws(strategy: Strategy, has_worker: bool) -> None:
+    """Moves, marks, a worker's growths, and under `auto` other rows of the table now and then."""
+    rng = np.random.default_rng(7)
+    with mock.patch.object(growth_times, "PIECES_CELLS", 0):
+        for rules in RULES:
+            pace = random_pace(rng, 70, 75, 6.0, 0.15)
+            play = Play(pace, PlannerConfig(strategy=strategy, cpu_budget=0.5, **rules), has_worker=has_worker)
+            for budget in (0.5, 1e-9, 0.5):
+                kinds = play.walk(rng, 8, 4)
+                in_pieces = isinstance(play.tree._tree, PieceTree)
+                assert in_pieces == (play.tree.strategy.on_move is OnMove.EXACT_MOVE) == ("exact" in kinds)
+                play.tree.times.set_budget(budget if strategy == "auto" else 0.5)
 
 
 def test_a_long_walk_stays_exact() -> None:

@@ -60,7 +60,9 @@ class _Walk:
         self._note("parents", began)
         self.gave_way["parents"] += not exact
         began = time.thread_time_ns()
-        followed = self.pieces.move(self.cell, window) > 0
+        if self.pieces.move(self.cell, window):
+            self.pieces.mend()
+        followed = self.pieces.root == self.cell and self.pieces.exact
         if not followed:
             self.grown.grow(self.cell)
             self.pieces.take(self.cell, self.grown.parent.copy())
