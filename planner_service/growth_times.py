@@ -15,7 +15,7 @@ MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
 MODEL_PIECES_NS_PER_CELL = 2
 """The same of a tree in pieces."""
-PIECES_CELLS = 1 << 19
+PIECES_CELLS = 1 << 18
 """Maps of so many cells have their exact trees in pieces."""
 INLINE_NS = 100_000_000
 """What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
