@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
 
 
@@ -25,6 +26,7 @@ class GrownTree:
     cell_cost    float32, s, the cell costs of the snapshot
     reach        s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
     offered      parents of the tree that was served when the snapshot was taken; None where none led there
+    pieces       the same tree in pieces, on the snapshot, over the same parents; None where that was not asked for
     """
 
     target_cell: int
@@ -35,6 +37,7 @@ class GrownTree:
     cell_cost: Floats
     reach: float
     offered: NDArray[np.uint8] | None
+    pieces: PieceTree | None = None
 
 
 def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
@@ -47,6 +50,7 @@ def growth_job(
     target_cell: int,
     map_version: int,
     offered: NDArray[np.uint8] | None,
+    in_pieces: bool = False,
 ) -> Callable[[], GrownTree]:
     """A pure full growth that releases the interpreter lock. `cost_grid` is a snapshot."""
 
@@ -57,7 +61,13 @@ def growth_job(
         if can_be_root(cost_grid, target_cell):
             reach = cost_grid.grow(cost_grid.pad(target_cell), cost, parent)
         heuristic = cost.copy() if reach >= 0 else cost
-        return GrownTree(target_cell, map_version, cost, heuristic, parent, cost_grid.cell_cost, reach, offered)
+        pieces = None
+        if in_pieces and reach >= 0:
+            pieces = PieceTree(cost_grid)
+            pieces.take(target_cell, parent)
+        return GrownTree(
+            *(target_cell, map_version, cost, heuristic, parent, cost_grid.cell_cost, reach, offered, pieces)
+        )
 
     return job
 
@@ -78,4 +88,4 @@ def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]
     best = cost_grid.rests(grown.parent, root, starts[whole], grown.cell_cost)
     driven = walks.driven[whole]
     gaps: NDArray[np.float64] = driven / best
-    return np.where((gaps < 1.0) & (driven >= best * (1.0 - cost_grid.rounding(best))), 1.0, gaps)
+    return np.where((gaps < 1.0) & (driven >= best * (1.0 - 2.0 * cost_grid.rounding(best))), 1.0, gaps)

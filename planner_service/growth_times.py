@@ -13,6 +13,10 @@ MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
+MODEL_PIECES_NS_PER_CELL = 2
+"""The same of a tree in pieces."""
+PIECES_CELLS = 1 << 19
+"""Maps of so many cells have their exact trees in pieces."""
 INLINE_NS = 100_000_000
 """What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
 takes less, and where there is a worker, so is any other."""
@@ -31,12 +35,16 @@ class GrowthTimes:
     row       of the strategy, in force now
     full_ns   CPU time of a full growth
     exact_ns  CPU time of an exact move, or of mending the tree
+    in_pieces whether exact trees are `PieceTree`s: on large maps, where a cell costs the same from everywhere
     """
 
-    def __init__(self, grid: GridSpec, config: PlannerConfig, has_worker: bool, chosen_by: Strategy | None) -> None:
+    def __init__(
+        self, grid: GridSpec, config: PlannerConfig, has_worker: bool, climbs: bool, chosen_by: Strategy | None
+    ) -> None:
         self._grid = grid
         self.full_ns = self.model_ns
-        self.exact_ns = grid.cells * MODEL_EXACT_NS_PER_CELL
+        self.in_pieces = grid.cells >= PIECES_CELLS and not climbs
+        self.exact_ns = grid.cells * (MODEL_PIECES_NS_PER_CELL if self.in_pieces else MODEL_EXACT_NS_PER_CELL)
         self.row = StrategyRow(OnMove.WHOLE_TREE)
         self.narrowest = 4 << config.k_min
         """How far the narrowest scheduled window reaches, in cells."""

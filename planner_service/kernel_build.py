@@ -28,13 +28,13 @@ from planner_service.kernels import (
     lower_bounds,
     mend,
     parents,
-    parents_from_root,
     pieces,
     pieces_mend,
     repair,
     route_walk,
     stride_growth,
     stride_network,
+    tied_parents,
     wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
@@ -47,7 +47,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
     StepKernel(wide_buckets.grow_by_wide_buckets, None),
-    parents_from_root.find_parents_from_root,
+    tied_parents.untie_parents,
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
@@ -55,6 +55,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.find_starts,
     route_walk.drive_rests,
     cell_costs.cell_cost_range,
+    cell_costs.count_classes,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
 takes longest comes first, so that builders end together."""

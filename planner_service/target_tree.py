@@ -19,6 +19,7 @@ from planner_service.strategy import FullGrowth, OnMove, Strategy, StrategyRow, 
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.pieces import PieceTree
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
 from planner_service.tree.windows import WindowSchedule, block_half, exact_half
@@ -68,7 +69,7 @@ class TargetTree:
         # The cell costs of the map as it was last told, and whether it was told at all.
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
-        self._tree = CostToGoTree(self._costs)
+        self._tree: CostToGoTree | PieceTree = CostToGoTree(self._costs)
         # The tree is of no use and must be grown: before the first, and when the map changed without a target.
         self._stale = True
         # Moves of the target since the whole tree was last exact.
@@ -79,7 +80,7 @@ class TargetTree:
         self._left_to_worker = False
         # The networks of strategies that thin far cells.
         self._strides = StrideUpkeep()
-        self.times = GrowthTimes(grid, config, has_worker, chosen_by)
+        self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
         self._schedule = WindowSchedule(grid, self.times.narrowest)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
@@ -148,7 +149,7 @@ class TargetTree:
         leads_there = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
-        return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered)
+        return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces)
 
     @property
     def wants_strides(self) -> bool:
@@ -191,7 +192,7 @@ class TargetTree:
             if repaired is None or self.times.is_quick(self._grid.cells):
                 return self._grow_full(target_cell)
             return self._leave_to_worker() if target_cell != tree.root else repaired
-        tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
+        tree = self._tree = self._taken(grown)
         self._note_full_growth(grown.target_cell)
         self._bounds.take(grown.heuristic)
         self._is_better_bound = False
@@ -302,11 +303,38 @@ class TargetTree:
         if not self.times.is_quick(self._grid.cells):
             self._stale, self.ready, self.target_cell = True, False, None
             return Update("none", wants_full=not self._job_out)
+        if isinstance(self._tree, PieceTree) is not self._in_pieces:
+            self._tree = PieceTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
         self._tree.grow(target_cell)
         self._stale = False
         self._note_full_growth(target_cell)
         self._bounds_are_old()
         return Update("full", self._grid.window, self._grid.cells)
+
+    @property
+    def _in_pieces(self) -> bool:
+        """Whether the row in force wants the tree in pieces."""
+        return self.times.in_pieces and self.strategy.on_move is OnMove.EXACT_MOVE
+
+    def _taken(self, grown: GrownTree) -> CostToGoTree | PieceTree:
+        """What a worker grew, as a tree on the map as it is now."""
+        if grown.pieces is not None and self._in_pieces:
+            grown.pieces.cost_grid = self._costs
+            return grown.pieces
+        tree = self._tree if isinstance(self._tree, CostToGoTree) else CostToGoTree(self._costs)
+        tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
+        return tree
+
+    def _whole(self) -> CostToGoTree:
+        """The tree, no longer in pieces."""
+        tree = self._tree
+        if isinstance(tree, PieceTree):
+            exact = tree.exact
+            self._tree = whole = CostToGoTree(self._costs)
+            whole.take_parents(tree.root, tree.parent)
+            whole.exact = exact
+            return whole
+        return tree
 
     def _bounds_are_old(self) -> None:
         self._bounds.forget()
@@ -363,6 +391,12 @@ class TargetTree:
         """Lead to the target's new cell, exactly."""
         if self._left_to_worker or not self._can_mend:
             return self._leave_to_worker() if self._left_to_worker else self._give_up(target_cell)
+        if self._in_pieces and not isinstance(self._tree, PieceTree):
+            if not self.times.is_quick(self._grid.cells):
+                return self._leave_to_worker()
+            pieces = PieceTree(self._costs)
+            pieces.take(self._tree.root, self._tree.parent)
+            self._tree = pieces
         cells = 0
         if target_cell != self._tree.root:
             half = exact_half(self._grid, self._tree.root, target_cell)
@@ -374,7 +408,7 @@ class TargetTree:
 
     def _move(self, target_cell: int) -> Update:
         """Grow a window around the target's new cell, a wider one where that fails, at last the whole tree."""
-        tree = self._tree
+        tree = self._whole()
         if self._left_to_worker or not (tree.fine or self.times.is_quick(self._grid.cells)):
             return self._leave_to_worker()
         if not tree.fine:

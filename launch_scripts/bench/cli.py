@@ -275,6 +275,32 @@ def kernels(
 
 
 @app.command()
+def moves(
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
+    field: FieldOption = "terrain",
+    dem: Annotated[Path | None, typer.Option(help="An elevation file, in place of --field.")] = None,
+    moves: Annotated[int, typer.Option(min=1, help="Moves of each walk, one cell each.")] = 100,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Exact trees that follow a target, beside trees that are grown anew.
+
+    \b
+    swarm bench moves
+    swarm bench moves --size 2048 --moves 30
+    swarm bench moves --dem ridge.tif --json
+
+    The same roots in turn, on a random walk and straight on: a tree that is made
+    exact by its parents, one that lies in pieces, and a growth.
+    """
+    from launch_scripts.bench.planning.moves import run, tables
+
+    with progress_of("moves") as progress:
+        report = run(size, field if dem is None else str(dem), moves, seed, progress)
+    show(report, as_json, tables)
+
+
+@app.command()
 def terrain(
     size: Annotated[int, typer.Option(min=64, help="Cells a side.")] = 4096,
     repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs of each pass.")] = 3,

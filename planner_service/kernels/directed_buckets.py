@@ -10,10 +10,9 @@ A cost's *index* is how many finest widths it has. Its digits to the base 128 sa
 of the first digit in which its index differs from what is served, so that buckets of one level are 128 times as
 wide as those of the level below. When the turn of a bucket comes, the least that any of its cells may offer decides
 (A. Crauser, K. Mehlhorn, U. Meyer, P. Sanders, "A parallelization of Dijkstra's shortest path algorithm", MFCS
-1998, their OUT-criterion): cells that cost no more than that are final. Where these lie in a good part of the
-bucket, they are served, and the others wait on; where not, all of them are spread over the level below. So neither
-dear cells nor cheap ones make the others' buckets narrower, and no result rests on a width or on the rounding of
-sums.
+1998, their OUT-criterion): cells that cost no more than that are final. They are served, and the others wait on;
+but where many cells may lead into their own bucket, all of it is spread over the level below. So neither dear cells
+nor cheap ones make the others' buckets narrower, and no result rests on a width or on the rounding of sums.
 
 Arrays, beside those of `layout` and `climbs`:
     touched  uint32  (8 * _PIECE + 8,) padded cells whose cost has fallen
@@ -33,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.climbs import CLIMBS, find_entries
+from planner_service.kernels.climbs import CLIMBS, find_entries, step_price
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
 from planner_service.kernels.prefetch import prefetch
@@ -57,11 +56,11 @@ _DIGIT, _BASE = np.uint64(BASE_BITS), np.uint64(1 << BASE_BITS)
 _LAST = _BASE - _ONE
 _MASK = np.uint64((1 << 32) - 1)
 _LEVELS = np.uint64(-(-63 // BASE_BITS))
-_MOST_INDEX = np.float32(2.0**62)
-_PART = np.uint64(3)
-"""A bucket is served in parts where the first is at least its width shifted right by so many bits,"""
-_FEW = np.uint64(8)
-"""or where it holds no more cells than these."""
+_NEAR, _MOST_INDEX = np.float32(2.0**30), np.float32(2.0**62)
+_FEW, _SHARE = np.uint64(8), np.uint64(5)
+"""A bucket is served in parts while so many of its cells may lead into it, and of n cells n >> _SHARE more."""
+_ONE_BY_ONE = np.uint64(4)
+"""Up to so many cells make their offers one by one."""
 _ALL = np.float32(-1.0)
 _SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), u8[::1], {QUEUE}))"
 
@@ -166,40 +165,79 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
 
 
 @helper
+def _offer_one_by_one(grid, cost, climbs, batch, n, touched):
+    """As `_offer`, of the first `n` cells of a batch, for few: there passes and what is asked for ahead cost more
+    than branches do."""
+    cell_cost, offsets, _, rule, corners = grid
+    every = 2 if rule == RULE_FOUR else 1
+    count = _ZERO
+    for i in range(n):
+        u = np.int64(batch[i])
+        base, own = -cost[u], cell_cost[u]
+        for k in range(0, 8, every):
+            v = u + offsets[k]
+            odd = k & 1
+            # No step costs less than the cell cost of the cell that it enters, which is u.
+            if not base + own < cost[v]:
+                continue
+            if odd and not corners and min(cost[u + offsets[k - 1]], cost[u + offsets[(k + 1) & 7]]) == WALL:
+                continue
+            key = base + own * step_price(climbs, v, u, odd)
+            if key < cost[v]:
+                cost[v] = key
+                touched[count] = v
+                count += _ONE
+    return count
+
+
+@helper
 def _index(cost, inverse):
     """uint64: how many finest widths a cost has."""
     return np.uint64(np.int64(min(cost * inverse, _MOST_INDEX)))
 
 
 @helper
-def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
-    """buckets := where each cell is to wait: at `level` or above."""
-    shift = level * _DIGIT
-    now = served >> shift
-    own = level << _DIGIT
-    far = _ZERO
-    for i in range(count):
-        at = _index(cost[np.uint64(cells[i])], inverse) >> shift
-        apart = at ^ now
-        if apart <= _LAST:
-            buckets[i] = np.int32(own + (at & _LAST))
-            continue
-        above = level
-        while apart > _LAST:
-            apart >>= _DIGIT
-            at >>= _DIGIT
-            above += _ONE
-        waiting[above] += _ONE
-        far += _ONE
-        buckets[i] = np.int32((above << _DIGIT) + (at & _LAST))
-    waiting[level] += count - far
+def _bucket(at, now, level):
+    """uint64: where a cell of index `at` waits, at `level` or above, while `now` is served; both are without the
+    digits of the levels below."""
+    apart = at ^ now
+    while apart > _LAST:
+        apart >>= _DIGIT
+        at >>= _DIGIT
+        level += _ONE
+    return (level << _DIGIT) + (at & _LAST)
 
 
 @helper
-def _least_ahead(cell_cost, cost, batch, n):
-    """Keep those cells of a batch that were not served yet. Returns how many, and the least that any of them
-    may offer."""
+def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
+    """buckets := where each cell is to wait: at `level` or above."""
+    if level > _ZERO or served >= _SURE:
+        shift = level * _DIGIT
+        for i in range(count):
+            b = _bucket(_index(cost[np.uint64(cells[i])], inverse) >> shift, served >> shift, level)
+            waiting[b >> _DIGIT] += _ONE
+            buckets[i] = np.int32(b)
+        return
+    # Nearly all cells wait at the level that is served: a twentieth of the time.
+    now, far = np.int32(served), _ZERO
+    for i in range(count):
+        c = cost[np.uint64(cells[i])]
+        at = np.int32(min(c * inverse, _NEAR))
+        buckets[i] = at & np.int32(_LAST)
+        if at ^ now > np.int32(_LAST):
+            b = _bucket(_index(c, inverse), served, _ZERO)
+            waiting[b >> _DIGIT] += _ONE
+            buckets[i] = np.int32(b)
+            far += _ONE
+    waiting[0] += count - far
+
+
+@helper
+def _look(cell_cost, cost, inverse, end, batch, n):
+    """Keep those cells of a batch that were not served yet. Returns how many; how many of them may offer less than
+    index `end`; and the least that any may offer."""
     kept = _ZERO
+    within = _ZERO
     least = INF
     for p in range(n):
         ahead = np.uint64(batch[p + np.uint64(_AHEAD)])
@@ -210,8 +248,10 @@ def _least_ahead(cell_cost, cost, batch, n):
         batch[kept] = u
         if c >= _ZERO32:
             kept += _ONE
-            least = min(least, c + cell_cost[u])
-    return kept, least
+            offer = c + cell_cost[u]
+            within += np.uint64(_index(offer, inverse) < end)
+            least = min(least, offer)
+    return kept, within, least
 
 
 @helper
@@ -245,6 +285,11 @@ def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
     touched, chosen, batch, steps, waiting, queue = scratch
     s = np.uint64(stride)
     n = _serve_once(cost, batch, n)
+    if n <= _ONE_BY_ONE:
+        count = _offer_one_by_one(grid, cost, climbs, batch, n, touched)
+        _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+        put(queue, touched, count, chosen, _MASK, _ZERO)
+        return
     first = _ZERO
     while first < n:
         some = min(_PIECE, n - first)
@@ -295,13 +340,11 @@ def grow_directed_by_buckets(grid, cost, root, climbs, width, look, scratch):
         n = take(queue, b, batch)
         waiting[level] -= n
         if look or level > _ZERO or served >= _SURE:
-            n, least = _least_ahead(cell_cost, cost, batch, n)
-            wide = _ONE << shift
-            sure = _index(least, inverse) - served
-            if n > _FEW and level > _ZERO and sure < wide >> _PART:
+            n, within, least = _look(cell_cost, cost, inverse, served + (_ONE << shift), batch, n)
+            if level > _ZERO and within > _FEW + (n >> _SHARE):
                 level -= _ONE
                 n = _put_back(cost, inverse, served, level, batch, n, _ALL, scratch)
-            elif sure < wide:
+            elif within > _ZERO:
                 n = _put_back(cost, inverse, served, level, batch, n, least, scratch)
         _serve(grid, cost, climbs, inverse, served, level, n, scratch)
         level = _find_level(waiting)

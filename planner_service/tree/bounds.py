@@ -9,6 +9,7 @@ from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
+from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
@@ -24,14 +25,10 @@ class LowerBounds:
         """float32, padded, s: the exact cost of an earlier root, lowered where the map became cheaper. A consistent
         heuristic: no step costs less than it falls by. `take` sets it, `learn` lowers it, or drops it (None) where
         that would visit too many cells."""
-        self._lowest = cost_grid.lowest_cell_cost
-        """s: no cell cost was less since the heuristic was exact. It bounds the steps of a route by which the
-        heuristic was made, and so its rounding. `take` sets it, `learn` lowers it."""
 
     def take(self, exact_cost: Floats) -> None:
         """Go by this exact padded cost from now on; nobody may write to it any more."""
         self._heuristic = exact_cost
-        self._lowest = self._grid.lowest_cell_cost
 
     def forget(self) -> None:
         """The map changed, and nothing is to be known of the optimum until `take`."""
@@ -39,8 +36,6 @@ class LowerBounds:
 
     def learn(self, changes: Changes) -> None:
         """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
-        if changes.cells.size:
-            self._lowest = min(self._lowest, float(changes.before.min()), self._grid.lowest_cell_cost)
         if self._heuristic is None or not changes.any_lower:
             return
         grid = self._grid
@@ -53,7 +48,7 @@ class LowerBounds:
             self._heuristic = None
 
     def at(
-        self, tree: CostToGoTree, starts: NDArray[np.int64], cost: NDArray[np.float64] | None = None
+        self, tree: CostToGoTree | PieceTree, starts: NDArray[np.int64], cost: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """Proven lower bounds, s, on the time from padded cells to the target now.
 
@@ -61,17 +56,19 @@ class LowerBounds:
         Raises ValueError where a start is no padded cell.
         """
         grid = self._grid
+        cost = tree.cost_at(starts) if cost is None else cost
+        rounding = grid.rounding(cost)
         if tree.exact:
-            cost = tree.cost_at(starts) if cost is None else cost
-            bound = cost * (1.0 - grid.rounding(cost))
+            # What is driven along its parents is off from its labels by no more than these from the optimum.
+            bound = cost * np.maximum(1.0 - 2.0 * rounding, 0.0)
         else:
             bound = np.zeros(starts.size)
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            steps = self._lowest, grid.grid.cells
+            most = float(grid.rounding(rim_cost.max(initial=0.0)))
             kernels.bound_by_heuristic(
-                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, *steps, bound
+                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, rounding, most, bound
             )
         # Of the optimum only the share that is travel time counts.
         return bound * grid.time_share

@@ -97,6 +97,13 @@ class CostToGoTree:
         self.reach = reach
         self._become_exact(root)
 
+    def take_parents(self, root: int, parent: NDArray[np.uint8]) -> None:
+        """Become a tree that somebody else made on the map as it is now; costs are what is driven along it. Raises
+        as `take`."""
+        self.take(root, np.empty(self.cost_grid.size, np.float32), parent, 0.0)
+        self.relabel()
+        self.reach = float(self.cost[np.isfinite(self.cost)].max())
+
     def _become_exact(self, root: int) -> None:
         self.root = root
         self.offset = 0.0

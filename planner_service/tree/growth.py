@@ -13,7 +13,7 @@ from planner_service.kernels.cell_costs import cell_cost_range
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import TOO_FINE, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
-from planner_service.kernels.parents_from_root import find_parents_from_root
+from planner_service.kernels.tied_parents import untie_parents
 from planner_service.tree.directed_growth import grow_directed_costs
 from shared_map.arrays import Floats
 
@@ -58,11 +58,10 @@ def grow_tree(
         reach = _grow_alike(padded, bounds, root, cost, scratch_of)
     if parent is None:
         return reach
-    # A step costs its cell's cost at least. Where that is lost in the rounding, parents could lead in a circle.
-    if reach <= FINE * lowest or not ((cost + cell_cost == cost) & (cost < np.inf)).any():
-        point_to_parents(padded, climbs, cost, root, (0, 0, size // stride - 2, stride - 2), parent)
-    else:
-        find_parents_from_root(padded, climbs, (cost, parent, root), np.empty(size, np.uint32))
+    point_to_parents(padded, climbs, cost, root, (0, 0, size // stride - 2, stride - 2), parent)
+    if reach > FINE * lowest:
+        # Steps may be lost in the rounding of the ways behind them, and parents lead in a circle.
+        untie_parents(padded, climbs, (cost, parent, root), np.empty(2 * size, np.uint32))
     return reach
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from planner_service.kernels import pieces, pieces_mend
 from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.layout import NONE, PaddedGrid, step_offsets
+from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.pieces import CELLS, LOOK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
 from planner_service.tree.growth import KeptScratch, grow_tree
@@ -31,9 +32,14 @@ class PieceTree:
     parent     uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way. Empty
                before the first `take`
     root       the target's cell, of the grid; -1 before the first `take`
-    exact      whether all costs are the least there are. `take` sets it; a `move` or a `repair` that gives way
-               resets it. The tree then still leads to its root, and states what is driven
+    exact      whether all costs are the least there are. `grow`, `take` and `mend` set it, `move` to another root
+               resets it, and so do `mend` and `repair` where they give way: the tree then still leads to its root,
+               and states what is driven
+    window_bound  None: an exact tree bounds itself
+    fine, precise  as of a `CostToGoTree`: true
     """
+
+    fine = precise = True
 
     def __init__(self, cost_grid: CostGrid) -> None:
         if cost_grid.climbs is not None:
@@ -42,6 +48,7 @@ class PieceTree:
         self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         self.root = -1
         self.exact = False
+        self.window_bound: WindowBound | None = None
         self._across = -(-cost_grid.grid.cols // SIDE)
         self._count = count = -(-cost_grid.grid.rows // SIDE) * self._across
         self._piece = np.full(count * CELLS, NO_PIECE, np.uint8)
@@ -57,15 +64,25 @@ class PieceTree:
         self._todo = np.empty(count, np.int64)
         self._kept: KeptScratch = {}
         self.work = (0, 0, 0)
-        """Tiles looked at, tiles mended and rounds of the last call."""
+        """Tiles looked at, tiles mended and rounds of the last `mend`."""
+        self._moved = False
+        """The root has moved since totals were added up."""
 
     @property
     def _labels(self) -> pieces.Cells:
         return self.parent, self._piece, self._local, self.cost_grid.pad(self.root)
 
+    def grow(self, root: int) -> None:
+        """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
+        it is lethal."""
+        self.cost_grid.check_root(root)
+        parent = np.full(self.cost_grid.size, NONE, np.uint8)
+        self.cost_grid.grow(self.cost_grid.pad(root), np.empty(self.cost_grid.size, np.float32), parent)
+        self.take(root, parent)
+
     def take(self, root: int, parent: NDArray[np.uint8]) -> None:
-        """Become the tree that somebody grew, exactly or nearly so, on the map as it is now; make it exact. The
-        array is taken over."""
+        """Become a tree that somebody else made, on the map as it is now, and make it exact. The array is taken
+        over. Raises as `grow`, and ValueError unless the array is as `parent` here."""
         self.cost_grid.check_root(root)
         if parent.shape != (self.cost_grid.size,) or parent.dtype != np.uint8:
             raise ValueError(f"parents of this map are uint8, {self.cost_grid.size} cells")
@@ -76,13 +93,15 @@ class PieceTree:
         rows, cols = np.divmod(np.arange(self._count), self._across)
         self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
         self._relabel(np.arange(self._count))
-        self._settle(math.inf, True)
+        self._moved = True
+        self._mend(math.inf)
 
     def move(self, root: int, window: Window) -> int:
-        """Lead to a new root, exactly; the window holds it and the old root.
+        """Lead to a new root, by a window that holds it and the old one; `mend` makes the tree exact again.
 
-        Returns tiles looked at; 0 if nothing was done because the old root has no way to the new one inside the
-        window; -1 if it gave way to a growth.
+        Returns cells grown, or 0 if nothing was done because the old root has no way to the new one inside the
+        window. Raises as `grow`, and OutsideGridError on a window that is not inside the grid or does not hold both
+        roots.
         """
         grid = self.cost_grid
         if self.root < 0:
@@ -101,6 +120,8 @@ class PieceTree:
         way = float(cost[old])
         if not way < math.inf:
             return 0
+        if self._moved:
+            self._add_up()
         old_root = grid.pad(self.root)
         self.root = root
         changed = np.zeros(self._count, np.uint8)
@@ -109,7 +130,14 @@ class PieceTree:
             *(cost, parent, box, old_root, way, changed),
         )
         self._relabel(np.flatnonzero(changed))
-        return self._settle(MOST_LOOKS * self._count + 64, True)
+        self._moved = True
+        self.exact = False
+        return window.cells
+
+    def mend(self) -> int:
+        """Make the tree exact, after whatever moves and repairs, or give way to a growth: `exact` tells. Returns
+        cells looked at."""
+        return self._mend(MOST_LOOKS * self._count + 64)
 
     def _in_window(self, cell: int, window: Window) -> int:
         row, col = self.cost_grid.grid.row_col(cell)
@@ -118,8 +146,11 @@ class PieceTree:
         return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1
 
     def repair(self, changes: Changes) -> int:
-        """Bring the tree up to date after the map changed. Returns tiles looked at, or -1 if it gave way to a
-        growth: then cells may be without a way that have one."""
+        """Bring the tree up to date after the map changed, and make it exact, or give way: `exact` tells.
+
+        Returns cells looked at; -1 if it gave way and cells may be without a way that have one: then it must be
+        grown before anything else.
+        """
         if changes.cells.size == 0:
             return 0
         changed = np.zeros(self._count, np.uint8)
@@ -127,45 +158,57 @@ class PieceTree:
             self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
         )
         self._relabel(np.flatnonzero(changed))
-        looked = self._settle(MOST_LOOKS * self._count + 64, False)
+        looked = self.mend()
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
         pieces_mend.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
-        return looked
+        return looked if self.exact or not lost.size else -1
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
-        """float64, s: cost-to-go of padded cells, inf where there is no way."""
+        """float64, s: what it costs to go from padded cells along the parents, length's price with it; inf where
+        there is no way. Raises ValueError where one is no padded cell."""
+        if self._moved:
+            self._add_up()
         costs = np.empty(cells.size, np.float64)
         pieces.costs_at(self.cost_grid.padded, self._labels, self._pieces, self._across, cells, costs)
         return costs
 
+    def time_at(self, cells: Cells) -> NDArray[np.float64]:
+        """float64, s: how long it takes to drive from padded cells along the parents. Otherwise as `cost_at`."""
+        grid = self.cost_grid
+        if not grid.length_weight_s:
+            return self.cost_at(cells)
+        return grid.rests(self.parent, grid.pad(self.root), cells, grid.time_cost)
+
+    def tighten(self, cells: Cells) -> None:
+        """Costs are what is driven at all times."""
+
     def _relabel(self, which: Cells) -> None:
         pieces.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
 
-    def _settle(self, most: float, moved: bool) -> int:
-        """Look at tiles until the tree is exact, or gives way to a growth once it has looked at `most`.
+    def _add_up(self) -> int:
+        """Evaluate the totals; returns how many tiles are to be looked at now, which stand in `_todo`."""
+        self._now += self._moved
+        count = pieces.evaluate(
+            *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench[0]),
+            *(np.argsort(self._ends[0]), self._now if self._moved else 0, self._stack, self._todo),
+        )
+        self._moved = False
+        return int(count)
 
-        moved  totals have changed nearly everywhere
-        """
-        grid = self.cost_grid.padded
-        self._now += moved
-        now = self._now if moved else 0
-        order = np.argsort(self._ends[0])
-        looked = rounds = mended = 0
+    def _mend(self, most: float) -> int:
+        """Look at tiles until the tree is exact, or as many as `most` have been."""
+        looked = mended = rounds = 0
         while True:
             rounds += 1
-            count = pieces.evaluate(
-                *(grid, self._labels, self._pieces, self._tiles, self._bench[0]),
-                *(order, now, self._stack, self._todo),
-            )
-            now = 0
+            count = self._add_up()
             if not count or looked + 2 * mended > most:
                 break
             todo = self._todo[:count]
             todo = todo[np.argsort(self._ends[0][todo])]
             looked += count
             mended += pieces_mend.mend_tiles(
-                *(grid, self._labels, self._pieces, self._tiles, self._bench, todo),
+                *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench, todo),
             )
         self.exact = not count
         self.work = looked, mended, rounds
-        return looked if self.exact else -1
+        return looked * CELLS

@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 from planner_service.kernels.route_walk import OK, find_starts, price_routes
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.pieces import PieceTree
 from swarm.wire.routes import RouteBatch
 
 
-def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int) -> RouteBatch:
+def read_routes(
+    tree: CostToGoTree | PieceTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int
+) -> RouteBatch:
     """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
     grid = tree.cost_grid
     root = grid.pad(tree.root)

@@ -92,23 +92,27 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
 
 
 def test_no_costs_make_a_growth_many_times_as_long() -> None:
-    """CPU time of 64 x 64 cells, over that of ordinary ground: at most 12, measured 0.9 to 5."""
-    took = {}
-    for name, draw in {"plain": spread(4.0), **GROUNDS}.items():
+    """CPU time of 64 x 64 cells, over that of ordinary ground, in turn: at most 10, measured 0.9 to 5."""
+    climb = random_climb(np.random.default_rng(1), 64, 64, 0.1, 10.0)
+
+    def grow(draw: Paces) -> Callable[[], float]:
         rng = np.random.default_rng(1)
-        climb = random_climb(rng, 64, 64, 0.1, 10.0)
         costs = CostGrid(climb.grid, PlannerConfig(), climb)
         costs.load(draw(rng, 64, 64))
-        tree, root = CostToGoTree(costs), int(rng.choice(np.flatnonzero(np.isfinite(costs.cell_cost[67:]))))
-        times = []
-        for _ in range(5):
+        labels = np.empty(costs.size, np.float32), np.full(costs.size, NONE, np.uint8)
+        root = int(rng.choice(np.flatnonzero(np.isfinite(costs.cell_cost))))
+
+        def timed() -> float:
             begun = time.thread_time()
-            tree.cost_grid.grow(root + 67, *_arrays(costs.size))
-            times.append(time.thread_time() - begun)
-        took[name] = statistics.median(times)
-    slow = {name: round(each / took["plain"], 1) for name, each in took.items() if each > 12 * took["plain"]}
-    assert not slow
+            costs.grow(root, *labels)
+            return time.thread_time() - begun
 
+        return timed
 
-def _arrays(size: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.empty(size, np.float32), np.full(size, NONE, np.uint8)
+    plain = grow(spread(4.0))
+    slow = {}
+    for name, draw in GROUNDS.items():
+        if "e+30" not in name:  # costs whose sums leave float32
+            other = grow(draw)
+            slow[name] = round(statistics.median(other() / plain() for _ in range(5)), 1)
+    assert max(slow.values()) < 10, slow

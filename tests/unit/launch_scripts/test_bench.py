@@ -30,6 +30,7 @@ from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, RouteStatus
 
 STRATEGIES = (
     "auto",
+    "exact",
     "full",
     "rotation",
     "variable_range",
@@ -204,7 +205,7 @@ def test_certificates_are_checked_by_a_command() -> None:
 
 def test_the_command_says_which_life_broke_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
     true = LowerBounds.at
-    monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1.01)
+    monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1e9)
     done = CliRunner().invoke(app, ["certificates", "--checks", "2000", "--seed", "4", "--json"])
     assert done.exit_code == 1
     found = json.loads(done.stdout)["laws"]["bound"]
@@ -413,3 +414,14 @@ def test_a_number_out_of_range_is_refused_by_name(words: tuple[str, ...]) -> Non
 @pytest.mark.parametrize("command", ["peers", "start", "paper", "scale", "gap"])
 def test_help_teaches_with_an_example(command: str) -> None:
     assert f"swarm bench {command}" in words_of(command, "--help").replace(f"Usage: swarm bench {command}", "", 1)
+
+
+def test_exact_moves_are_those_that_would_have_grown_and_are_counted() -> None:
+    report = bench("moves", "--size", "96", "--moves", "6")
+    assert [(row["course"], row["by"]) for row in report["rows"]] == [
+        (course, by) for course in ("random", "straight") for by in ("parents", "pieces")
+    ]
+    for row in report["rows"][::2]:
+        assert row["bit_equal"] == 1
+        assert row["gave_way"] <= 0.5
+        assert row["p50_ms"] > 0
