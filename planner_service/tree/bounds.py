@@ -64,7 +64,7 @@ class LowerBounds:
         grid = self._grid
         if tree.exact:
             cost = tree.cost_at(starts) if cost is None else cost
-            bound = cost * (1.0 - grid.rounding(cost))
+            bound = cost - tree.slack(cost)
         else:
             bound = np.zeros(starts.size)
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound

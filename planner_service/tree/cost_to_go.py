@@ -251,6 +251,11 @@ class CostToGoTree:
         _, parent, root = self._labels
         return self.cost_grid.rests(parent, root, cells, cell_cost)
 
+    def slack(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
+        """float64, s: by how much what is driven in an exact tree may exceed the optimum, of cells that cost so
+        much."""
+        return cost * self.cost_grid.rounding(cost)
+
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
 
