@@ -30,12 +30,12 @@ from planner_service.kernels import (
     parents,
     pieces,
     pieces_mend,
-    radix_heap,
     repair,
     route_walk,
     stride_growth,
     stride_network,
     tied_parents,
+    wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -46,7 +46,8 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, tied_parents.untie_parents),
+    StepKernel(wide_buckets.grow_by_wide_buckets, None),
+    tied_parents.untie_parents,
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
@@ -54,6 +55,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.find_starts,
     route_walk.drive_rests,
     cell_costs.cell_cost_range,
+    cell_costs.count_classes,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
 takes longest comes first, so that builders end together."""
@@ -104,9 +106,10 @@ def all_kernels() -> list[Kernel]:
 
 
 def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
-    return [
+    found = [
         (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each for each in kernels
     ]
+    return [kernel for kernel in found if kernel is not None]
 
 
 def name_of(kernel: Kernel) -> str:

@@ -7,7 +7,7 @@ key is ever decreased. Octile steps make two keys per cell, straight and diagona
 
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
-    batch    uint32  (size + _AHEAD,) padded cells of the bucket that is being served
+    batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `chunked_buckets`; `make_scratch` says how large
 
 What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
@@ -33,20 +33,20 @@ _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
-_AHEAD = 8
+AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 
 @helper
-def _open_costs(cell_cost, cost):
+def open_costs(cell_cost, cost):
     """Before a growth: inf on passable cells, WALL on the others."""
     for i in range(cell_cost.size):
         cost[i] = INF if cell_cost[i] < INF else WALL
 
 
 @helper
-def _close_costs(cost):
+def close_costs(cost):
     """After a growth: inf on lethal cells too."""
     for i in range(cost.size):
         c = cost[i]
@@ -61,7 +61,7 @@ def make_scratch(size: int, rule: int, buckets: int) -> Scratch:
     that was not written."""
     kinds = 2 if rule == RULE_OCTILE else 1
     # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
-    touched, batch = np.empty(size + 1, np.uint32), np.empty(size + _AHEAD, np.uint32)
+    touched, batch = np.empty(size + 1, np.uint32), np.empty(size + AHEAD, np.uint32)
     return touched, batch, make_queue(kinds * size, kinds * buckets)
 
 
@@ -82,12 +82,12 @@ def _ask_for(cell_cost, cost, s, u):
 
 
 @helper
-def _offer_straight(cell_cost, cost, s, batch, n, touched):
+def offer_straight(cell_cost, cost, s, batch, n, touched):
     """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
     many."""
     count = _ZERO
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
         key = cost[u] + cell_cost[u]
         north, west, east, south = cost[u - s], cost[u - _ONE], cost[u + _ONE], cost[u + s]
@@ -99,10 +99,10 @@ def _offer_straight(cell_cost, cost, s, batch, n, touched):
 
 
 @helper
-def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
-    """As `_offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
+def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
+    """As `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
         key = cost[u] + cell_cost[u] * SQRT2
         above = u - s
@@ -130,11 +130,11 @@ def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
 
 
 @helper
-def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
-    """As `_offer_straight`, to eight neighbours, all a step of length 1 away."""
+def offer_around(cell_cost, cost, s, corners, batch, n, touched):
+    """As `offer_straight`, to eight neighbours, all a step of length 1 away."""
     count = _ZERO
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
         key = cost[u] + cell_cost[u]
         above = u - s
@@ -187,7 +187,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
     second = length if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / np.float32(width)
 
-    _open_costs(cell_cost, cost)
+    open_costs(cell_cost, cost)
     cost[np.uint64(root)] = _ZERO32
     touched[0] = root
     count = _ONE
@@ -204,7 +204,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
             _choose(cell_cost, cost, SQRT2, inverse, following, touched, count, batch)
             put(queue, touched, count, batch, mask, length)
         if waiting == _ZERO:
-            _close_costs(cost)
+            close_costs(cost)
             return current
         if current > 1 << 20:
             return TOO_FINE
@@ -216,13 +216,13 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
         n = take(queue, b, batch)
         waiting -= n
         if rule == RULE_PAPER:
-            count = _offer_around(cell_cost, cost, s, corners, batch, n, touched)
+            count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
         else:
-            count = _offer_straight(cell_cost, cost, s, batch, n, touched)
+            count = offer_straight(cell_cost, cost, s, batch, n, touched)
         if rule == RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
-            count = _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
+            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
 
 
 @kernel(f"({GRID}, f4[::1], i8, u4[::1])")

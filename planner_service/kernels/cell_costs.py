@@ -1,7 +1,7 @@
 """Cell costs of a map: padded, changed, their range; a window cut out of them, and merged back.
 
 Arrays, beside those of `layout`:
-    pace    float32  (rows, cols)  s/m; inf is lethal; NaN, zero and negative ones are errors, which are counted
+    pace    float32  (rows, cols)  s/m; inf is lethal; NaN, zero and negative ones are errors
     part    float32  ((row1 - row0 + 2) * width,)  cell costs or costs of a window as a padded grid of its own,
                      whose stride is width = col1 - col0 + 2
     *_bits  int32    the same array as without it, its numbers read as integers
@@ -14,51 +14,58 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.compile import kernel
+from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import BOX, INF
 
+CHEAPEST_S, DEAREST_S = np.float32(2.0**-40), np.float32(2.0**40)
+"""What a cell costs at least and at most, s: a picosecond, 35,000 years. So no way over the largest grid, and no
+quotient of two costs, leaves float32."""
 _INF_BITS = np.int32(0x7F800000)
 _ONE = np.uint64(1)
+
+
+@helper
+def _cell_cost(pace, resolution, extra):
+    """What a cell of this pace costs: between `CHEAPEST_S` and `DEAREST_S`, inf where it is lethal."""
+    cost = min(max(pace * resolution, CHEAPEST_S) + extra, DEAREST_S)
+    return cost if pace < INF else INF
 
 
 @kernel("(f4[:, ::1], f8, f8, i8, f4[::1])")
 def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
     """cell_cost := pace * resolution + extra, everywhere; resolution in m, extra in s. Returns how many cells have
-    a pace that is NaN, zero or negative."""
+    a pace that is NaN, zero or negative, and how many cost `CHEAPEST_S` or `DEAREST_S`."""
     resolution, extra = np.float32(resolution), np.float32(extra)
     bad = 0
+    bounded = 0
     for row in range(pace.shape[0]):
         base = np.uint64((row + 1) * stride + 1)
         for col in range(np.uint64(pace.shape[1])):
             p = pace[row, col]
-            c = p * resolution + extra
-            bad += not (p > 0 and c > 0)
+            c = _cell_cost(p, resolution, extra)
+            bad += not p > 0
+            bounded += p < INF and ((c == CHEAPEST_S) | (c == DEAREST_S))
             cell_cost[base + col] = c
-    return bad
+    return bad, bounded
 
 
 @kernel(f"(f4[:, ::1], f8, f8, {BOX}, i8, f4[::1], i8[::1], f4[::1])")
 def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before):
     """Update the cell costs of a window, and list what changed.
 
+    pace           none of the window is NaN, zero or negative
     cells, before  int64 padded cells and float32 cost before, written; both have room for the whole window
-    Returns (count of changed cells, count of cells whose pace is NaN, zero or negative: these are not applied;
-    lowest, highest finite new cell cost: inf, 0 if there is none).
+    Returns (count of changed cells; lowest, highest finite new cell cost: inf, 0 if there is none).
     """
     row0, col0, row1, col1 = box
     resolution, extra = np.float32(resolution), np.float32(extra)
     count = 0
-    bad = 0
     lowest = INF
     highest = np.float32(0.0)
     for row in range(row0, row1):
         base = (row + 1) * stride + 1
         for col in range(col0, col1):
-            p = pace[row, col]
-            new = p * resolution + extra
-            if not (p > 0 and new > 0):
-                bad += 1
-                continue
+            new = _cell_cost(pace[row, col], resolution, extra)
             old = cell_cost[base + col]
             if new != old:
                 cells[count] = base + col
@@ -67,25 +74,35 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
                 cell_cost[base + col] = new
                 lowest = min(lowest, new)
                 highest = max(highest, new if new < INF else highest)
-    return count, bad, lowest, highest
+    return count, lowest, highest
+
+
+@kernel("(i4[::1], i8[::1])")
+def count_classes(bits, counts):
+    """Add to `counts` (int64, 1 << 11) how many cell costs begin with the same 11 bits."""
+    for i in range(bits.size):
+        counts[np.uint64(bits[i] >> 20)] += 1
 
 
 @kernel("(i4[::1],)")
 def cell_cost_range(bits):
-    """(lowest, highest finite) cell cost, as bits; those of (inf, 0) if all cells are lethal."""
+    """(lowest, highest finite, highest) cell cost, as bits; the first two those of (inf, 0) if all cells are
+    lethal."""
     lowest = _INF_BITS
     highest = np.int32(0)
+    last = np.int32(0)
     for i in range(bits.size):
         c = bits[i]
         lowest = min(lowest, c)
         highest = max(highest, c if c < _INF_BITS else np.int32(0))
-    return lowest, highest
+        last = max(last, c)
+    return lowest, highest, last
 
 
 @kernel(f"(i4[::1], i8, {BOX}, i4[::1])")
 def cut_window(cell_cost_bits, stride, box, part_bits):
-    """part := the cell costs of a window, behind a lethal border. Returns their range, as `cell_cost_range`
-    does."""
+    """part := the cell costs of a window, behind a lethal border. Returns the first two of their
+    `cell_cost_range`."""
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
     lowest = _INF_BITS

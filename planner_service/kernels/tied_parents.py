@@ -1,4 +1,4 @@
-"""Parents in a directed tree whose costs float32 does not tell apart.
+"""Parents in a tree whose costs float32 does not tell apart.
 
 Where a step costs less than the rounding of the way behind it, a cell may cost what its parent does, and parents
 that follow from costs alone may lead in a circle. Such cells get others: from where costs do tell them onward, over
@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.climbs import CLIMBS, step_price
-from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import GRID, INF, LABELS, NONE, RULE_FOUR
+from planner_service.kernels.climbs import CLIMBS, offered
+from planner_service.kernels.compile import helper, step_kernel
+from planner_service.kernels.layout import GRID, INF, LABELS, NONE, RULE_FOUR, step_length
 
 
 @helper
@@ -29,10 +29,10 @@ def _leads(grid, climbs, labels, v, k):
         return False
     if odd and not corners and max(cell_cost[v + offsets[k - 1]], cell_cost[v + offsets[(k + 1) & 7]]) == INF:
         return False
-    return cost[u] + cell_cost[u] * step_price(climbs, v, u, odd) == cost[v]
+    return offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd)) == cost[v]
 
 
-@kernel(f"({GRID}, {CLIMBS}, {LABELS}, u4[::1])")
+@step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
 def untie_parents(grid, climbs, labels, queue):
     """Of exact costs, and of parents that follow from them: replace those that cost as much as their cells."""
     offsets = grid[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 import struct
 from collections.abc import Iterator, Sequence
@@ -25,7 +26,6 @@ from planner_service.kernels.layout import (
     PaddedGrid,
     step_offsets,
 )
-from planner_service.kernels.lower_bounds import ROUNDING
 from planner_service.tree.growth import grow_tree
 from planner_service.tree.padded_climbs import padded_climbs, with_scratch
 from shared_map.arrays import Bools, Floats, private_copy
@@ -33,6 +33,8 @@ from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
+
+log = logging.getLogger(__name__)
 
 Cells = NDArray[np.int64]
 _NONE: Floats = np.empty(0, np.float32)
@@ -76,8 +78,29 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
     return lowest, highest
 
 
+def _said_of_bad(pace: Floats, window: Window) -> str:
+    """Of the first cell of a window whose pace is none."""
+    part = pace[window.row0 : window.row1, window.col0 : window.col1]
+    bad = np.argwhere(~(part > 0))
+    row, col = (bad[0] + (window.row0, window.col0)).tolist()
+    return (
+        f"the pace of cell [{row}, {col}] is {pace[row, col]:g} s/m ({len(bad)} cells have one that is NaN, zero or"
+        " negative); expected a number above 0, or inf where a cell is lethal"
+    )
+
+
+def _range_of(cell_cost: Floats) -> tuple[float, float, float]:
+    """(lowest, highest finite, highest) of cell costs."""
+    lowest, highest, last = kernels.cell_cost_range(cell_cost.view(np.int32))
+    return *floats_of_bits((lowest, highest)), floats_of_bits((last, last))[0]
+
+
+_SHORTEST_M, _LONGEST_M = 1e-30, 1e30
+"""Sides of cells that float32 knows."""
 _BLOCK = 1 << 10
 """Cells that are copied at a time: a page of memory."""
+_LETHAL = 0x7F8
+"""The class of inf."""
 _FEWEST, _MOST = 1 << 9, 1 << 14
 """Buckets of a repair."""
 _SMALL = 1 << 20
@@ -119,8 +142,13 @@ class CostGrid:
         if climb is not None:
             self.climbs, self.dearest_step = padded_climbs(climb, self.rule)
             self._metres *= climb.lowest
-        self.length_weight_s = config.length_weight * grid.resolution_m
+        self.length_weight_s = min(config.length_weight * grid.resolution_m, float(kernels.DEAREST_S))
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
+        if not (_SHORTEST_M <= self._metres <= _LONGEST_M and self.length_weight_s >= 0):
+            raise ValueError(
+                f"resolution_m is {grid.resolution_m:g}, planner.length_weight {config.length_weight:g}; expected"
+                f" {_SHORTEST_M:g} to {_LONGEST_M:g} and 0 or more"
+            )
         self.cell_cost: Floats = _NONE
         """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Empty
         before `load` or `share`; `apply` writes it, in place."""
@@ -128,6 +156,11 @@ class CostGrid:
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
+        self._classes: Cells = np.zeros(1 << 11, np.int64)
+        """How many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide.
+        `load`, `share` and `apply` put another in its place, as snapshots keep the one that they have."""
+        self._cheapest: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        """What the cheapest cells cost together at least, s, and how many they are; of them. None until needed."""
         self._time_cost: Floats | None = None
         """As `time_cost`, where that is an array of its own. `load` and `share` set it, `apply` writes it."""
         self._lowest_time = math.inf
@@ -193,19 +226,30 @@ class CostGrid:
         return cells
 
     def load(self, pace: Floats) -> None:
-        """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
-        check_pace(self.grid, pace)
-        self._shared = None
-        self.cell_cost, bad = self._padded(pace, self.length_weight_s)
-        if bad:
-            raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
-        if self.length_weight_s:
-            self._time_cost, _ = self._padded(pace, 0.0)
-        self._find_range()
+        """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative; the grid is then as it
+        was.
 
-    def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int]:
+        A cell costs between `CHEAPEST_S` and `DEAREST_S`, whatever its pace is; the log says where that holds.
+        """
+        check_pace(self.grid, pace)
+        cell_cost, bad, bounded = self._padded(pace, self.length_weight_s)
+        if bad:
+            raise ValueError(_said_of_bad(pace, self.grid.window))
+        if bounded:
+            log.warning(
+                "%d of %d cells cost %.2g s or %.2g s, the least and the most that a cell can cost",
+                *(bounded, self.grid.cells, kernels.CHEAPEST_S, kernels.DEAREST_S),
+            )
+        self._shared = None
+        self.cell_cost = cell_cost
+        if self.length_weight_s:
+            self._time_cost, _, _ = self._padded(pace, 0.0)
+        self._find_range()
+        self._count_classes()
+
+    def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int, int]:
         costs: Floats = np.full(self.size, np.inf, np.float32)
-        return costs, kernels.pad_cell_costs(pace, self._metres, extra_s, self.stride, costs)
+        return costs, *kernels.pad_cell_costs(pace, self._metres, extra_s, self.stride, costs)
 
     @property
     def metres(self) -> float:
@@ -229,16 +273,26 @@ class CostGrid:
 
     def share(self, time_cost: Floats) -> None:
         """Take the `time_cost` that another cost grid of the same map and `metres` has loaded, from `open_array`.
-        What `apply` changes is this grid's own. Raises ValueError unless they are of this grid."""
+        What `apply` changes is this grid's own. Raises ValueError unless they are of this grid, and such as `load`
+        makes."""
         if time_cost.shape != (self.size,) or time_cost.dtype != np.float32:
             raise ValueError(f"cell costs of this map are float32, {self.size} cells")
+        own = private_copy(time_cost)  # kernels know arrays that may be written only
+        lowest, highest, last = _range_of(own)
+        if not (lowest >= kernels.CHEAPEST_S and highest <= kernels.DEAREST_S and last <= math.inf):
+            raise ValueError(
+                f"cell costs lie between {kernels.CHEAPEST_S:.2g} s and {kernels.DEAREST_S:.2g} s or are inf; these"
+                f" lie between {lowest:.2g} s and {last:.2g} s"
+            )
         self._written[:] = False
         if self.length_weight_s:
-            self._shared, self._time_cost = None, private_copy(time_cost)
+            self._shared, self._time_cost = None, own
             self.cell_cost = self._time_cost + np.float32(self.length_weight_s)
+            np.minimum(self.cell_cost, kernels.DEAREST_S, out=self.cell_cost, where=time_cost < np.inf)
         else:
-            self._shared, self.cell_cost = time_cost, private_copy(time_cost)
+            self._shared, self.cell_cost = time_cost, own
         self._find_range()
+        self._count_classes()
 
     def snapshot(self) -> Self:
         """The same costs, which nobody changes any more. Of shared ones only what has changed is copied."""
@@ -263,6 +317,7 @@ class CostGrid:
         first._make_scratch()
         first.cell_cost = private_copy(self._shared)
         first._find_range()
+        first._count_classes()
         return first
 
     def changes_since(self, older: Floats) -> Changes:
@@ -277,25 +332,33 @@ class CostGrid:
         return Changes(cells, older[cells], self.cell_cost[cells])
 
     def _find_range(self) -> None:
-        bits = kernels.cell_cost_range(self.cell_cost.view(np.int32))
-        self.lowest_cell_cost, self.highest_cell_cost = floats_of_bits(bits)
+        self.lowest_cell_cost, self.highest_cell_cost, _ = _range_of(self.cell_cost)
         self._find_lowest_time()
+
+    def _count_classes(self) -> None:
+        self._classes, self._cheapest = np.zeros(1 << 11, np.int64), None
+        kernels.count_classes(self.cell_cost.view(np.int32), self._classes)
 
     def _find_lowest_time(self) -> None:
         if self._time_cost is not None:
-            self._lowest_time, _ = floats_of_bits(kernels.cell_cost_range(self._time_cost.view(np.int32)))
+            self._lowest_time, _, _ = _range_of(self._time_cost)
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
-        """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
+        """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative;
+        the grid is then as it was. Costs are bounded as by `load`."""
         check_pace(self.grid, pace)
+        boxes = list(self._boxes(dirty))
+        for row0, col0, row1, col1 in boxes:
+            if not (pace[row0:row1, col0:col1] > 0).all():
+                raise ValueError(_said_of_bad(pace, Window(row0, col0, row1, col1)))
         was = (self.lowest_cell_cost, self.highest_cell_cost)
         found: list[Changes] = []
-        for box in self._boxes(dirty):
+        for box in boxes:
             row0, col0, row1, col1 = box
             most = (row1 - row0) * (col1 - col0)
             cells = np.empty(most, np.int64)
             before = np.empty(most, np.float32)
-            count, bad, lowest, highest = kernels.changed_cells(
+            count, lowest, highest = kernels.changed_cells(
                 pace,
                 self._metres,
                 self.length_weight_s,
@@ -305,8 +368,6 @@ class CostGrid:
                 cells,
                 before,
             )
-            if bad:
-                raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
             if count:
                 self.lowest_cell_cost = min(self.lowest_cell_cost, float(lowest))
                 self.highest_cell_cost = max(self.highest_cell_cost, float(highest))
@@ -315,9 +376,10 @@ class CostGrid:
             if self._time_cost is not None:
                 # A change of time may be too small to be seen in a cost that holds the price of length, too.
                 of_map = self._time_cost.reshape(self.grid.rows + 2, self.stride)
-                of_map[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1] = pace[row0:row1, col0:col1] * np.float32(
-                    self._metres
-                )
+                part = pace[row0:row1, col0:col1]
+                with np.errstate(over="ignore", under="ignore"):
+                    times = np.clip(part * np.float32(self._metres), kernels.CHEAPEST_S, kernels.DEAREST_S)
+                of_map[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1] = np.where(part < np.inf, times, np.inf)
         if dirty:
             self._find_lowest_time()
         if not found:
@@ -330,6 +392,9 @@ class CostGrid:
                 np.concatenate([part.before for part in found]),
                 np.concatenate([part.after for part in found]),
             )
+        classes = [part.view(np.int32) >> 20 for part in (changes.after, changes.before)]
+        more, fewer = (np.bincount(part, minlength=1 << 11) for part in classes)
+        self._classes, self._cheapest = self._classes + more - fewer, None
         if ((changes.before <= was[0]) | (changes.before == np.float32(was[1]))).any():
             # An extreme cell is another now: look for the next, or one wrong mark would stay for good.
             self._find_range()
@@ -347,6 +412,11 @@ class CostGrid:
             return NO_CHANGES
         cells = np.unique(np.concatenate(parts))
         return Changes(cells, older[cells], self.cell_cost[cells])
+
+    def window_of(self, cells: Cells) -> Window:
+        """The least window that holds these padded cells, one at least."""
+        rows, cols = np.divmod(cells, self.stride)
+        return Window(int(rows.min()) - 1, int(cols.min()) - 1, int(rows.max()), int(cols.max()))
 
     def _boxes(self, windows: Sequence[Window]) -> Iterator[tuple[int, int, int, int]]:
         """(row0, col0, row1, col1) of what of each window lies on the grid, where anything does."""
@@ -409,12 +479,21 @@ class CostGrid:
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
 
-    def rounding(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far float32 may have put the labels of an exact tree off that cost so much (s), relatively: a route
-        has no more steps than its cost has lowest cell costs, or than there are cells. `kernels.lower_bounds` takes
-        the same."""
-        steps = np.minimum(cost / self.lowest_cell_cost, self.grid.cells) + 4.0
-        return np.minimum(steps * ROUNDING, 1.0)
+    def rounding(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
+        """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
+
+        One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
+        than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
+        that, where the lowest cell cost alone would say a step for each of it.
+        """
+        if self._cheapest is None:
+            classes = np.flatnonzero(self._classes[:_LETHAL])
+            counts = self._classes[classes]
+            least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)
+            # Of the first class zero; a way that costs nothing has no steps.
+            costs = np.cumsum(counts * np.maximum(least, np.finfo(np.float64).tiny))
+            self._cheapest = np.append(0.0, costs), np.append(0.0, np.cumsum(counts))
+        return np.minimum((np.interp(cost, *self._cheapest) + 8.0) * 2.0**-24, 1.0)
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

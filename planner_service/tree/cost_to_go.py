@@ -164,7 +164,7 @@ class CostToGoTree:
         kept = self._kept if part.size <= _SMALL else None
         grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, None, kept)
         way = float(cost[old])
-        if not way < math.inf:
+        if not (way < math.inf and self.offset + way <= FINE * grid.lowest_cell_cost):
             return 0
         self.offset += way
         merge_window(cost, box, self.offset, grid.pad(self.root), self.cost, grid.stride)
@@ -251,10 +251,10 @@ class CostToGoTree:
         _, parent, root = self._labels
         return self.cost_grid.rests(parent, root, cells, cell_cost)
 
-    def slack(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
-        """float64, s: by how much what is driven in an exact tree may exceed the optimum, of cells that cost so
-        much."""
-        return cost * self.cost_grid.rounding(cost)
+    def slack(self, cost: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
+        """float64, s: by how much what is driven in an exact tree may exceed the optimum, from cells that cost so
+        much; `rounding` is the cost grid's of these costs."""
+        return cost * np.minimum(2.0 * rounding, 1.0)
 
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
@@ -289,6 +289,7 @@ class CostToGoTree:
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents, and the offset 0."""
         route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
+        self.reach += self.offset
         self.offset = 0.0
 
     @property

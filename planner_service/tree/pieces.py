@@ -179,13 +179,13 @@ class PieceTree:
             return self.cost_at(cells)
         return grid.rests(self.parent, grid.pad(self.root), cells, grid.time_cost)
 
-    def slack(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
-        """float64, s: by how much what is driven in an exact tree may exceed the optimum, of cells that cost so
-        much."""
-        grid = self.cost_grid
+    def slack(self, cost: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
+        """float64, s: by how much what is driven in an exact tree may exceed the optimum, from cells that cost so
+        much; `rounding` is the cost grid's of these costs. Cell costs are float32, by a few roundings; all else is
+        left over step by step."""
         farthest = self._ends[1].max() + self._tiles[2].max()
-        steps = np.minimum(cost / grid.lowest_cell_cost, grid.grid.cells) + 4.0
-        slack: NDArray[np.float64] = np.minimum(steps * (MOST_SLACK * farthest), cost)
+        steps = rounding * 2.0**24
+        slack: NDArray[np.float64] = np.minimum(cost * 2.0**-21 + steps * (MOST_SLACK * farthest), cost)
         return slack
 
     def tighten(self, cells: Cells) -> None:

@@ -1,0 +1,196 @@
+"""Whatever a map is said to cost: a tree is exact on it, or the map is refused, and nothing overflows."""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import slow_twins as naive
+from support.planner_strategies import RULES, STRATEGIES
+
+from launch_scripts.bench.planning.any_costs import paces_of_any_ratio
+from launch_scripts.bench.planning.fields import make_field
+from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
+from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
+
+EXAMPLES = 60
+TINY, HUGE = float(np.float32(1e-45)), float(np.finfo(np.float32).max)
+PACES = st.one_of(
+    st.sampled_from([TINY, 1e-38, 1e-6, 1 / 340, 1.0, 100.0, 1e7, 1e30, HUGE, float("inf")]),
+    st.floats(min_value=TINY, allow_nan=False, width=32),
+)
+METRES = st.sampled_from([1e-30, 1e-3, 1.0, 30.0, 1e6, 1e12])
+WEIGHTS = st.sampled_from([0.0, 0.0, 1e-30, 0.5, 1e12])
+
+
+def said_cost(pace: np.ndarray, resolution_m: float, weight: float) -> np.ndarray:
+    """float64: what cells cost by the rule."""
+    cost = np.maximum(pace.astype(np.float64) * resolution_m, CHEAPEST_S) + weight * resolution_m
+    return np.where(np.isfinite(pace), np.minimum(cost, DEAREST_S), np.inf)
+
+
+def assert_exact(ground: CostGrid, tree: CostToGoTree, target: int, rules: dict) -> None:
+    costs = tree.inner(ground.cell_cost)
+    best = naive.cost_to_go(costs, target, **rules)
+    # Each step is rounded by 2^-23 at most, where costs drown in others; and so is the product before.
+    np.testing.assert_allclose(
+        tree.inner(tree.cost), np.where(np.isfinite(costs), best, np.inf), rtol=(costs.size + 2) * 2**-23
+    )
+
+
+def cost_by_heap(cost: np.ndarray, target: int, neighbours: int, edge: str, corner_cutting: bool) -> np.ndarray:
+    """Costs-to-go in float32, by a heap: sums and products are rounded as in kernels, in whatever order."""
+    rows, cols = cost.shape
+    walled = np.full((rows + 2, cols + 2), np.inf, np.float32)
+    walled[1:-1, 1:-1] = cost
+    stride, flat = cols + 2, walled.reshape(-1)
+    slant = np.float32(np.sqrt(2)) if edge == "octile" else np.float32(1)
+    steps = [row * stride + col for row, col in zip(STEP_ROW, STEP_COL, strict=True)]
+    lethal, best = np.isinf(flat).tolist(), [np.inf] * flat.size
+    heap, done = [(0.0, (target // cols + 1) * stride + target % cols + 1)], set()
+    best[heap[0][1]] = 0.0
+    while heap:
+        key, u = heapq.heappop(heap)
+        if u in done:
+            continue
+        done.add(u)
+        own = np.float32(key)
+        offers = float(own + flat[u]), float(own + flat[u] * slant)
+        for k in range(0, 8, 2 if neighbours == 4 else 1):
+            v = u + steps[k]
+            shut = k % 2 and not corner_cutting and (lethal[u + steps[k - 1]] or lethal[u + steps[(k + 1) % 8]])
+            if not (lethal[v] or shut) and offers[k % 2] < best[v]:
+                best[v] = offers[k % 2]
+                heapq.heappush(heap, (best[v], v))
+    found: np.ndarray = np.array(best, np.float32).reshape(walled.shape)[1:-1, 1:-1]
+    return found
+
+
+@pytest.mark.parametrize("field", ["terrain", "uniform", "maze"])
+def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> None:
+    pace = make_field(field, 80)
+    for number, (_, paces) in enumerate(paces_of_any_ratio(pace, np.random.default_rng(1))):
+        rules = RULES[number % len(RULES)]
+        ground = CostGrid(GridSpec(80, 80, 1.0), PlannerConfig(**rules))
+        ground.load(paces)
+        tree = CostToGoTree(ground)
+        target = int(np.flatnonzero(np.isfinite(paces))[1500])
+        tree.grow(target)
+        best = cost_by_heap(tree.inner(ground.cell_cost), target, **rules)
+        np.testing.assert_array_equal(tree.inner(tree.cost), best)
+        assert tree.reach >= best[np.isfinite(best)].max()
+        starts = ground.pad_all(np.flatnonzero(np.isfinite(best) & (best > 0)))
+        walks = ground.walk(tree.parent, ground.pad(target), starts, 0, ground.cell_cost)
+        np.testing.assert_allclose(walks.driven, tree.cost[starts], rtol=1e-4)
+        assert (walks.last == ground.pad(target)).all()
+
+
+@settings(max_examples=EXAMPLES, deadline=None)
+@given(st.data(), st.lists(PACES, min_size=1, max_size=5), METRES, WEIGHTS, st.sampled_from(RULES))
+def test_a_tree_is_exact_on_any_paces_after_any_marks(
+    data: st.DataObject, palette: list[float], resolution_m: float, weight: float, rules: dict
+) -> None:
+    logging.getLogger("planner_service").setLevel(logging.ERROR)
+    rows, cols = data.draw(st.integers(1, 12)), data.draw(st.integers(1, 12))
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    pace = rng.choice(np.array(palette, np.float32), (rows, cols))
+    target = int(rng.integers(rows * cols))
+    with warnings.catch_warnings(), np.errstate(all="raise", under="ignore"):
+        warnings.simplefilter("error")
+        ground = CostGrid(GridSpec(rows, cols, resolution_m), PlannerConfig(length_weight=weight, **rules))
+        ground.load(pace)
+        tree = CostToGoTree(ground)
+        for _ in range(data.draw(st.integers(1, 4))):
+            costs = tree.inner(ground.cell_cost)
+            with np.errstate(all="ignore"):
+                np.testing.assert_allclose(costs, said_cost(pace, resolution_m, weight), rtol=1e-6, atol=1e-38)
+            finite = costs[np.isfinite(costs)]
+            lowest, highest = (finite.min(), finite.max()) if finite.size else (np.inf, 0)
+            assert (ground.lowest_cell_cost, ground.highest_cell_cost) == (lowest, highest)
+            if ground.passable(target):
+                if tree.root != target:
+                    tree.grow(target)
+                assert_exact(ground, tree, target, rules)
+            row, col = int(rng.integers(rows)), int(rng.integers(cols))
+            pace[row : row + 3, col : col + 3] = rng.choice(np.array(palette, np.float32))
+            marked = Window(row, col, row + 3, col + 3), Window(row - 2, col - 2, row + 1, col + 2)
+            changes = ground.apply(pace, marked)
+            if not ground.passable(target) or not tree.fine or tree.root < 0 or tree.repair(changes) < 0:
+                tree = CostToGoTree(ground)
+
+
+@settings(max_examples=EXAMPLES, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(PACES, min_size=2, max_size=4),
+    METRES,
+    WEIGHTS,
+    st.sampled_from(STRATEGIES),
+    st.sampled_from(RULES),
+)
+def test_no_paces_end_a_planner(
+    seed: int, palette: list[float], resolution_m: float, weight: float, strategy: str, rules: dict
+) -> None:
+    logging.getLogger("planner_service").setLevel(logging.ERROR)
+    rng, grid = np.random.default_rng(seed), GridSpec(17, 19, resolution_m)
+    pace = rng.choice(np.array(palette, np.float32), (grid.rows, grid.cols))
+    config = PlannerConfig(strategy=strategy, k_min=0, length_weight=weight, **rules)  # type: ignore[arg-type]
+    tree, target = TargetTree(grid, config), int(rng.integers(grid.cells))
+    with warnings.catch_warnings(), np.errstate(all="raise", under="ignore"):
+        warnings.simplefilter("error")
+        for version in range(8):
+            row, col = (int(each) for each in rng.integers(0, 17, 2))
+            pace[row : row + 2, col : col + 4] = rng.choice(np.array(palette, np.float32))
+            tree.update(pace, target, [Window(row, col, row + 2, col + 4)], version)
+            for route in tree.routes(rng.integers(0, grid.cells, 5)):
+                assert weight or route.lower_bound_s <= route.cost_s * (1 + 1e-5)
+            tree.cost_to_go_at(np.arange(grid.cells))
+            step = int(rng.choice([-grid.cols - 1, -grid.cols, -1, 0, 1, grid.cols]))
+            target = min(max(target + step, 0), grid.cells - 1)
+
+
+@settings(max_examples=EXAMPLES, deadline=None)
+@given(st.lists(st.integers(0, 2**32 - 1), min_size=4, max_size=4), st.integers(0, 3))
+def test_any_bits_are_taken_or_refused_and_a_refusal_changes_nothing(bits: list[int], where: int) -> None:
+    grid = GridSpec(2, 2, 10.0)
+    ground, pace = CostGrid(grid, PlannerConfig()), np.array(bits, np.uint32).view(np.float32).reshape(2, 2)
+    good = bool((pace > 0).all())
+    ground.load(np.ones((2, 2), np.float32))
+    before, changed = ground.cell_cost.copy(), np.ones((2, 2), np.float32)
+    changed.flat[where] = pace.flat[where]
+    windows = [Window(0, 0, 1, 2), Window(1, 0, 2, 2)]
+    for take, fine in (
+        (lambda: ground.apply(changed, windows), changed.flat[where] > 0),
+        (lambda: ground.load(pace), good),
+    ):
+        if fine:
+            take()
+            before = ground.cell_cost.copy()
+            continue
+        with pytest.raises(ValueError, match=r"cell \[\d, \d\] is .* expected a number above 0"):
+            take()
+        np.testing.assert_array_equal(ground.cell_cost, before)
+
+
+@pytest.mark.parametrize("bad", [np.nan, -1.0, 0.0, 1e20])
+def test_shared_cell_costs_that_no_map_has_are_refused(bad: float) -> None:
+    ground = CostGrid(GridSpec(2, 2, 10.0), PlannerConfig())
+    with pytest.raises(ValueError, match="cell costs lie between"):
+        ground.share(np.array([1.0] * 15 + [bad], np.float32))
+
+
+@pytest.mark.parametrize(
+    ("metres", "weight"), [(float("inf"), 0.0), (1e200, 0.0), (1.0, -1.0), (1.0, float("nan"))]
+)
+def test_lengths_that_no_map_has_are_refused(metres: float, weight: float) -> None:
+    with pytest.raises(ValueError, match="length_weight"):
+        CostGrid(GridSpec(2, 2, metres), PlannerConfig(length_weight=weight))
