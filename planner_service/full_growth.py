@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.forms import AnyTree
 from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
 
@@ -38,6 +40,15 @@ class GrownTree:
     reach: float
     offered: NDArray[np.uint8] | None
     pieces: PieceTree | None = None
+
+    def tree_on(self, cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
+        """The tree on the map as it is now: to be repaired by what has changed since the snapshot."""
+        if self.pieces is not None and in_pieces:
+            self.pieces.cost_grid = cost_grid
+            return self.pieces
+        tree = CostToGoTree(cost_grid)
+        tree.take(self.target_cell, self.cost, self.parent, self.reach)
+        return tree
 
 
 def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
@@ -88,4 +99,4 @@ def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]
     best = cost_grid.rests(grown.parent, root, starts[whole], grown.cell_cost)
     driven = walks.driven[whole]
     gaps: NDArray[np.float64] = driven / best
-    return np.where((gaps < 1.0) & (driven >= best * (1.0 - cost_grid.rounding(best))), 1.0, gaps)
+    return np.where((gaps < 1.0) & (driven >= best * (1.0 - 2.0 * cost_grid.rounding(best))), 1.0, gaps)

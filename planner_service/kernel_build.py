@@ -55,6 +55,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.find_starts,
     route_walk.drive_rests,
     cell_costs.cell_cost_range,
+    cell_costs.count_classes,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
 takes longest comes first, so that builders end together."""

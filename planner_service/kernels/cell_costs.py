@@ -77,6 +77,13 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
     return count, lowest, highest
 
 
+@kernel("(i4[::1], i8[::1])")
+def count_classes(bits, counts):
+    """Add to `counts` (int64, 1 << 11) how many cell costs begin with the same 11 bits."""
+    for i in range(bits.size):
+        counts[np.uint64(bits[i] >> 20)] += 1
+
+
 @kernel("(i4[::1],)")
 def cell_cost_range(bits):
     """(lowest, highest finite, highest) cell cost, as bits; the first two those of (inf, 0) if all cells are

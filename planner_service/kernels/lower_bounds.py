@@ -16,12 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.compile import kernel
 from planner_service.kernels.layout import BOX, INF, check_cells
-
-ROUNDING = 2.0**-23
-"""Relative error of one float32 step, doubled for the sum over a route's steps."""
-
 
 WindowBound = tuple[NDArray[np.float32], tuple[int, int, int, int], NDArray[np.int64], NDArray[np.float64]]
 """What a window around the root costs on its own, a lower bound on every way that stays inside: (part, box, rim,
@@ -35,20 +31,13 @@ rim_cost  float64  (m,)      s; the window's own cost of each cell of the rim
 """
 
 
-@helper
-def _rounding(cost, lowest, most):
-    """How far float32 may have put this cost off, relatively: no optimal route has more steps than its cost has
-    lowest cell costs, or than there are cells (`most`)."""
-    return min((min(cost / lowest, most) + 4.0) * ROUNDING, 1.0)
-
-
-@kernel(f"(f4[::1], i8, i8, f4[::1], {BOX}, i8[::1], f8[::1], i8[::1], f8, i8, f8[::1])")
-def bound_by_heuristic(heuristic, root, stride, part, box, rim, rim_cost, starts, lowest, most, bound):
+@kernel(f"(f4[::1], i8, i8, f4[::1], {BOX}, i8[::1], f8[::1], i8[::1], f8[::1], f8, f8[::1])")
+def bound_by_heuristic(heuristic, root, stride, part, box, rim, rim_cost, starts, rounding, most, bound):
     """bound := the larger of itself and what a heuristic and the window around the padded root prove.
 
     part, box, rim, rim_cost  a `WindowBound`, in parts: a single route feels what a nested tuple takes to read
-    lowest, most              lowest cell cost, s, and cells of the grid: they bound a route's steps, and so its
-                              rounding
+    rounding                  float64 (n,), relative; what float32 may add to labels on the best way from each
+    most                      the same of the best way from any cell of the rim
     """
     if heuristic.size > 0:
         check_cells(starts, heuristic.size)
@@ -58,21 +47,18 @@ def bound_by_heuristic(heuristic, root, stride, part, box, rim, rim_cost, starts
     at_root = np.inf
     if known:
         at_root = np.float64(heuristic[root])
-        at_root *= 1.0 + _rounding(at_root, lowest, most)
     nearest = np.inf
     highest = -np.inf
     for j in range(rim.size):
-        inner = rim_cost[j] * (1.0 - _rounding(rim_cost[j], lowest, most))
+        inner = rim_cost[j] * (1.0 - most)
         nearest = min(nearest, inner)
         if known:
-            at_rim = np.float64(heuristic[rim[j]])
-            highest = max(highest, at_rim * (1.0 + _rounding(at_rim, lowest, most)) - inner)
+            highest = max(highest, np.float64(heuristic[rim[j]]) - inner)
     for i in range(starts.size):
         v = starts[i]
         own = 0.0
         if known and heuristic[v] < INF:
-            own = np.float64(heuristic[v])
-            own *= 1.0 - _rounding(own, lowest, most)
+            own = np.float64(heuristic[v]) * (1.0 - rounding[i])
         way = nearest
         if known and rim.size:
             way = max(way, own - highest)
@@ -81,7 +67,7 @@ def bound_by_heuristic(heuristic, root, stride, part, box, rim, rim_cost, starts
         if row0 <= row < row1 and col0 <= col < col1:
             inner = np.float64(part[(row - row0 + 1) * width + col - col0 + 1])
             if inner < np.inf:
-                way = min(way, inner * (1.0 - _rounding(inner, lowest, most)))
+                way = min(way, inner * (1.0 - rounding[i]))
         # A route was found, so that no bound is infinite; a rim that leads nowhere would be.
         if way == np.inf:
             way = 0.0

@@ -25,14 +25,10 @@ class LowerBounds:
         """float32, padded, s: the exact cost of an earlier root, lowered where the map became cheaper. A consistent
         heuristic: no step costs less than it falls by. `take` sets it, `learn` lowers it, or drops it (None) where
         that would visit too many cells."""
-        self._lowest = cost_grid.lowest_cell_cost
-        """s: no cell cost was less since the heuristic was exact. It bounds the steps of a route by which the
-        heuristic was made, and so its rounding. `take` sets it, `learn` lowers it."""
 
     def take(self, exact_cost: Floats) -> None:
         """Go by this exact padded cost from now on; nobody may write to it any more."""
         self._heuristic = exact_cost
-        self._lowest = self._grid.lowest_cell_cost
 
     def forget(self) -> None:
         """The map changed, and nothing is to be known of the optimum until `take`."""
@@ -40,8 +36,6 @@ class LowerBounds:
 
     def learn(self, changes: Changes) -> None:
         """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
-        if changes.cells.size:
-            self._lowest = min(self._lowest, float(changes.before.min()), self._grid.lowest_cell_cost)
         if self._heuristic is None or not changes.any_lower:
             return
         grid = self._grid
@@ -62,17 +56,19 @@ class LowerBounds:
         Raises ValueError where a start is no padded cell.
         """
         grid = self._grid
+        cost = tree.cost_at(starts) if cost is None else cost
+        rounding = grid.rounding(cost)
         if tree.exact:
-            cost = tree.cost_at(starts) if cost is None else cost
-            bound = cost * (1.0 - grid.rounding(cost))
+            # What is driven along its parents is off from its labels by no more than these from the optimum.
+            bound = cost * np.maximum(1.0 - 2.0 * rounding, 0.0)
         else:
             bound = np.zeros(starts.size)
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            steps = self._lowest, grid.grid.cells
+            most = float(grid.rounding(rim_cost.max(initial=0.0)))
             kernels.bound_by_heuristic(
-                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, *steps, bound
+                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, rounding, most, bound
             )
         # Of the optimum only the share that is travel time counts.
         return bound * grid.time_share

@@ -26,7 +26,6 @@ from planner_service.kernels.layout import (
     PaddedGrid,
     step_offsets,
 )
-from planner_service.kernels.lower_bounds import ROUNDING
 from planner_service.tree.growth import grow_tree
 from planner_service.tree.padded_climbs import padded_climbs, with_scratch
 from shared_map.arrays import Bools, Floats, private_copy
@@ -100,6 +99,8 @@ _SHORTEST_M, _LONGEST_M = 1e-30, 1e30
 """Sides of cells that float32 knows."""
 _BLOCK = 1 << 10
 """Cells that are copied at a time: a page of memory."""
+_LETHAL = 0x7F8
+"""The class of inf."""
 _FEWEST, _MOST = 1 << 9, 1 << 14
 """Buckets of a repair."""
 _SMALL = 1 << 20
@@ -155,6 +156,11 @@ class CostGrid:
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
+        self._classes: Cells = np.zeros(1 << 11, np.int64)
+        """How many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide.
+        `load`, `share` and `apply` put another in its place, as snapshots keep the one that they have."""
+        self._cheapest: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        """What the cheapest cells cost together at least, s, and how many they are; of them. None until needed."""
         self._time_cost: Floats | None = None
         """As `time_cost`, where that is an array of its own. `load` and `share` set it, `apply` writes it."""
         self._lowest_time = math.inf
@@ -239,6 +245,7 @@ class CostGrid:
         if self.length_weight_s:
             self._time_cost, _, _ = self._padded(pace, 0.0)
         self._find_range()
+        self._count_classes()
 
     def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int, int]:
         costs: Floats = np.full(self.size, np.inf, np.float32)
@@ -285,6 +292,7 @@ class CostGrid:
         else:
             self._shared, self.cell_cost = time_cost, own
         self._find_range()
+        self._count_classes()
 
     def snapshot(self) -> Self:
         """The same costs, which nobody changes any more. Of shared ones only what has changed is copied."""
@@ -309,6 +317,7 @@ class CostGrid:
         first._make_scratch()
         first.cell_cost = private_copy(self._shared)
         first._find_range()
+        first._count_classes()
         return first
 
     def changes_since(self, older: Floats) -> Changes:
@@ -325,6 +334,10 @@ class CostGrid:
     def _find_range(self) -> None:
         self.lowest_cell_cost, self.highest_cell_cost, _ = _range_of(self.cell_cost)
         self._find_lowest_time()
+
+    def _count_classes(self) -> None:
+        self._classes, self._cheapest = np.zeros(1 << 11, np.int64), None
+        kernels.count_classes(self.cell_cost.view(np.int32), self._classes)
 
     def _find_lowest_time(self) -> None:
         if self._time_cost is not None:
@@ -379,6 +392,9 @@ class CostGrid:
                 np.concatenate([part.before for part in found]),
                 np.concatenate([part.after for part in found]),
             )
+        classes = [part.view(np.int32) >> 20 for part in (changes.after, changes.before)]
+        more, fewer = (np.bincount(part, minlength=1 << 11) for part in classes)
+        self._classes, self._cheapest = self._classes + more - fewer, None
         if ((changes.before <= was[0]) | (changes.before == np.float32(was[1]))).any():
             # An extreme cell is another now: look for the next, or one wrong mark would stay for good.
             self._find_range()
@@ -396,6 +412,11 @@ class CostGrid:
             return NO_CHANGES
         cells = np.unique(np.concatenate(parts))
         return Changes(cells, older[cells], self.cell_cost[cells])
+
+    def window_of(self, cells: Cells) -> Window:
+        """The least window that holds these padded cells, one at least."""
+        rows, cols = np.divmod(cells, self.stride)
+        return Window(int(rows.min()) - 1, int(cols.min()) - 1, int(rows.max()), int(cols.max()))
 
     def _boxes(self, windows: Sequence[Window]) -> Iterator[tuple[int, int, int, int]]:
         """(row0, col0, row1, col1) of what of each window lies on the grid, where anything does."""
@@ -458,12 +479,21 @@ class CostGrid:
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
 
-    def rounding(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far float32 may have put the labels of an exact tree off that cost so much (s), relatively: a route
-        has no more steps than its cost has lowest cell costs, or than there are cells. `kernels.lower_bounds` takes
-        the same."""
-        steps = np.minimum(cost / self.lowest_cell_cost, self.grid.cells) + 4.0
-        return np.minimum(steps * ROUNDING, 1.0)
+    def rounding(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
+        """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
+
+        One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
+        than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
+        that, where the lowest cell cost alone would say a step for each of it.
+        """
+        if self._cheapest is None:
+            classes = np.flatnonzero(self._classes[:_LETHAL])
+            counts = self._classes[classes]
+            least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)
+            # Of the first class zero; a way that costs nothing has no steps.
+            costs = np.cumsum(counts * np.maximum(least, np.finfo(np.float64).tiny))
+            self._cheapest = np.append(0.0, costs), np.append(0.0, np.cumsum(counts))
+        return np.minimum((np.interp(cost, *self._cheapest) + 8.0) * 2.0**-24, 1.0)
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

@@ -9,11 +9,12 @@ from support.planner_strategies import random_pace
 
 from launch_scripts.bench.planning.certificate_checks import Findings, Life, run_checks
 from planner_service.kernels.layout import NONE
+from planner_service.target_tree import TargetTree
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, Window
 
 GRID = GridSpec(40, 60, 2.0)
 
@@ -116,3 +117,39 @@ def test_time_is_told_where_the_price_of_length_rounds_it_away() -> None:
     np.testing.assert_allclose(tree.time_at(cells), walks.driven, rtol=1e-13)
     np.testing.assert_array_equal(costs.time_cost[costs.pad_all(np.arange(GRID.cells))], pace.reshape(-1) * 2)
     assert costs.time_share == pytest.approx(2 * pace.min() / (2 * pace.min() + 2e8), rel=1e-6)
+
+
+def most_steps(costs: CostGrid, cost_s: float) -> int:
+    """By the definition: the cheapest cells, one after the other, as long as they cost no more together."""
+    return int((np.cumsum(np.sort(costs.cell_cost).astype(np.float64)) <= cost_s).sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_way_is_taken_for_shorter_than_it_may_be_nor_for_much_longer(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pace = random_pace(rng, 30, 30, 1e4, 0.2)
+    costs = CostGrid(GridSpec(30, 30, 1.0), PlannerConfig())
+    costs.load(pace)
+    for _ in range(6):
+        for cost_s in (0.5, 3.0, 40.0, 1e3, 1e9):
+            steps = costs.rounding(np.array([cost_s]))[0] * 2**24 - 8
+            assert most_steps(costs, cost_s) <= steps <= most_steps(costs, cost_s * 1.13) + 1
+        row, col = (int(at) for at in rng.integers(0, 25, 2))
+        pace[row : row + 5, col : col + 5] *= np.float32(rng.choice([0.3, 7.0, np.inf]))
+        snapshot, before = costs.snapshot(), costs.rounding(np.array([40.0]))
+        costs.apply(pace, [Window(row, col, row + 5, col + 5)])
+        np.testing.assert_array_equal(snapshot.rounding(np.array([40.0])), before)
+        anew = CostGrid(GridSpec(30, 30, 1.0), PlannerConfig())
+        anew.load(pace)
+        np.testing.assert_array_equal(anew._classes, costs._classes)
+
+
+def test_one_cheap_cell_leaves_certificates_as_tight_as_they_were() -> None:
+    grid = GridSpec(200, 200, 1.0)
+    pace = np.ones((200, 200), np.float32)
+    tree = TargetTree(grid, PlannerConfig(strategy="full"))
+    tree.update(pace, 0, [], 0)
+    before = tree.routes([grid.cells - 1])[0].gap
+    pace[7, 90] = 1e-6
+    tree.update(pace, 0, [Window(7, 90, 8, 91)], 1)
+    assert tree.routes([grid.cells - 1])[0].gap - 1 < 1.02 * (before - 1) < 1e-4

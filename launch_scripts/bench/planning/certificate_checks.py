@@ -20,7 +20,6 @@ from launch_scripts.bench.planning.route_oracle import Cells, Driven, Seconds, b
 from launch_scripts.bench.tables import Progress, table
 from planner_service.full_growth import GrownTree
 from planner_service.kernel_build import load_all
-from planner_service.strategy import OnMove
 from planner_service.target_tree import TargetTree
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -118,14 +117,15 @@ class Life:
         self._seed = seed
         self._findings = findings
         rng = self._rng = np.random.default_rng(seed)
-        rows, cols = (int(rng.integers(1, 49)) for _ in "rc")
+        in_pieces = rng.random() < 0.25
+        rows, cols = (int(rng.integers(1, 161 if in_pieces else 49)) for _ in "rc")
         resolution_m = float(rng.choice([1.0, 0.1, 7.3, 30.0]))
         self._grid = GridSpec(rows, cols, resolution_m)
         self._pace = _random_pace(rng, rows, cols)
-        kind = int(rng.integers(3))
+        kind = int(rng.integers(2 if in_pieces else 3))
         self._climb = _random_climb(rng, self._grid) if kind == 2 else None
         self.config = PlannerConfig(
-            strategy=get_args(Strategy)[rng.integers(len(get_args(Strategy)))],
+            strategy=str(rng.choice(["exact", "auto"] if in_pieces else get_args(Strategy))),
             k_min=int(rng.integers(3)),
             full_every=int(rng.integers(1, 30)),
             cpu_budget=float(rng.choice([1e-9, 1e-4, 0.5])),
@@ -133,6 +133,7 @@ class Life:
             **_RULES[rng.integers(len(_RULES))],
         )
         self._tree = TargetTree(self._grid, self.config, self._climb)
+        self._tree.times.in_pieces = in_pieces  # as if the map were large
         self._target = int(rng.choice(np.flatnonzero(np.isfinite(self._pace))))
         self._version = 0
         self._grown: GrownTree | None = None
@@ -214,7 +215,7 @@ class Life:
         for routes in (whole, cut):
             self._note("bound", _above(routes.lower_bound_s[there], best_s[there]), _FLOAT64)
         self._note("optimum", _above(best_s[there], driven.time_s[there]), _FLOAT64)
-        if self._tree.strategy.on_move is OnMove.WHOLE_TREE:
+        if self._tree.strategy.is_exact:
             best = best_costs(*ground, self._target, self.config.length_weight)[there]
             asked = driven.time_s[there] + self.config.length_weight * whole.length_m[there]
             self._note("exact", _above(asked, best), self._grid.cells * 2.0**-23)
