@@ -106,7 +106,7 @@ class Agent:
             f"{scenario.seed}/{plan.id}",
         )
         self._driver = Driver(local_map, holdings, self._steering.passable, dynamics)
-        self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
+        self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)

@@ -111,7 +111,7 @@ class TargetWorld:
         pace: Floats = inflate(truth_s_per_m, halves) if halves else private_copy(truth_s_per_m)
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
-        self._terrain = TrueTerrain(terrain.grid, pace)
+        self._terrain = TrueTerrain(terrain.grid, pace, terrain.climb)
         self._referee = Referee(truth_s_per_m, terrain.grid)
         self._target_bodies = TargetBodies(scenario, terrain.grid)
         self.rovers = Rovers(scenario, self._terrain, incarnation)

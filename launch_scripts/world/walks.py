@@ -1,6 +1,7 @@
 """How simulated targets move over the true terrain. Pure: time and chance are arguments.
 
-Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never past the corner of one.
+Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never past the corner of one,
+never up or down what is too steep. Where steps cost by what they climb, so do theirs.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import CellsOf
+from shared_map.terrain.step_climb import Climb
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
 from swarm.errors import TerrainError
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
 
@@ -37,13 +39,17 @@ _STEPS_PER_TICK = 1000
 
 
 class TrueTerrain:
-    """True pace of every cell, and the steps that are possible."""
+    """True pace of every cell, and the steps that are possible.
 
-    def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
+    climb  factor of a step's cost by its slope; None if steps cost the same both ways
+    """
+
+    def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32], climb: Climb | None = None) -> None:
         # Imported here: it takes as long as all else that a run's roles share, and one process of them needs it.
         from scipy.ndimage import label
 
         self.grid = grid
+        self.climb = climb
         self.pace_s_per_m = pace_s_per_m.view()
         self.pace_s_per_m.flags.writeable = False  # walks are told it
         passable = np.isfinite(pace_s_per_m)
@@ -89,7 +95,8 @@ class TrueTerrain:
             return None
         if d_row and d_col and not (self._passable(row, to_col) and self._passable(to_row, col)):
             return None
-        return to_row * self.grid.cols + to_col
+        to = to_row * self.grid.cols + to_col
+        return to if self.climb is None or self.climb.allows(cell, to) else None
 
     def steps(self, cell: int) -> list[tuple[int, int]]:
         """(direction, cell) of every possible step."""
@@ -100,6 +107,11 @@ class TrueTerrain:
         straight = abs(cell - to) in (1, self.grid.cols)
         return self.grid.resolution_m * (1.0 if straight else math.sqrt(2))
 
+    def step_s(self, cell: int, to: int) -> float:
+        """How long a vehicle takes for the step, as `Driver` has it."""
+        level_s = self.length_m(cell, to) * self.pace_s_per_m.item(to)
+        return level_s if self.climb is None else level_s * self.climb.driven(cell, to)
+
     def way(self, start: int, chance: random.Random) -> list[int]:
         """The cheapest way to a random place that can be reached inside the window around `start`, without `start`
         itself; empty if there is none."""
@@ -108,7 +120,7 @@ class TrueTerrain:
 
         window = self.grid.around(start, WAY_HALF_CELLS)
         rows, cols = window.row1 - window.row0, window.col1 - window.col0
-        graph = _steps_graph(self.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1])
+        graph = self._steps_graph(window)
         row, col = self.grid.row_col(start)
         here = (row - window.row0) * cols + col - window.col0
         cost, before = dijkstra(graph, directed=True, indices=np.asarray(here), return_predecessors=True)
@@ -129,34 +141,40 @@ class TrueTerrain:
         way.reverse()
         return way
 
+    def _steps_graph(self, window: Window) -> csr_array[np.float64]:
+        """Graph of all possible steps inside a window; an edge costs what the step does, in cells."""
+        from scipy.sparse import csr_array
 
-def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
-    """Graph of all possible steps of a window of pace; an edge costs what entering its end costs."""
-    from scipy.sparse import csr_array
+        pace = self.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
+        rows, cols = pace.shape
+        padded = np.full((rows + 2, cols + 2), np.inf)
+        padded[1:-1, 1:-1] = pace
+        open_ = np.isfinite(padded)
+        cells = np.arange(rows * cols).reshape(rows, cols)
+        on_map = cells // cols * self.grid.cols + cells % cols + window.row0 * self.grid.cols + window.col0
+        starts: list[NDArray[np.int64]] = []
+        ends: list[NDArray[np.int64]] = []
+        costs: list[NDArray[np.float64]] = []
 
-    rows, cols = pace.shape
-    padded = np.full((rows + 2, cols + 2), np.inf)
-    padded[1:-1, 1:-1] = pace
-    open_ = np.isfinite(padded)
-    cells = np.arange(rows * cols).reshape(rows, cols)
-    starts: list[NDArray[np.int64]] = []
-    ends: list[NDArray[np.int64]] = []
-    costs: list[NDArray[np.float64]] = []
+        def shifted(array: NDArray[Any], d_row: int, d_col: int) -> NDArray[Any]:
+            return array[1 + d_row : 1 + d_row + rows, 1 + d_col : 1 + d_col + cols]
 
-    def shifted(array: NDArray[Any], d_row: int, d_col: int) -> NDArray[Any]:
-        return array[1 + d_row : 1 + d_row + rows, 1 + d_col : 1 + d_col + cols]
-
-    for direction in range(8):
-        d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
-        possible = open_[1:-1, 1:-1] & shifted(open_, d_row, d_col)
-        if d_row and d_col:
-            possible &= shifted(open_, d_row, 0) & shifted(open_, 0, d_col)
-        start = cells[possible]
-        starts.append(start)
-        ends.append(start + d_row * cols + d_col)
-        costs.append(shifted(padded, d_row, d_col)[possible] * math.hypot(d_row, d_col))
-    edges = (np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends)))
-    return csr_array(edges, shape=(rows * cols, rows * cols))
+        for direction in range(8):
+            d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
+            possible = open_[1:-1, 1:-1] & shifted(open_, d_row, d_col)
+            if d_row and d_col:
+                possible &= shifted(open_, d_row, 0) & shifted(open_, 0, d_col)
+            start = cells[possible]
+            cost = shifted(padded, d_row, d_col)[possible] * math.hypot(d_row, d_col)
+            if self.climb is not None:
+                tails = on_map[possible]
+                cost *= self.climb.along(tails, tails + d_row * self.grid.cols + d_col)
+                start, cost = start[cost < np.inf], cost[cost < np.inf]
+            starts.append(start)
+            ends.append(start + d_row * cols + d_col)
+            costs.append(cost)
+        edges = (np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends)))
+        return csr_array(edges, shape=(rows * cols, rows * cols))
 
 
 @dataclass
@@ -359,8 +377,7 @@ class Walker:
 
     def _step_s(self, terrain: TrueTerrain) -> float:
         assert self.towards is not None
-        pace = float(terrain.pace_s_per_m.flat[self.towards])
-        return terrain.length_m(self.cell, self.towards) * pace * self.slowness
+        return terrain.step_s(self.cell, self.towards) * self.slowness
 
 
 def slowness_of(target: TargetConfig, cost: CostConfig) -> float:

@@ -53,7 +53,7 @@ _ZERO32 = np.float32(0.0)
 _EVERY_BIT = np.uint64(0xFFFFFFFF)
 _FAR = np.float32(1 << 30)
 """No bucket has a larger number, so that it fits int32."""
-CIRCLE = 1 << 10
+CIRCLE = 1 << 9
 """Buckets of each kind of step."""
 _CIRCLE, _MASK = np.int32(CIRCLE), np.int32(CIRCLE - 1)
 _STRAIGHT, _DIAGONAL = np.uint64(0), np.uint64(CIRCLE + 1)
@@ -62,7 +62,7 @@ _BEHIND = np.uint64(CIRCLE)
 """Counted from there, the one behind the circle."""
 _LAST = 1 << 20
 """Buckets are counted anew beyond this one: float32 tells so many apart."""
-_SPARSE = np.uint64(16)
+_SPARSE = np.uint64(32)
 """Buckets that hold fewer cells, in the mean of a circle, get wider."""
 _WIDER, _NARROWER = np.float32(8.0), np.float32(1 / 8)
 _FEW, _AGAIN = np.uint64(1024), np.uint64(2)

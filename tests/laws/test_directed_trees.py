@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +34,7 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import SlopeRule
 from swarm.grid import GridSpec, Window
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 SLOPES: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
 
@@ -191,6 +193,53 @@ def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
         driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
         assert (tree.cost[starts] + tree.offset >= driven * (1 - 1e-5)).all()
     assert visited > 100
+
+
+@pytest.mark.parametrize("strategy", ["full", "rotation", "variable_range+multi_resolution"])
+@pytest.mark.parametrize("most", [0, 5])
+def test_what_is_said_of_a_route_does_not_depend_on_who_else_asks(strategy: str, most: int) -> None:
+    ground = Ground(4, RULES[0], 24, 26)
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
+    play = Play(ground.pace, config, climb=ground.climb)
+    for _ in range(8):
+        play.happen(Move(*(int(step) for step in ground.rng.integers(-1, 2, 2))))
+        asked = ground.rng.choice(play.grid.cells, 40)
+        together = copy.deepcopy(play.tree).routes(asked, most)
+        alone = copy.deepcopy(play.tree)
+        for n, cell in enumerate(asked.tolist()):
+            one = alone.routes([cell], most)[0]
+            assert (one.cost_s, one.remaining_s) == (together[n].cost_s, together[n].remaining_s)
+            assert (one.lower_bound_s, one.directions) == (together[n].lower_bound_s, together[n].directions)
+
+
+class Extremes(Play):
+    """Marks that are told as dear and as cheap as the wire allows, and that are taken back."""
+
+    def _mark(self, event: Marks) -> Window:
+        rng = np.random.default_rng(event.seed)
+        before = self.pace.copy()
+        window = super()._mark(event)
+        marked = np.argwhere(self.pace != before)
+        for row, col in marked:
+            if np.isfinite(self.pace[row, col]):
+                self.pace[row, col] = rng.choice(np.array([PACE_LEAST, PACE_MOST, 1.0, 3.0], np.float32))
+        # What was marked most dearly, or most cheaply, may go again.
+        for row, col in np.argwhere((self.pace == np.float32(PACE_MOST)) | (self.pace == np.float32(PACE_LEAST))):
+            if rng.random() < 0.4:
+                self.pace[row, col] = 1.0
+                window = window.union(Window(int(row), int(col), int(row) + 1, int(col) + 1))
+        return window
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_marks_as_dear_and_as_cheap_as_can_be_come_and_go_and_the_laws_hold(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows, cols = 13 + seed, 22 - seed
+    pace = random_pace(rng, rows, cols, 4.0, 0.15)
+    climb = random_climb(rng, rows, cols, (0.1, 0.3)[seed % 2], 0.25)
+    strategy = STRATEGIES[1 + seed % 5]
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, full_every=4, **RULES[seed % 5])  # type: ignore[arg-type]
+    Extremes(pace, config, climb=climb).walk(rng, 18, 3)
 
 
 def one_way() -> Climb:

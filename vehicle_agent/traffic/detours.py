@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from vehicle_agent.bodies import Bodies
@@ -33,15 +34,22 @@ class Detours:
     """Leads vehicles around standing bodies.
 
     pace   float32 (rows, cols), s/m; inf is lethal
-    steps  the neighbours of a cell to which one may drive: not lethal, not closed
+    steps  the neighbours of a cell to which one may drive: not lethal, not closed, not too steep
+    climb  factor of a step's cost by its slope; None if steps cost the same both ways
 
     found  how many ways around were begun
     """
 
     def __init__(
-        self, grid: GridSpec, pace: NDArray[np.float32], steps: Callable[[int], list[int]], bodies: Bodies
+        self,
+        grid: GridSpec,
+        pace: NDArray[np.float32],
+        steps: Callable[[int], list[int]],
+        bodies: Bodies,
+        climb: Climb | None = None,
     ) -> None:
         self.found = 0
+        self._climb = climb
         self._grid = grid
         self._pace = pace.reshape(-1)
         self._steps = steps
@@ -111,7 +119,8 @@ class Detours:
                 rest_s += self._step_s(behind[index - 1], behind[index])
         if not goals:
             return
-        least = float(self._pace[behind].min()) * self._grid.resolution_m
+        lowest = 1.0 if self._climb is None else self._climb.lowest
+        least = float(self._pace[behind].min()) * self._grid.resolution_m * lowest
         end_row, end_col = divmod(behind[-1], self._grid.cols)
 
         def bound_s(cell: int) -> float:
@@ -145,4 +154,5 @@ class Detours:
 
     def _step_s(self, tail: int, head: int) -> float:
         straight = abs(head - tail) in (1, self._grid.cols)
-        return float(self._pace[head]) * self._grid.resolution_m * (1.0 if straight else _DIAGONAL)
+        level_s = float(self._pace[head]) * self._grid.resolution_m * (1.0 if straight else _DIAGONAL)
+        return level_s if self._climb is None else level_s * self._climb.of_step(tail, head)

@@ -20,8 +20,8 @@ from swarm.grid import Window
 
 _HALVES = (16, 32, 64)
 """Cells to every side of the windows."""
-_PATCH = 4
-"""The same of a patch that becomes twice as dear, and what it was again."""
+_PATCHES = (0, 4, 8)
+"""The same of patches that become twice as dear, and what they were again; 0 is a mark of one cell."""
 _MOVES = 6
 """There and back, in each window."""
 _PLACES = 3
@@ -113,16 +113,17 @@ def _patches(
     rng: np.random.Generator,
     free: NDArray[np.int64],
 ) -> None:
-    for _ in range(_PLACES):
-        window = sides[0].costs.grid.around(int(rng.choice(free)), _PATCH)
-        for factor, what in ((2.0, "dearer"), (0.5, "cheaper")):
+    for half in _PATCHES * _PLACES:
+        window = sides[0].costs.grid.around(int(rng.choice(free)), half)
+        what = f"{2 * half + 1} x {2 * half + 1} cells" if half else "1 cell"
+        for factor, becomes in ((2.0, "dearer"), (0.5, "cheaper")):
             done = [side.change(window, factor) for side in sides]
             if not all(done):
                 for side in sides:
                     side.tree.grow(side.tree.root)
                 continue
             side_ms = [side.took_ms for side in sides]
-            _note(took, f"repair, {2 * _PATCH + 1} x {2 * _PATCH + 1} cells {what}", side_ms)
+            _note(took, f"repair, {what} {becomes}", side_ms)
 
 
 def _timed(work: Callable[..., object], *arguments: object) -> float:

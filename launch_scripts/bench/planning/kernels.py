@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from launch_scripts.bench.machine import machine
+from launch_scripts.bench.planning.any_costs import growths_of_any_ratio
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, number, table, times
 from planner_service.tree.bounds import LowerBounds
@@ -125,6 +126,7 @@ def run(
     routes     by how many at once: a whole route with its certificate, and its mean number of steps
     repairs    of a patch, the map's part of it included, and a growth where it gave way: CPU time, and over the
                median growth; given_way: share of the changes
+    costs      growths where costs differ by any ratio, over growths of the field
     """
     bench = _Bench(make_field(field, size, seed).copy(), seed)
     bench.grow()
@@ -173,6 +175,7 @@ def run(
         "steps": STEPS,
         "routes": routes,
         "repairs": repairs,
+        "costs": growths_of_any_ratio(bench.pace, max(repeats // 3, 1), seed),
         **machine(),
     }
 
@@ -193,4 +196,8 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
         share = "" if row["given_way"] is None else f"{100 * row['given_way']:.0f} %"
         figures = (number(row[f"{name}_us"]) for name in ("p50", "mean", "p95", "max"))
         found.add_row(row["change"], str(row["side"]), *figures, times(row["worst_over_growth"]), share)
+    yield found
+    found = table("A full tree where costs differ by any ratio", "<paces", "ms", "/ the field's")
+    for row in report["costs"]:
+        found.add_row(row["costs"], number(row["growth_ms"]), times(row["over_usual"]))
     yield found

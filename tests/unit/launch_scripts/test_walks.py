@@ -22,6 +22,7 @@ from launch_scripts.world.walks import (
     far_place,
     slowness_of,
 )
+from shared_map.terrain.step_climb import climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
 from swarm.config.values import Walk
@@ -54,6 +55,30 @@ def walker(
 ) -> Walker:
     world = WalkWorld("t", where, random.Random(seed), budget or Budget())
     return Walker("t", WALKS[walk](world), slowness, cell)
+
+
+@pytest.mark.parametrize("walk", ["random", "waypoints", "evade"])
+def test_no_target_takes_a_step_that_is_too_steep_and_none_outruns_the_climb(walk: Walk) -> None:
+    """Terraces, each of which may be left downhill only."""
+    heights = np.repeat(np.arange(6, dtype=np.float32) * 0.6 * RES, 5)[:, None] + np.zeros((30, 34), np.float32)
+    climb = climb_of(
+        GridSpec(30, 34, RES), heights, CostConfig(directional=True, max_climb_deg=20, max_slope_deg=50)
+    )
+    assert climb is not None
+    where = TrueTerrain(GridSpec(30, 34, RES), rough(3, lethal=0.1), climb)
+    one = walker(where, where.nearest(29 * 34 + 15), walk)
+    downhill = 0
+    for _ in range(1500):
+        before = one.cell
+        one.towards = one.towards or one.walk.choose(before, np.array([before - 34]))
+        if one.towards is None:
+            continue
+        assert climb.allows(before, one.towards)
+        level_s = where.length_m(before, one.towards) * where.pace_s_per_m.item(one.towards)
+        one.advance(where, level_s * climb.of_step(before, one.towards) * 1.0001, np.array([before - 34]))
+        assert one.cell != before
+        downhill += heights.flat[one.cell] < heights.flat[before]
+    assert walk == "evade" or downhill > 0
 
 
 def test_the_largest_part_is_what_legal_steps_connect() -> None:

@@ -9,7 +9,9 @@ import msgpack
 import numpy as np
 import pytest
 
+from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.clock import NS_PER_S
+from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
@@ -191,10 +193,12 @@ def vehicle_on(route: list[int]) -> Vehicle:
     return vehicle
 
 
-def drive_around(bodies: Bodies, pace: np.ndarray, ticks: int = 60) -> tuple[Vehicle, Detours]:
+def drive_around(
+    bodies: Bodies, pace: np.ndarray, ticks: int = 60, climb: Climb | None = None
+) -> tuple[Vehicle, Detours]:
     route = [GRID.cell(20, col) for col in range(5, 35)]
     vehicle = vehicle_on(route)
-    detours = Detours(GRID, pace, steering(bodies, pace).steps, bodies)
+    detours = Detours(GRID, pace, steering(bodies, pace).steps, bodies, climb)
     for tick in range(ticks):
         detours.tick([vehicle], lambda id: [route[0]], NOW + NS_PER_S + tick * TICK)
     return vehicle, detours
@@ -209,6 +213,18 @@ def test_a_body_that_stands_on_a_route_is_driven_around_by_the_cheapest_way(bodi
     assert not any(cell in bodies.closed for cell in cells)
     assert all(GRID.distance_cells(a, b) == 1 for a, b in itertools.pairwise(cells))
     assert len(cells) == 30, "diagonal steps aside cost no cell"
+
+
+@pytest.mark.parametrize("ridge", [np.s_[10:20], np.s_[21:31]])
+def test_the_way_around_that_climbs_less_is_taken(bodies: Bodies, ridge: slice) -> None:
+    heights = np.zeros((40, 40), np.float32)
+    heights[ridge, 15:26] = 8.0
+    climb = climb_of(GRID, heights, CostConfig(directional=True, slope_rule="energy"))
+    standing(bodies, body(20.5, 20.5, radius_m=25.0))
+    vehicle, detours = drive_around(bodies, np.full((40, 40), 0.1, np.float32), climb=climb)
+    cells = vehicle.route.ahead()
+    assert detours.found == 1
+    assert heights.flat[cells].max() == 0.0
 
 
 def test_a_long_way_around_is_found_over_several_ticks(bodies: Bodies) -> None:
