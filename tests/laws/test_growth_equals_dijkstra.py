@@ -64,11 +64,12 @@ def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dic
         assert reach >= wide[np.isfinite(wide)].max()
 
 
-@pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e20, 1e30])
+@pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e20])
 def test_no_ratio_of_paces_breaks_or_crawls(ratio: float) -> None:
     rng = np.random.default_rng(6)
     for walls in (0.0, 0.2):
         pace = random_pace(rng, 120, 120, ratio, walls)
+        pace[pace < np.inf] = np.clip(pace[pace < np.inf], 2.0**-40, 2.0**40)  # as the door does
         target = int(np.flatnonzero(np.isfinite(pace))[77])
         for rules in RULES:
             # 400 steps, each rounded by 2^-23 at most where costs drown in others.
