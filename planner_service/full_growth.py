@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.forms import AnyTree
 from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
 
@@ -38,6 +40,15 @@ class GrownTree:
     reach: float
     offered: NDArray[np.uint8] | None
     pieces: PieceTree | None = None
+
+    def tree_on(self, cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
+        """The tree on the map as it is now: to be repaired by what has changed since the snapshot."""
+        if self.pieces is not None and in_pieces:
+            self.pieces.cost_grid = cost_grid
+            return self.pieces
+        tree = CostToGoTree(cost_grid)
+        tree.take(self.target_cell, self.cost, self.parent, self.reach)
+        return tree
 
 
 def can_be_root(cost_grid: CostGrid, cell: int) -> bool:

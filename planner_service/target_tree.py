@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.growth_times import GrowthTimes
-from planner_service.strategy import FullGrowth, OnMove, Strategy, StrategyRow, whole_trees_only
+from planner_service.reach import Reach
+from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.forms import AnyTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.pieces import PieceTree
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
-from planner_service.tree.windows import WindowSchedule, block_half, exact_half
+from planner_service.tree.windows import exact_half
 from planner_service.update import Update
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
@@ -62,18 +64,14 @@ class TargetTree:
         self.ready = False
         self.last_gaps: NDArray[np.float64] = np.empty(0, np.float64)
         self._grid = grid
-        self._config = config
         self._all_kernels = all_kernels
-        self._side = max(grid.rows, grid.cols)
         self._has_worker = has_worker
         # The cell costs of the map as it was last told, and whether it was told at all.
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
-        self._tree: CostToGoTree | PieceTree = CostToGoTree(self._costs)
+        self._tree: AnyTree = CostToGoTree(self._costs)
         # The tree is of no use and must be grown: before the first, and when the map changed without a target.
         self._stale = True
-        # Moves of the target since the whole tree was last exact.
-        self._moves = 0
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
         # A full growth was left to the worker: until it is adopted, moves are not followed.
@@ -81,8 +79,7 @@ class TargetTree:
         # The networks of strategies that thin far cells.
         self._strides = StrideUpkeep()
         self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
-        # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
-        self._schedule = WindowSchedule(grid, self.times.narrowest)
+        self._reach = Reach(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
         # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
@@ -119,7 +116,7 @@ class TargetTree:
         moved = target_cell != self._tree.root
         if self._stale:
             return self._grow_full(target_cell)
-        self._moves += moved
+        self._reach.moves += moved
         row = self.strategy
         whole = row.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact)
         if whole and self.times.is_quick(self._grid.cells):
@@ -136,13 +133,7 @@ class TargetTree:
             done = self._move(target_cell)
         if self._is_full_due(done):
             done = self._renew(done)
-        if repaired.kind != "none" and done.kind == "none":
-            done = Update(repaired.kind, repaired.window, repaired.cells, done.wants_full)
-        elif repaired.kind != "none" and done.kind not in ("full", "exact") and moved:
-            done = Update(
-                "window", done.window.union(repaired.window), done.cells + repaired.cells, done.wants_full
-            )
-        return done
+        return done.after(repaired) if repaired.kind != "none" and moved | (done.kind == "none") else done
 
     def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
         """A full growth for a worker, on the map as it was told last: see `growth_job`."""
@@ -192,8 +183,8 @@ class TargetTree:
             if repaired is None or self.times.is_quick(self._grid.cells):
                 return self._grow_full(target_cell)
             return self._leave_to_worker() if target_cell != tree.root else repaired
-        tree = self._tree = self._taken(grown)
-        self._note_full_growth(grown.target_cell)
+        tree = self._tree = grown.tree_on(self._costs, self._in_pieces)
+        self._reach.note_whole(grown.target_cell)
         self._bounds.take(grown.heuristic)
         self._is_better_bound = False
         self._learn_bounds(since)
@@ -227,13 +218,11 @@ class TargetTree:
             return self._grow_full(target)
         if self._can_mend and self.times.is_short(self.times.exact_ns):
             return self._mend()
-        row, col = self._grid.row_col(target)
-        rows, cols = np.divmod(wanted, self._grid.cols)
-        half = int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) * 5 // 4 + 1
+        half = max(self._grid.distance_cells(target, cell) for cell in wanted.tolist()) * 5 // 4 + 1
         window = self._grid.around(target, half)
         grown_cells = 0
         has_windows = self.strategy.on_move is not OnMove.WHOLE_TREE
-        if half <= self._widest and has_windows and self._tree.precise:
+        if half <= self.times.widest(self.strategy.widest_window) and has_windows and self._tree.precise:
             grown_cells = self._tree.move(target, window)
         if not grown_cells:
             return Update("none", wants_full=not self._job_out)
@@ -259,10 +248,6 @@ class TargetTree:
         return costs
 
     # --- how ----------------------------------------------------------------------------------------------------
-
-    @property
-    def _widest(self) -> int:
-        return self.times.widest(self.strategy.widest_window)
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
         """Take the map's changes. None the first time: everything is new."""
@@ -304,10 +289,10 @@ class TargetTree:
             self._stale, self.ready, self.target_cell = True, False, None
             return Update("none", wants_full=not self._job_out)
         if isinstance(self._tree, PieceTree) is not self._in_pieces:
-            self._tree = PieceTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
+            self._tree = empty_tree(self._costs, self._in_pieces)
         self._tree.grow(target_cell)
         self._stale = False
-        self._note_full_growth(target_cell)
+        self._reach.note_whole(target_cell)
         self._bounds_are_old()
         return Update("full", self._grid.window, self._grid.cells)
 
@@ -316,33 +301,9 @@ class TargetTree:
         """Whether the row in force wants the tree in pieces."""
         return self.times.in_pieces and self.strategy.on_move is OnMove.EXACT_MOVE
 
-    def _taken(self, grown: GrownTree) -> CostToGoTree | PieceTree:
-        """What a worker grew, as a tree on the map as it is now."""
-        if grown.pieces is not None and self._in_pieces:
-            grown.pieces.cost_grid = self._costs
-            return grown.pieces
-        tree = self._tree if isinstance(self._tree, CostToGoTree) else CostToGoTree(self._costs)
-        tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
-        return tree
-
-    def _whole(self) -> CostToGoTree:
-        """The tree, no longer in pieces."""
-        tree = self._tree
-        if isinstance(tree, PieceTree):
-            exact = tree.exact
-            self._tree = whole = CostToGoTree(self._costs)
-            whole.take_parents(tree.root, tree.parent)
-            whole.exact = exact
-            return whole
-        return tree
-
     def _bounds_are_old(self) -> None:
         self._bounds.forget()
         self._is_better_bound = True
-
-    def _note_full_growth(self, root: int) -> None:
-        self._moves = 0
-        self._schedule.note_grown(root, self._side)
 
     def _repair(self, changes: Changes | None) -> Update | None:
         """Bring the tree up to date with the map; None if it must be grown instead."""
@@ -358,10 +319,7 @@ class TargetTree:
         visited = tree.repair(changes)
         if visited < 0 or not tree.fine:
             return None
-        rows = changes.cells // self._costs.stride - 1
-        cols = changes.cells % self._costs.stride - 1
-        window = Window(int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1)
-        return Update("repair", window, visited)
+        return Update("repair", self._costs.window_of(changes.cells), visited)
 
     @property
     def _can_mend(self) -> bool:
@@ -376,7 +334,7 @@ class TargetTree:
             if not tree.fine or self.times.is_quick(self._grid.cells):
                 return self._grow_full(tree.root)
             return Update("window", self._grid.window, cells, wants_full=not self._job_out)
-        self._note_full_growth(tree.root)
+        self._reach.note_whole(tree.root)
         self._bounds_are_old()
         return Update("exact", self._grid.window, cells)
 
@@ -394,9 +352,7 @@ class TargetTree:
         if self._in_pieces and not isinstance(self._tree, PieceTree):
             if not self.times.is_quick(self._grid.cells):
                 return self._leave_to_worker()
-            pieces = PieceTree(self._costs)
-            pieces.take(self._tree.root, self._tree.parent)
-            self._tree = pieces
+            self._tree = in_pieces(self._tree)
         cells = 0
         if target_cell != self._tree.root:
             half = exact_half(self._grid, self._tree.root, target_cell)
@@ -408,7 +364,7 @@ class TargetTree:
 
     def _move(self, target_cell: int) -> Update:
         """Grow a window around the target's new cell, a wider one where that fails, at last the whole tree."""
-        tree = self._whole()
+        self._tree = tree = in_cells(self._tree)
         if self._left_to_worker or not (tree.fine or self.times.is_quick(self._grid.cells)):
             return self._leave_to_worker()
         if not tree.fine:
@@ -418,13 +374,13 @@ class TargetTree:
         if self._is_better_bound and tree.exact:
             self._bounds.take(tree.cost.copy())
         self._is_better_bound = False
-        half, far = self._reach(target_cell)
-        network = self._strides.network if far > half else None
+        network = self._strides.network
+        half, far = self._reach.after_move(self.strategy, tree.root, target_cell, network is not None)
         window, cells = self._grow_window(target_cell, half)
         if window is None:
             return self._give_up(target_cell)
-        if network is not None:
-            self._schedule.note_grown(target_cell, far)
+        if network is not None and far > half:
+            self._reach.note_window(target_cell, far)
             cells += tree.grow_strides(window, network, far)
             return Update("coarse", self._grid.around(target_cell, far), cells)
         return Update("window", window, cells)
@@ -439,7 +395,7 @@ class TargetTree:
             connected = self._tree.move(target_cell, window)
             cells += window.cells
             if connected:
-                self._schedule.note_grown(target_cell, half)
+                self._reach.note_window(target_cell, half)
                 return window, cells
             half *= 2
             window = self._grid.around(target_cell, half)
@@ -449,34 +405,12 @@ class TargetTree:
         """No window leads to the target's new cell."""
         return self._grow_full(target_cell) if self.times.is_quick(self._grid.cells) else self._leave_to_worker()
 
-    def _reach(self, target_cell: int) -> tuple[int, int]:
-        """How far to every side of the target all cells are grown now, and how far strides are: no further
-        where both are the same."""
-        row, old, fine = self.strategy, self._tree.root, self.times.fine
-        has_strides = row.thins_far_cells and self._strides.network is not None and 4 * fine <= self._side
-        least = 2 * self._grid.distance_cells(old, target_cell)
-        if row.on_move is OnMove.BLOCK_WINDOW:
-            half = block_half(self._grid, old, target_cell, self._config.k_min)
-            return (min(half, max(fine, least)) if has_strides else half), half
-        widest = self._widest
-        if has_strides and self._schedule.beyond(target_cell, widest):
-            return max(widest, fine, least), self._side
-        half = max(self._schedule.half(target_cell, widest), least)
-        return half, half
-
     def _is_full_due(self, done: Update) -> bool:
-        """Whether to ask for a full growth after what was done: the row says when, unless one is under way."""
+        """Whether the whole tree is due after what was done, unless a growth is under way."""
         if done.kind in ("full", "exact") or done.wants_full or self._job_out:
             return False
-        row = self.strategy
-        if row.full_growth is FullGrowth.EVERY_FEW_MOVES:
-            # On a small map a full growth is due as soon as windows have cost half as much.
-            twice = 2 * (2 * self.times.narrowest) ** 2
-            return self._moves >= min(self._config.full_every, self._grid.cells // twice + 1)
-        if row.full_growth is FullGrowth.WITHIN_BUDGET:
-            costs_ns = self.times.exact_ns if self._can_mend else self.times.full_ns
-            return self._moves > 0 and self._moves * self.times.budget_ns >= costs_ns
-        return False
+        costs_ns = self.times.exact_ns if self._can_mend else self.times.full_ns
+        return self._reach.is_whole_due(self.strategy, costs_ns)
 
     def _inside(self, cells: Any) -> NDArray[np.int64]:
         asked = np.asarray(cells, np.int64).reshape(-1)

@@ -26,3 +26,11 @@ class Update:
     window: Window = _EMPTY
     cells: int = 0
     wants_full: bool = False
+
+    def after(self, repaired: Update) -> Update:
+        """This, and the repair before it."""
+        if self.kind == "none":
+            return Update(repaired.kind, repaired.window, repaired.cells, self.wants_full)
+        if self.kind in ("full", "exact"):
+            return self
+        return Update("window", self.window.union(repaired.window), self.cells + repaired.cells, self.wants_full)

@@ -71,6 +71,9 @@ FINEST = 2.0**-46
 32nd of it; it keeps costs within so much a step of the optimum."""
 _DRIFT = 4.0
 """How many times that a tile's totals may come apart before it is looked at."""
+MOST_SLACK = 8 * FINEST
+"""Of the farthest cost: no cell of an exact tree is offered less than it costs by more than this. It holds both of
+these and the rounding of sums."""
 
 Cells = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64], int]
 """(parent, piece, local, root), root a padded cell."""

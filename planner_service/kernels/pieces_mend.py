@@ -53,21 +53,24 @@ _ONE = np.uint64(1)
 
 
 @helper
-def _lay_line(count, g, step, i, jump, at, by, other, grid, labels, total, bench):
-    """Put `count` cells on the bench, each `step` after the one before on the map, `jump` in tile `other`, `by` on
-    the bench; from padded cell g, from i in the tile, from `at`. There is no such tile where cells are lethal."""
+def _lay_line(count, first, steps, other, grid, labels, total, bench):
+    """Put `count` cells of tile `other` on the bench; there is no such tile where cells are lethal.
+
+    first  where the first is on the map, among the cells of all tiles, on the bench
+    steps  from one to the next, in the same order
+    """
     cell_cost = grid[0]
     piece, local = labels[1], labels[2]
     cost, own = bench[1], bench[2]
-    names = other * ROOM
+    g, i, at = first
     for _ in range(count):
         own[at] = cell_cost[g]
         cost[at] = np.inf
         if cell_cost[g] < INF:
-            cost[at] = total[names + np.int64(piece[i]), TOTAL] + local[i]
-        g += step
-        i += jump
-        at += by
+            cost[at] = total[other * ROOM + np.int64(piece[i]), TOTAL] + local[i]
+        g += steps[0]
+        i += steps[1]
+        at += steps[2]
 
 
 @helper
@@ -102,10 +105,8 @@ def _lay(t, grid, labels, total, tiles, bench):
             i = other * CELLS + ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
             at = (row + 1) * WIDE + col + 1
             g = origin + row * stride + col
-            if down:
-                _lay_line(count, g, 1, i, 1, at, 1, other, grid, labels, total, bench)
-            else:
-                _lay_line(count, g, stride, i, SIDE, at, WIDE, other, grid, labels, total, bench)
+            steps = (1, 1, 1) if down else (stride, SIDE, WIDE)
+            _lay_line(count, (g, i, at), steps, other, grid, labels, total, bench)
 
 
 @helper

@@ -59,8 +59,7 @@ class LowerBounds:
         cost = tree.cost_at(starts) if cost is None else cost
         rounding = grid.rounding(cost)
         if tree.exact:
-            # What is driven along its parents is off from its labels by no more than these from the optimum.
-            bound = cost * np.maximum(1.0 - 2.0 * rounding, 0.0)
+            bound = cost - tree.slack(cost, rounding)
         else:
             bound = np.zeros(starts.size)
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound

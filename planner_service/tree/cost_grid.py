@@ -413,6 +413,11 @@ class CostGrid:
         cells = np.unique(np.concatenate(parts))
         return Changes(cells, older[cells], self.cell_cost[cells])
 
+    def window_of(self, cells: Cells) -> Window:
+        """The least window that holds these padded cells, one at least."""
+        rows, cols = np.divmod(cells, self.stride)
+        return Window(int(rows.min()) - 1, int(cols.min()) - 1, int(rows.max()), int(cols.max()))
+
     def _boxes(self, windows: Sequence[Window]) -> Iterator[tuple[int, int, int, int]]:
         """(row0, col0, row1, col1) of what of each window lies on the grid, where anything does."""
         for window in windows:

@@ -123,9 +123,12 @@ class CostToGoTree:
 
         far  cells; how far from the root
         The least stride is for distances up to twice as far as the window reaches, the next for twice that, and so
-        on. Returns cells visited. Raises OutsideGridError on a window that is not inside the grid.
+        on. Returns cells visited. Raises OutsideGridError on a window that is not inside the grid, ValueError on
+        networks of another map.
         """
         grid = self.cost_grid
+        if network.size != grid.size:
+            raise ValueError(f"networks of {network.size} padded cells, the map has {grid.size}")
         box = self._box(window)
         row, col = divmod(self.root, grid.grid.cols)
         half = max(row - box[0], col - box[1], box[2] - 1 - row, box[3] - 1 - col)
@@ -250,6 +253,11 @@ class CostToGoTree:
     def _driven(self, cells: Cells, cell_cost: Floats) -> NDArray[np.float64]:
         _, parent, root = self._labels
         return self.cost_grid.rests(parent, root, cells, cell_cost)
+
+    def slack(self, cost: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
+        """float64, s: by how much what is driven in an exact tree may exceed the optimum, from cells that cost so
+        much; `rounding` is the cost grid's of these costs."""
+        return cost * np.minimum(2.0 * rounding, 1.0)
 
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.

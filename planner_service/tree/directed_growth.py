@@ -15,8 +15,9 @@ _SAMPLE = 1 << 10
 """Cells by which the usual cell cost is told."""
 _RARE = 1 / 16
 """Of them, so many may cost less than the usual."""
-_FEW = 16.0
-"""Up to so many lowest cell costs, the usual one is no reason to have buckets wider than the lowest asks for."""
+_FEW, _NEAR = 16.0, 4.0
+"""Buckets are as narrow as the lowest cell cost asks for where none is more than `_FEW` times as much, or the usual
+one no more than `_NEAR` times."""
 
 
 def grow_directed_costs(
@@ -48,7 +49,7 @@ def _width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, boo
         sample = sample[sample < np.inf]
         rank = int(sample.size * _RARE)
         usual = float(np.partition(sample, rank)[rank]) if sample.size else lowest
-        if usual > _FEW * lowest:
+        if usual > _NEAR * lowest:
             width = usual * WIDTH
             while width > lowest:
                 width /= 1 << BASE_BITS

@@ -14,7 +14,7 @@ from planner_service.kernels import pieces, pieces_mend
 from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.layout import NONE, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.pieces import CELLS, LOOK, NO_PIECE, REHOOK, ROOM, SIDE
+from planner_service.kernels.pieces import CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
 from planner_service.tree.growth import KeptScratch, grow_tree
 from swarm.errors import OutsideGridError
@@ -178,6 +178,15 @@ class PieceTree:
         if not grid.length_weight_s:
             return self.cost_at(cells)
         return grid.rests(self.parent, grid.pad(self.root), cells, grid.time_cost)
+
+    def slack(self, cost: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
+        """float64, s: by how much what is driven in an exact tree may exceed the optimum, from cells that cost so
+        much; `rounding` is the cost grid's of these costs. Cell costs are float32, by a few roundings; all else is
+        left over step by step."""
+        farthest = self._ends[1].max() + self._tiles[2].max()
+        steps = rounding * 2.0**24
+        slack: NDArray[np.float64] = np.minimum(cost * 2.0**-21 + steps * (MOST_SLACK * farthest), cost)
+        return slack
 
     def tighten(self, cells: Cells) -> None:
         """Costs are what is driven at all times."""

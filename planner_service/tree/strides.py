@@ -24,6 +24,7 @@ MOST_SHARE = 8
 STALE_SHARE = 16
 """Networks are found anew when cells have changed in one block of the least stride in so many."""
 
+_HEADER = 32
 _DTYPES = (np.uint32, np.int32, np.int32, np.float32, np.uint32, np.int32, np.uint8, np.uint8)
 
 
@@ -34,10 +35,12 @@ class StrideNetwork:
     never make it wrong, only less good.
 
     arrays  for kernels
+    size    padded cells of the map that it is of
     """
 
-    def __init__(self, arrays: Network) -> None:
+    def __init__(self, arrays: Network, size: int) -> None:
         self.arrays = arrays
+        self.size = size
         self._changed: Bools = np.empty(0, np.bool_)
         """Blocks of the least stride in which a cell has changed since this was found. `learn` sets it."""
 
@@ -53,22 +56,21 @@ class StrideNetwork:
     def packed(self) -> Bytes:
         """All of it as uint8, for a file."""
         centre, doublings, first, other, price, begin, steps, paths = self.arrays
-        counts = np.array((centre.size, other.size, paths.size), np.int64)
+        counts = np.array((centre.size, other.size, paths.size, self.size), np.int64)
         parts = (counts, centre, first, other, price, begin, steps, doublings, paths)
         return np.concatenate([part.view(np.uint8) for part in parts])
 
     @classmethod
     def unpacked(cls, packed: Bytes) -> StrideNetwork:
         """From what `packed` has made, whose memory it shares."""
-        nodes, links, steps = packed[:24].view(np.int64).tolist()
+        nodes, links, steps, size = packed[:_HEADER].view(np.int64).tolist()
         sizes = (nodes, nodes + 1, links, links, links, links, nodes, steps)
-        ends = 24 + np.cumsum([size * np.dtype(dtype).itemsize for size, dtype in zip(sizes, _DTYPES, strict=True)])
-        parts = np.split(packed, ends[:-1])[0:]
-        parts[0] = parts[0][24:]
+        lengths = [many * np.dtype(dtype).itemsize for many, dtype in zip(sizes, _DTYPES, strict=True)]
+        parts = np.split(packed[_HEADER:], np.cumsum(lengths)[:-1])
         centre, first, other, price, begin, signed, doublings, paths = (
             part.view(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)
         )
-        return cls((centre, doublings, first, other, price, begin, signed, paths))
+        return cls((centre, doublings, first, other, price, begin, signed, paths), size)
 
 
 class StrideShelf(Protocol):
@@ -208,7 +210,7 @@ def _find(grid: CostGrid) -> Iterator[StrideNetwork | None]:
         centre, found = _find_stride(grid, 1 << doublings, node, below, sum(map(len, centres)))
         centres.append(centre)
         links.append(found)
-    yield _joined(centres, links)
+    yield StrideNetwork(_joined(centres, links), grid.size)
 
 
 def _find_stride(
@@ -258,7 +260,7 @@ def _joining_steps(grid: CostGrid, node: NDArray[np.int32], cost: Floats, many: 
     return steps[found], prices[found]
 
 
-def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> StrideNetwork:
+def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> Network:
     """Every link from both of its ends, by the node that it begins at."""
     centre = np.concatenate(centres)
     doublings = np.repeat(np.arange(LEAST, LEAST + len(centres)), [len(part) for part in centres]).astype(np.uint8)
@@ -272,15 +274,13 @@ def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> StrideNetw
     np.cumsum(np.bincount(source, minlength=centre.size), out=first[1:])
     # A way without a step, where a node and the one above have the same centre, is never followed backward.
     backward = np.where(length > 0, begin + length - 1, 0)
-    return StrideNetwork(
-        (
-            centre,
-            doublings,
-            first,
-            np.concatenate((to, from_))[order].astype(np.int32),
-            np.concatenate((price, price))[order],
-            np.concatenate((begin, backward))[order].astype(np.uint32),
-            np.concatenate((length, ~length))[order].astype(np.int32),
-            np.concatenate([part.paths for part in links]),
-        )
+    return (
+        centre,
+        doublings,
+        first,
+        np.concatenate((to, from_))[order].astype(np.int32),
+        np.concatenate((price, price))[order],
+        np.concatenate((begin, backward))[order].astype(np.uint32),
+        np.concatenate((length, ~length))[order].astype(np.int32),
+        np.concatenate([part.paths for part in links]),
     )

@@ -23,11 +23,11 @@ def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
     return tree
 
 
-def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict) -> None:
+def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict, rtol: float = 1e-5) -> None:
     tree = grown(pace, target, rules)
     mine, parents = tree.inner(tree.cost), tree.inner(tree.parent)
     best = naive.cost_to_go(pace, target, **rules)
-    np.testing.assert_allclose(mine, np.where(np.isfinite(pace), best, np.inf), rtol=1e-5)
+    np.testing.assert_allclose(mine, np.where(np.isfinite(pace), best, np.inf), rtol=rtol)
     # Every reachable cell's parent is a neighbour whose offer is what the cell costs.
     rows, cols = np.nonzero(np.isfinite(mine))
     codes = parents[rows, cols]

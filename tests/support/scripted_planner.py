@@ -37,7 +37,7 @@ class NotedTimes(GrowthTimes):
     """Notes what it is told, and goes by the model."""
 
     def __init__(self, calls: list[tuple[Any, ...]]) -> None:
-        super().__init__(GRID, PlannerConfig(), False, None)
+        super().__init__(GRID, PlannerConfig(), False, False, None)
         self._calls = calls
 
     def observe_full_ns(self, took_ns: int) -> None:
