@@ -24,6 +24,10 @@ takes less, and where there is a worker, so is any other."""
 FINE_SHARE = 16
 """How far the fine windows of multi-resolution reach, as a share of the map's side."""
 
+_TICKS = 32
+"""Over so many is averaged how often the target moves, and the row is chosen anew where that has changed by: """
+_NOTICED = 0.05
+
 
 def is_slow_to_grow(grid: GridSpec) -> bool:
     """Whether a whole tree of this grid is nothing to be grown between two answers."""
@@ -58,12 +62,22 @@ class GrowthTimes:
         self._has_worker = has_worker
         self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
         self._exact_measured = False
+        self._moves_per_tick, self._chosen_at = 1.0, 1.0
+        """Of the last `_TICKS` ticks or so; what it was when the row was chosen."""
+        self._ticks = 0
         self._choose()
 
     def set_budget(self, cpu_budget: float) -> None:
         """The share of one core that the tree may take from now on."""
         self.budget_ns = cpu_budget * 1e9 / self._tick_hz
         self._choose()
+
+    def note_tick(self, moved: bool) -> None:
+        """Whether the target has moved since the last tick: one that stands may have a dearer tree."""
+        self._ticks = min(self._ticks + 1, _TICKS)
+        self._moves_per_tick += (moved - self._moves_per_tick) / self._ticks
+        if abs(self._moves_per_tick - self._chosen_at) > _NOTICED:
+            self._choose()
 
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took; not one that found networks too. A simulation does not call it."""
@@ -80,7 +94,11 @@ class GrowthTimes:
 
     def _choose(self) -> None:
         widest = self.widest(WidestWindow.WHILE_CHEAPER)
-        times = Growths(self.full_ns, self.budget_ns, widest, self._grid.cells, self.exact_ns)
+        exact_ns = self.exact_ns if self.mends_quickly else math.inf
+        self._chosen_at = self._moves_per_tick
+        times = Growths(
+            self.full_ns, self.budget_ns, widest, self._grid.cells, exact_ns, moves_per_tick=self._moves_per_tick
+        )
         self.row = self._chosen_by.row(times)
 
     def widest(self, rule: WidestWindow) -> int:

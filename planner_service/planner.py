@@ -217,6 +217,7 @@ class Planner:
         if pose is None:
             return []  # the first growth takes the map as it is then, whatever changed before
         now_known = (pose.cell, self._cost_map.version)
+        self.tree.times.note_tick(self._told is not None and pose.cell != self._told[0])
         if now_known != self._told:
             self._take_in(now_known, now_ns)
         if self._wants_full and self._growing_since_ns is None:

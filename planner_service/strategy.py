@@ -93,7 +93,9 @@ class Growths:
     budget_ns     CPU time that a tick may take, by `planner.cpu_budget`
     widest_cells  how far the widest window reaches that is grown without a worker
     map_cells     cells of the map
-    exact_ns      CPU time that an exact move takes: in proportion to `full_ns` until one has been measured
+    exact_ns      CPU time that an exact move takes: in proportion to `full_ns` until one has been measured; inf
+                  where it would hold up answers for long
+    moves_per_tick  how often the target has moved lately; 1 until known
     """
 
     full_ns: float
@@ -101,6 +103,7 @@ class Growths:
     widest_cells: int
     map_cells: int
     exact_ns: float
+    moves_per_tick: float = 1.0
 
 
 class Strategy(Protocol):
@@ -161,15 +164,16 @@ class Auto:
         self.stage: Stage = "exact"
 
     def row(self, growths: Growths) -> StrategyRow:
-        full_ns, slowest_exact = growths.full_ns, growths.budget_ns
-        # The target comes one cell a tick, and a window is due once it has come an `AHEAD`th of its width.
-        slowest_rotation = max(growths.budget_ns * growths.widest_cells / AHEAD, slowest_exact)
-        if full_ns > slowest_rotation * (HYSTERESIS if self.stage == "coarsen" else 1.0):
-            self.stage = "coarsen"
-        elif growths.exact_ns > slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
-            self.stage = "rotate"
-        else:
+        often = max(growths.moves_per_tick, 1e-9)
+        slowest_exact = growths.budget_ns / often
+        # A window is due once the target has come an `AHEAD`th of its width.
+        slowest_rotation = max(slowest_exact * growths.widest_cells / AHEAD, slowest_exact)
+        if growths.exact_ns <= slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
             self.stage = "exact"
+        elif growths.full_ns > slowest_rotation * (HYSTERESIS if self.stage == "coarsen" else 1.0):
+            self.stage = "coarsen"
+        else:
+            self.stage = "rotate"
         return STAGES[self.stage]
 
 

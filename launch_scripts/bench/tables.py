@@ -17,7 +17,12 @@ _LABELS: dict[Strategy, str] = {
     "multi_resolution": "multi-resolution",
     "variable_range+multi_resolution": "both, the paper's",
 }
-_NARROW: dict[Strategy, str] = {"multi_resolution": "multi-\nresol.", "variable_range+multi_resolution": "both"}
+_NARROW: dict[Strategy, str] = {
+    "rotation": "rota-\ntion",
+    "variable_range": "var.\nrange",
+    "multi_resolution": "multi-\nresol.",
+    "variable_range+multi_resolution": "both",
+}
 
 
 def label_of(strategy: Strategy) -> str:

@@ -11,6 +11,7 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
+from planner_service.growth_times import GrowthTimes
 from planner_service.strategy import (
     ROWS,
     STAGES,
@@ -165,3 +166,14 @@ def test_a_strategy_that_fails_is_named_and_trees_stay_exact(answer: object, sai
     assert "strategy plug-in 'my:Own' of planner.strategy: row r" in fault
     assert said in fault
     assert fault.endswith("this planner keeps exact trees now")
+
+
+def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
+    grid = GridSpec(2048, 2048, 10.0)
+    for every, stage in ((20, OnMove.EXACT_MOVE), (1, OnMove.SCHEDULED_WINDOW)):
+        times = GrowthTimes(grid, PlannerConfig(cpu_budget=0.1), True, False, None)
+        times.observe_full_ns(150_000_000)
+        times.observe_exact_ns(30_000_000)  # three times what a tick may take
+        for tick in range(200):
+            times.note_tick(tick % every == 0)
+        assert times.row.on_move is stage
