@@ -40,7 +40,7 @@ def refusal(text: str) -> str:
         ("name = 'a b'", ["name", "found 'a b'"]),
         (
             "[planner]\nstrategy = 'fast'",
-            ["planner.strategy", "found 'fast'", "allowed: 'auto', 'full', 'rotation'"],
+            ["planner.strategy", "found 'fast'", "allowed: 'auto', 'exact', 'full'"],
         ),
         ("[planner]\nneighbours = 6", ["planner.neighbours", "found 6", "allowed: '4', '8'"]),
         ("[planner]\ncpu_budget = 1.5", ["planner.cpu_budget", "found 1.5", "more than 0, up to 1"]),
