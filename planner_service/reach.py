@@ -50,10 +50,5 @@ class Reach:
 
     def is_whole_due(self, row: StrategyRow, costs_ns: float) -> bool:
         """Whether the whole tree is due to become exact, which takes so long."""
-        if row.full_growth is FullGrowth.EVERY_FEW_MOVES:
-            # On a small map a full growth is due as soon as windows have cost half as much.
-            twice = 2 * (2 * self._times.narrowest) ** 2
-            return self.moves >= min(self._config.full_every, self._grid.cells // twice + 1)
-        if row.full_growth is FullGrowth.WITHIN_BUDGET:
-            return self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
-        return False
+        within_budget = self.moves > 0 and self.moves * self._times.budget_ns >= costs_ns
+        return row.full_growth is FullGrowth.WITHIN_BUDGET and within_budget

@@ -40,8 +40,6 @@ class FullGrowth(Enum):
 
     WHEN_FORCED = "when forced"
     """Section 3.3.2, the passive strategy: only when a vehicle whose route has run out asks."""
-    EVERY_FEW_MOVES = "every few moves"
-    """Every `planner.full_every` moves, on small maps sooner."""
     WITHIN_BUDGET = "within the budget"
     """As often as `planner.cpu_budget` allows."""
 
@@ -135,7 +133,6 @@ ROWS: Mapping[str, StrategyRow] = {
         OnMove.SCHEDULED_WINDOW, thins_far_cells=True, widest_window=WidestWindow.SHARE_OF_MAP
     ),
     "variable_range+multi_resolution": StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True),
-    "rotation": StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES, renews_loose_bounds=True),
 }
 """Every strategy of one row; `auto` goes through those of `STAGES`."""
 

@@ -176,7 +176,6 @@ def gap(
     ] = None,
     strategies: Strategies = _ALL,
     k_min: Annotated[int, typer.Option(min=0, max=12, help="Smallest block exponent of windows.")] = 3,
-    full_every: Annotated[int, typer.Option(min=1, help="rotation: a full growth every so many moves.")] = 10,
     cpu_budget: Annotated[float, typer.Option(min=1e-4, max=1, help="auto: share of a core it may use.")] = 0.1,
     picture: Picture = None,
     seed: Seed = 1,
@@ -186,7 +185,7 @@ def gap(
 
     \b
     swarm bench gap --dem ridge.tif --walk random,evade --picture gap.png
-    swarm bench gap --dem ridge.tif --strategies rotation --full-every 5
+    swarm bench gap --dem ridge.tif --strategies auto --cpu-budget 0.01
     """
     from launch_scripts.bench.planning.gap import WALKS, run_gap, tables
 
@@ -206,7 +205,6 @@ def gap(
             picture,
             progress,
             k_min=k_min,
-            full_every=full_every,
             cpu_budget=cpu_budget,
         )
     show(report, as_json, tables)

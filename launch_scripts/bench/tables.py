@@ -18,7 +18,6 @@ _LABELS: dict[Strategy, str] = {
     "variable_range+multi_resolution": "both, the paper's",
 }
 _NARROW: dict[Strategy, str] = {
-    "rotation": "rota-\ntion",
     "variable_range": "var.\nrange",
     "multi_resolution": "multi-\nresol.",
     "variable_range+multi_resolution": "both",

@@ -28,6 +28,7 @@ from scipy.ndimage import gaussian_filter
 from launch_scripts.reference.printed import lattice_route, printed_costs, printed_range
 from launch_scripts.report.pictures.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
 from launch_scripts.report.pictures.plot_style import STYLE
+from planner_service.strategy import ROWS, STAGES, Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.strides import one_stride
@@ -47,10 +48,10 @@ _GAP = LinearSegmentedColormap.from_list("gap", ["#f2f7f4", "#fbd9a0", ORANGE, R
 class Chase:
     """A target's tree on a small map, and where the target is."""
 
-    def __init__(self, pace: Pace, target: Place, **config: Any) -> None:
+    def __init__(self, pace: Pace, target: Place, row: Strategy | None = None, **config: Any) -> None:
         self.pace = pace
         self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-        self.tree = TargetTree(self.grid, PlannerConfig(**config))
+        self.tree = TargetTree(self.grid, PlannerConfig(**config), chosen_by=row)
         self.version = 0
         self.widths: list[int] = []
         self.go(target)
@@ -193,7 +194,7 @@ def tracking() -> Figure:
     figure, panels = _figure(2, (9.2, 3.5))
     sides = (
         ("variable_range", "Windows, and a new route where the old one ends"),
-        ("rotation", "Full growths in turn, newer routes pushed"),
+        ("exact", "Exact moves, newer routes pushed"),
     )
     for axes, (strategy, title) in zip(panels, sides, strict=True):
         chase = Chase(pace, target, strategy=strategy, k_min=2)
@@ -247,15 +248,15 @@ def schedule() -> Figure:
     way = Chase(pace, (38, 140), strategy="full").trail(begin)[1:121]
     exact = Chase(pace, (int(way[-1][0]), int(way[-1][1])), strategy="full").costs()
     figure, panels = _figure(2, (8.4, 3.9))
-    for axes, strategy, name in zip(
+    for axes, row, name in zip(
         panels,
-        ("variable_range", "rotation"),
-        ("The paper's windows", "Window schedule and full growths"),
+        (ROWS["variable_range"], STAGES["rotate"]),
+        ("The paper's windows", "Doubling windows, renewed every 13 moves"),
         strict=True,
     ):
-        chase = Chase(pace, begin, strategy=strategy, k_min=2)
-        for row, col in way:
-            chase.go((int(row), int(col)))
+        chase = Chase(pace, begin, row, k_min=2, cpu_budget=1.2e-4)
+        for place in way:
+            chase.go((int(place[0]), int(place[1])))
         with np.errstate(invalid="ignore"):
             gap = (chase.costs() / exact - 1) * 100
         gap[np.isnan(gap)] = 0

@@ -151,7 +151,6 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     length_weight     lambda of the paper's length-aware key, seconds per metre
     k_min             smallest block exponent, as in the paper: the narrowest window of variable range is
                       2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
-    full_every        rotation: a full growth every so many moves, on small maps sooner
     cpu_budget        auto: share of one core that this planner may use
     push_s            newer routes are pushed to a vehicle at most this often
     """
@@ -164,7 +163,6 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     corner_cutting: bool = False
     length_weight: NotNegative = 0.0
     k_min: Annotated[int, Meta(ge=0, le=12)] = 3
-    full_every: Annotated[int, Meta(ge=1)] = 10
     cpu_budget: Annotated[float, Meta(gt=0, le=1)] = 0.1
     push_s: Positive = 1.0
 

@@ -28,9 +28,7 @@ RESERVED_GROUP = "operator"
 MOST_TARGETS = 1000
 """Of all entries together."""
 
-Strategy = Literal[
-    "auto", "exact", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
-]
+Strategy = Literal["auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution"]
 SlopeRule = Literal[
     "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
 ]

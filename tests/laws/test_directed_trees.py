@@ -79,7 +79,7 @@ def test_a_long_walk_with_marks_keeps_the_laws(strategy: str) -> None:
     rng = np.random.default_rng(5)
     pace = random_pace(rng, 24, 22, 6.0, 0.1)
     climb = random_climb(rng, 24, 22, 0.15, 0.35)
-    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
     play = Play(pace, config, climb=climb)
     kinds = play.walk(rng, 40, 8)
     assert strategy in ("full", "exact") or kinds & {"window", "coarse"}, kinds
@@ -195,11 +195,11 @@ def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
     assert visited > 100
 
 
-@pytest.mark.parametrize("strategy", ["full", "rotation", "variable_range+multi_resolution"])
+@pytest.mark.parametrize("strategy", ["full", "auto", "variable_range+multi_resolution"])
 @pytest.mark.parametrize("most", [0, 5])
 def test_what_is_said_of_a_route_does_not_depend_on_who_else_asks(strategy: str, most: int) -> None:
     ground = Ground(4, RULES[0], 24, 26)
-    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
     play = Play(ground.pace, config, climb=ground.climb)
     for _ in range(8):
         play.happen(Move(*(int(step) for step in ground.rng.integers(-1, 2, 2))))
@@ -238,7 +238,7 @@ def test_marks_as_dear_and_as_cheap_as_can_be_come_and_go_and_the_laws_hold(seed
     pace = random_pace(rng, rows, cols, 4.0, 0.15)
     climb = random_climb(rng, rows, cols, (0.1, 0.3)[seed % 2], 0.25)
     strategy = STRATEGIES[1 + seed % 5]
-    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, full_every=4, **RULES[seed % 5])  # type: ignore[arg-type]
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, **RULES[seed % 5])  # type: ignore[arg-type]
     Extremes(pace, config, climb=climb).walk(rng, 18, 3)
 
 

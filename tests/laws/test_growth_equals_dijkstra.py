@@ -115,7 +115,7 @@ from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 from swarm.config.scenario import PlannerConfig
 random_grids({count}, 5, 9)
-for strategy in ("full", "variable_range", "rotation", "multi_resolution"):
+for strategy in ("full", "variable_range", "auto", "multi_resolution"):
     pace = random_pace(np.random.default_rng(1), 9, 11, 6.0, 0.2)
     play = Play(pace, PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9))
     first = (Move(1, 0), Job("begin"), Marks(3, 3), Move(0, 1), Job("end"))

@@ -13,6 +13,7 @@ from support.planner_strategies import Job, Marks, Move, happenings, paces, plan
 from support.planner_swarm import GRID, Swarm, flat
 
 from planner_service import growth_times
+from planner_service.strategy import STAGES
 from planner_service.tree.windows import WindowSchedule
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.messages.planning import RouteRequest
@@ -45,7 +46,7 @@ def test_whatever_happens_answers_keep_the_laws_and_a_worker_catches_up(
 @LARGE
 def test_after_a_jump_the_older_tree_leads_where_it_led_and_follows_the_map() -> None:
     pace = random_pace(np.random.default_rng(1), 40, 40, 5.0, 0.1)
-    play = Play(pace, PlannerConfig(strategy="rotation", k_min=0), has_worker=True)
+    play = Play(pace, PlannerConfig(k_min=0), has_worker=True, chosen_by=STAGES["rotate"])
     assert not play.tree.ready
     assert play.last.wants_full
     play.happen(Job("begin"))
@@ -82,7 +83,7 @@ def test_while_a_worker_grows_after_a_jump_routes_say_where_they_lead_and_how_ol
     monkeypatch.setattr(growth_times, "INLINE_NS", 100)
     monkeypatch.setattr(growth_times, "MODEL_NS_PER_CELL", int(0.4e9 / GRID.cells))
     monkeypatch.setattr(WindowSchedule, "half", lambda *_: 40)
-    swarm = Swarm(flat(), "rotation")
+    swarm = Swarm(flat(), "multi_resolution")
     first, second = GRID.cell(20, 5), GRID.cell(20, 45)
     swarm.cells["t"] = first
     swarm.run(1.0)

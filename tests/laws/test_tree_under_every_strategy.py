@@ -19,6 +19,7 @@ from support.planner_strategies import (
     random_pace,
 )
 
+from planner_service.strategy import STAGES
 from planner_service.tree.windows import block_half
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -40,7 +41,7 @@ def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_
 def test_a_long_walk_with_marks_keeps_the_laws(strategy: str) -> None:
     rng = np.random.default_rng(5)
     pace = random_pace(rng, 40, 37, 10.0, 0.15)
-    config = PlannerConfig(strategy=strategy, k_min=1, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
+    config = PlannerConfig(strategy=strategy, k_min=1, cpu_budget=1e-9)  # type: ignore[arg-type]
     play = Play(pace, config)
     play.walk(rng, 60, 6)
 
@@ -79,7 +80,9 @@ def test_the_windows_of_variable_range_are_as_wide_as_in_the_papers_figure_3() -
 
 @pytest.mark.parametrize("outside", [-1, 10**6])
 def test_a_growth_for_a_target_that_was_outside_is_made_up_for_once_it_is_back(outside: int) -> None:
-    play = Play(random_pace(np.random.default_rng(3), 20, 20, 5.0, 0.1), PlannerConfig(strategy="rotation"))
+    play = Play(
+        random_pace(np.random.default_rng(3), 20, 20, 5.0, 0.1), PlannerConfig(), chosen_by=STAGES["rotate"]
+    )
     play.tree.update(play.pace, outside, [], 0)
     grown = play.tree.full_job(outside)()
     assert play.tree.adopt(grown, play.pace, play.target, [], 0, np.arange(400)).kind == "full"
@@ -92,7 +95,7 @@ def test_what_got_cheaper_while_a_worker_grew_lowers_the_bounds_that_its_tree_gi
     pace = np.full((41, 41), np.inf, np.float32)
     pace[[10, 30], 5:36] = 10.0
     pace[10:31, [5, 35]] = 10.0
-    play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
+    play = Play(pace, PlannerConfig(k_min=0, cpu_budget=1e-9), chosen_by=STAGES["rotate"])
     play.target = play.grid.cell(20, 5)
     play.happen(Move(0, 0))
     play.happen(Job("begin"))
@@ -108,9 +111,8 @@ def test_what_got_cheaper_while_a_worker_grew_lowers_the_bounds_that_its_tree_gi
 
 
 def test_a_forced_full_growth_is_a_full_growth() -> None:
-    play = Play(
-        random_pace(np.random.default_rng(4), 40, 40, 5.0, 0.1), PlannerConfig(strategy="rotation", k_min=0)
-    )
+    pace = random_pace(np.random.default_rng(4), 40, 40, 5.0, 0.1)
+    play = Play(pace, PlannerConfig(k_min=0, cpu_budget=1e-9), chosen_by=STAGES["rotate"])
     while play.last.kind != "window":
         play.happen(Move(1, 1))
     assert play.tree.force([0]).kind == "full"

@@ -11,6 +11,7 @@ from support.scripted_planner import chasers
 from support.slow_twins import cost_to_go
 from support.swarm_model import SwarmModel
 
+from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
@@ -30,6 +31,8 @@ from swarm.wire.topics import CHASERS, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS,
 ROWS, COLS, RES = 40, 50, 10.0
 GRID = GridSpec(ROWS, COLS, RES)
 TICK = NS_PER_S // 10
+RENEWS = GRID.cells * MODEL_EXACT_NS_PER_CELL * 1e-9 / 2.5 * PlannerConfig().tick_hz
+"""A `cpu_budget` with which `auto` grows windows and makes the tree exact every third move."""
 
 
 def flat() -> NDArray[np.float32]:
@@ -101,11 +104,16 @@ class Swarm(SwarmModel):
     """A terrain, planners, a tracker of targets, and an agent that marks."""
 
     def __init__(
-        self, pace: NDArray[np.float32] | None = None, strategy: Strategy = "auto", targets: int = 1
+        self,
+        pace: NDArray[np.float32] | None = None,
+        strategy: Strategy = "auto",
+        targets: int = 1,
+        cpu_budget: float = 0.1,
     ) -> None:
         self.pace = flat() if pace is None else pace
         scenario = Scenario(
-            targets=(TargetConfig(count=targets),), planner=PlannerConfig(strategy=strategy, k_min=1, full_every=3)
+            targets=(TargetConfig(count=targets),),
+            planner=PlannerConfig(strategy=strategy, k_min=1, cpu_budget=cpu_budget),
         )
         super().__init__(terrain=terrain_of_pace(self.pace, RES), scenario=scenario)
         self.ear = Ear(self)

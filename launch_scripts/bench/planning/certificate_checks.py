@@ -127,7 +127,6 @@ class Life:
         self.config = PlannerConfig(
             strategy=str(rng.choice(["exact", "auto"] if in_pieces else get_args(Strategy))),
             k_min=int(rng.integers(3)),
-            full_every=int(rng.integers(1, 30)),
             cpu_budget=float(rng.choice([1e-9, 1e-4, 0.5])),
             length_weight=float(10.0 ** rng.uniform(-6, 6)) if kind == 1 else 0.0,
             **_RULES[rng.integers(len(_RULES))],

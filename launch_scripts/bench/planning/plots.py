@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 
 from launch_scripts.bench.planning.chase import Tally
 from launch_scripts.bench.tables import label_of, on_machine
-from launch_scripts.report.pictures.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY, VIOLET
+from launch_scripts.report.pictures.palette import BLUE, FAINT, INK, ORANGE, PINK, SKY, VIOLET
 from launch_scripts.report.pictures.plot_style import STYLE
 from launch_scripts.report.pictures.plots import halo
 from swarm.config.values import Strategy
@@ -25,7 +25,6 @@ _COLOURS: dict[Strategy, str] = {
     "full": INK,
     "exact": VIOLET,
     "auto": BLUE,
-    "rotation": GREEN,
     "variable_range": ORANGE,
     "multi_resolution": SKY,
     "variable_range+multi_resolution": PINK,

@@ -33,10 +33,10 @@ def test_the_range_of_cell_costs_is_that_of_the_map_after_any_changes() -> None:
         assert (grid.lowest_cell_cost, grid.highest_cell_cost) == (float(finite.min()), float(finite.max()))
 
 
-@pytest.mark.parametrize("strategy", ["rotation", "variable_range", "auto"])
+@pytest.mark.parametrize("strategy", ["multi_resolution", "variable_range", "auto"])
 @pytest.mark.parametrize("wrong", [1e-9, PACE_LEAST])
 def test_one_wrong_mark_costs_windows_only_while_it_stands(strategy: str, wrong: float) -> None:
-    config = PlannerConfig(strategy=strategy, full_every=1000, k_min=1)  # type: ignore[arg-type]
+    config = PlannerConfig(strategy=strategy, k_min=1)  # type: ignore[arg-type]
     kinds = []
     for marked in (False, True):
         tree, pace = TargetTree(GRID, config), hills()

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from support import slow_twins
 
+from planner_service.strategy import STAGES
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.layers import terrain_pace
 from shared_map.terrain.slope_rules import SLOPE_RULES
@@ -117,7 +118,7 @@ def test_certificates_hold_while_the_tree_follows_a_target_by_windows(rule: str,
     grades = np.abs(rng.normal(0, 0.3, (GRID.rows, GRID.cols))).astype(np.float32)
     table = {"slope_table": ((-30.0, 0.6), (0.0, 1.0), (20.0, 4.0))} if rule == "table" else {}
     pace = terrain_pace(grades, np.zeros(grades.shape, np.uint8), CostConfig(slope_rule=rule, **table))
-    tree = TargetTree(GRID, PlannerConfig(strategy="rotation", k_min=0), climb)
+    tree = TargetTree(GRID, PlannerConfig(k_min=0), climb, chosen_by=STAGES["rotate"])
     root = int(np.flatnonzero(np.isfinite(pace))[30])
     served = 0
     for version in range(4):

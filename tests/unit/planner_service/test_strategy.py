@@ -11,7 +11,7 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
-from planner_service.growth_times import GrowthTimes
+from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, GrowthTimes
 from planner_service.strategy import (
     ROWS,
     STAGES,
@@ -59,13 +59,14 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
         (StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
         (StrategyRow(OnMove.SCHEDULED_WINDOW), ["window"] * 5),
         (StrategyRow(OnMove.EXACT_MOVE), ["exact"] * 5),
-        (StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES), ["window", "window", "exact"] * 2),
+        (StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET), ["window", "window", "exact"] * 2),
     ],
 )
 def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(
     row: StrategyRow, expected: list[str]
 ) -> None:
-    config = PlannerConfig(strategy="auto", k_min=0, full_every=3)
+    exact_s = GRID.cells * MODEL_EXACT_NS_PER_CELL * 1e-9
+    config = PlannerConfig(k_min=0, cpu_budget=exact_s / 2.5 * PlannerConfig().tick_hz)
     assert kinds_of_moves(config, row, len(expected)) == expected
 
 
@@ -107,7 +108,7 @@ class AnyRow:
 def test_whatever_rows_a_strategy_chooses_routes_keep_the_laws(seed: int) -> None:
     chance = np.random.default_rng(seed)
     pace = random_pace(chance, 40, 37, 10.0, 0.15)
-    play = Play(pace, PlannerConfig(k_min=1, cpu_budget=1e-9, full_every=5), chosen_by=AnyRow(seed))
+    play = Play(pace, PlannerConfig(k_min=1, cpu_budget=1e-9), chosen_by=AnyRow(seed))
     for step in range(60):
         play.happen(Move(int(chance.integers(-1, 2)), int(chance.integers(-1, 2))))
         if step % 3 == 0:
@@ -141,7 +142,7 @@ ASKED = Growths(1e6, 1e7, 64, GRID.cells, 4e5)
 
 
 def test_a_plugins_row_is_in_force() -> None:
-    row = StrategyRow(OnMove.BLOCK_WINDOW, FullGrowth.EVERY_FEW_MOVES)
+    row = StrategyRow(OnMove.BLOCK_WINDOW, FullGrowth.WITHIN_BUDGET)
     strategy, told = plugged(row)
     assert strategy.row(ASKED) == row
     assert TargetTree(GRID, PlannerConfig(strategy="my:Own"), chosen_by=strategy).strategy == row

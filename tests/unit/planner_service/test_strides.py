@@ -13,7 +13,7 @@ from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
 from planner_service import growth_times
-from planner_service.strategy import Auto, Growths
+from planner_service.strategy import STAGES, Auto, Growths
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -196,7 +196,7 @@ def test_on_a_large_map_a_forced_range_is_a_window_over_vehicle_and_target_until
 ) -> None:
     monkeypatch.setattr(growth_times, "INLINE_NS", 50_000)
     pace = random_pace(np.random.default_rng(1), 100, 100, 5.0, 0.1)
-    play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
+    play = Play(pace, PlannerConfig(k_min=0, cpu_budget=1e-9), chosen_by=STAGES["rotate"])
     for _ in range(4):
         play.happen(Move(1, 1))
     row, col = play.grid.row_col(play.target)

@@ -42,6 +42,8 @@ def refusal(text: str) -> str:
             "[planner]\nstrategy = 'fast'",
             ["planner.strategy", "found 'fast'", "allowed: 'auto', 'exact', 'full'"],
         ),
+        ("[planner]\nstrategy = 'rotation'", ["planner.strategy: found 'rotation'", "allowed: 'auto', 'exact'"]),
+        ("[planner]\nfull_every = 10", ["unknown key planner.full_every", "strategy"]),
         ("[planner]\nneighbours = 6", ["planner.neighbours", "found 6", "allowed: '4', '8'"]),
         ("[planner]\ncpu_budget = 1.5", ["planner.cpu_budget", "found 1.5", "more than 0, up to 1"]),
         ("[[targets]]\nwalk = 'run'", ["targets[0].walk", "found 'run'", "allowed: 'still', 'random'"]),
