@@ -99,4 +99,4 @@ def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]
     best = cost_grid.rests(grown.parent, root, starts[whole], grown.cell_cost)
     driven = walks.driven[whole]
     gaps: NDArray[np.float64] = driven / best
-    return np.where((gaps < 1.0) & (driven >= best * (1.0 - 2.0 * cost_grid.rounding(best))), 1.0, gaps)
+    return np.where((gaps < 1.0) & (driven >= best * (1.0 - 2.0 * cost_grid.rounding.at(best))), 1.0, gaps)

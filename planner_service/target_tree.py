@@ -18,7 +18,8 @@ from planner_service.growth_times import GrowthTimes
 from planner_service.reach import Reach
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.cost_grid import Changes, CostGrid
+from planner_service.tree.changes import Changes
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.forms import AnyTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.pieces import PieceTree

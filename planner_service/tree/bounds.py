@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
-from planner_service.tree.cost_grid import Changes, CostGrid
+from planner_service.tree.changes import Changes
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
@@ -57,7 +58,7 @@ class LowerBounds:
         """
         grid = self._grid
         cost = tree.cost_at(starts) if cost is None else cost
-        rounding = grid.rounding(cost)
+        rounding = grid.rounding.at(cost)
         if tree.exact:
             bound = cost - tree.slack(cost, rounding)
         else:
@@ -65,7 +66,7 @@ class LowerBounds:
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            most = float(grid.rounding(rim_cost.max(initial=0.0)))
+            most = float(grid.rounding.at(rim_cost.max(initial=0.0)))
             kernels.bound_by_heuristic(
                 heuristic, root, grid.stride, part, box, rim, rim_cost, starts, rounding, most, bound
             )

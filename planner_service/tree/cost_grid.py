@@ -5,10 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -26,8 +23,11 @@ from planner_service.kernels.layout import (
     PaddedGrid,
     step_offsets,
 )
-from planner_service.tree.growth import grow_tree
+from planner_service.tree.changes import NO_CHANGES, Cells, Changes, joined
+from planner_service.tree.growth import grow_tree, range_of
+from planner_service.tree.pace_checks import check_pace, said_of_bad
 from planner_service.tree.padded_climbs import padded_climbs, with_scratch
+from planner_service.tree.rounding import Rounding
 from shared_map.arrays import Bools, Floats, private_copy
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -36,24 +36,7 @@ from swarm.grid import GridSpec, Window
 
 log = logging.getLogger(__name__)
 
-Cells = NDArray[np.int64]
 _NONE: Floats = np.empty(0, np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Changes:
-    """Cells whose cost changed (padded, no repetition), and the cell costs before and after, s."""
-
-    cells: Cells
-    before: Floats
-    after: Floats
-
-    @cached_property
-    def any_lower(self) -> bool:
-        return self.cells.size > 0 and bool((self.after < self.before).any())
-
-
-NO_CHANGES = Changes(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
 
 
 def rule_of(config: PlannerConfig) -> int:
@@ -62,45 +45,10 @@ def rule_of(config: PlannerConfig) -> int:
     return RULE_OCTILE if config.edge == "octile" else RULE_PAPER
 
 
-def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
-    """Raises ValueError unless the array is what kernels may be handed. Values are checked as they are read."""
-    if not isinstance(pace, np.ndarray) or pace.dtype != np.float32:
-        raise ValueError(f"pace must be a float32 array, not {getattr(pace, 'dtype', type(pace).__name__)}")
-    if pace.shape != (grid.rows, grid.cols):
-        raise ValueError(f"pace has shape {pace.shape}, the grid is {grid.rows} x {grid.cols}")
-    if not pace.flags.c_contiguous:
-        raise ValueError("pace must be C-contiguous")
-
-
-def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
-    """Two float32 numbers, given as integers of the same bits."""
-    lowest, highest = struct.unpack("=2f", struct.pack("=2i", *bits))
-    return lowest, highest
-
-
-def _said_of_bad(pace: Floats, window: Window) -> str:
-    """Of the first cell of a window whose pace is none."""
-    part = pace[window.row0 : window.row1, window.col0 : window.col1]
-    bad = np.argwhere(~(part > 0))
-    row, col = (bad[0] + (window.row0, window.col0)).tolist()
-    return (
-        f"the pace of cell [{row}, {col}] is {pace[row, col]:g} s/m ({len(bad)} cells have one that is NaN, zero or"
-        " negative); expected a number above 0, or inf where a cell is lethal"
-    )
-
-
-def _range_of(cell_cost: Floats) -> tuple[float, float, float]:
-    """(lowest, highest finite, highest) of cell costs."""
-    lowest, highest, last = kernels.cell_cost_range(cell_cost.view(np.int32))
-    return *floats_of_bits((lowest, highest)), floats_of_bits((last, last))[0]
-
-
 _SHORTEST_M, _LONGEST_M = 1e-30, 1e30
 """Sides of cells that float32 knows."""
 _BLOCK = 1 << 10
 """Cells that are copied at a time: a page of memory."""
-_LETHAL = 0x7F8
-"""The class of inf."""
 _FEWEST, _MOST = 1 << 9, 1 << 14
 """Buckets of a repair."""
 _SMALL = 1 << 20
@@ -156,11 +104,8 @@ class CostGrid:
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
-        self._classes: Cells = np.zeros(1 << 11, np.int64)
-        """How many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide.
-        `load`, `share` and `apply` put another in its place, as snapshots keep the one that they have."""
-        self._cheapest: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        """What the cheapest cells cost together at least, s, and how many they are; of them. None until needed."""
+        self.rounding = Rounding.of(_NONE)
+        """Of labels of trees on this map. `load`, `share` and `apply` put another in its place."""
         self._time_cost: Floats | None = None
         """As `time_cost`, where that is an array of its own. `load` and `share` set it, `apply` writes it."""
         self._lowest_time = math.inf
@@ -234,7 +179,7 @@ class CostGrid:
         check_pace(self.grid, pace)
         cell_cost, bad, bounded = self._padded(pace, self.length_weight_s)
         if bad:
-            raise ValueError(_said_of_bad(pace, self.grid.window))
+            raise ValueError(said_of_bad(pace, self.grid.window))
         if bounded:
             log.warning(
                 "%d of %d cells cost %.2g s or %.2g s, the least and the most that a cell can cost",
@@ -245,7 +190,7 @@ class CostGrid:
         if self.length_weight_s:
             self._time_cost, _, _ = self._padded(pace, 0.0)
         self._find_range()
-        self._count_classes()
+        self.rounding = Rounding.of(self.cell_cost)
 
     def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int, int]:
         costs: Floats = np.full(self.size, np.inf, np.float32)
@@ -278,7 +223,7 @@ class CostGrid:
         if time_cost.shape != (self.size,) or time_cost.dtype != np.float32:
             raise ValueError(f"cell costs of this map are float32, {self.size} cells")
         own = private_copy(time_cost)  # kernels know arrays that may be written only
-        lowest, highest, last = _range_of(own)
+        lowest, highest, last = range_of(own)
         if not (lowest >= kernels.CHEAPEST_S and highest <= kernels.DEAREST_S and last <= math.inf):
             raise ValueError(
                 f"cell costs lie between {kernels.CHEAPEST_S:.2g} s and {kernels.DEAREST_S:.2g} s or are inf; these"
@@ -292,7 +237,7 @@ class CostGrid:
         else:
             self._shared, self.cell_cost = time_cost, own
         self._find_range()
-        self._count_classes()
+        self.rounding = Rounding.of(self.cell_cost)
 
     def snapshot(self) -> Self:
         """The same costs, which nobody changes any more. Of shared ones only what has changed is copied."""
@@ -317,7 +262,7 @@ class CostGrid:
         first._make_scratch()
         first.cell_cost = private_copy(self._shared)
         first._find_range()
-        first._count_classes()
+        first.rounding = Rounding.of(first.cell_cost)
         return first
 
     def changes_since(self, older: Floats) -> Changes:
@@ -332,16 +277,12 @@ class CostGrid:
         return Changes(cells, older[cells], self.cell_cost[cells])
 
     def _find_range(self) -> None:
-        self.lowest_cell_cost, self.highest_cell_cost, _ = _range_of(self.cell_cost)
+        self.lowest_cell_cost, self.highest_cell_cost, _ = range_of(self.cell_cost)
         self._find_lowest_time()
-
-    def _count_classes(self) -> None:
-        self._classes, self._cheapest = np.zeros(1 << 11, np.int64), None
-        kernels.count_classes(self.cell_cost.view(np.int32), self._classes)
 
     def _find_lowest_time(self) -> None:
         if self._time_cost is not None:
-            self._lowest_time, _, _ = _range_of(self._time_cost)
+            self._lowest_time, _, _ = range_of(self._time_cost)
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative;
@@ -350,7 +291,7 @@ class CostGrid:
         boxes = list(self._boxes(dirty))
         for row0, col0, row1, col1 in boxes:
             if not (pace[row0:row1, col0:col1] > 0).all():
-                raise ValueError(_said_of_bad(pace, Window(row0, col0, row1, col1)))
+                raise ValueError(said_of_bad(pace, Window(row0, col0, row1, col1)))
         was = (self.lowest_cell_cost, self.highest_cell_cost)
         found: list[Changes] = []
         for box in boxes:
@@ -375,26 +316,15 @@ class CostGrid:
                 self._written[cells[:count] // _BLOCK] = True
             if self._time_cost is not None:
                 # A change of time may be too small to be seen in a cost that holds the price of length, too.
-                of_map = self._time_cost.reshape(self.grid.rows + 2, self.stride)
-                part = pace[row0:row1, col0:col1]
-                with np.errstate(over="ignore", under="ignore"):
-                    times = np.clip(part * np.float32(self._metres), kernels.CHEAPEST_S, kernels.DEAREST_S)
-                of_map[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1] = np.where(part < np.inf, times, np.inf)
+                room = np.empty(most, np.int64), np.empty(most, np.float32)
+                kernels.changed_cells(pace, self._metres, 0.0, box, self.stride, self._time_cost, *room)
         if dirty:
             self._find_lowest_time()
         if not found:
             return NO_CHANGES
-        changes = found[0]
-        if len(found) > 1:
-            # A cell in two overlapping windows changes in the first only, so there is no repetition.
-            changes = Changes(
-                np.concatenate([part.cells for part in found]),
-                np.concatenate([part.before for part in found]),
-                np.concatenate([part.after for part in found]),
-            )
-        classes = [part.view(np.int32) >> 20 for part in (changes.after, changes.before)]
-        more, fewer = (np.bincount(part, minlength=1 << 11) for part in classes)
-        self._classes, self._cheapest = self._classes + more - fewer, None
+        # A cell in two overlapping windows changes in the first only, so there is no repetition.
+        changes = joined(found)
+        self.rounding = self.rounding.after(changes)
         if ((changes.before <= was[0]) | (changes.before == np.float32(was[1]))).any():
             # An extreme cell is another now: look for the next, or one wrong mark would stay for good.
             self._find_range()
@@ -478,22 +408,6 @@ class CostGrid:
         ):
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
-
-    def rounding(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
-        """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
-
-        One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
-        than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
-        that, where the lowest cell cost alone would say a step for each of it.
-        """
-        if self._cheapest is None:
-            classes = np.flatnonzero(self._classes[:_LETHAL])
-            counts = self._classes[classes]
-            least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)
-            # Of the first class zero; a way that costs nothing has no steps.
-            costs = np.cumsum(counts * np.maximum(least, np.finfo(np.float64).tiny))
-            self._cheapest = np.append(0.0, costs), np.append(0.0, np.cumsum(counts))
-        return np.minimum((np.interp(cost, *self._cheapest) + 8.0) * 2.0**-24, 1.0)
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

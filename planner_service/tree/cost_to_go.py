@@ -22,8 +22,9 @@ from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.mend import Walk, make_walk, mend
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
-from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
-from planner_service.tree.growth import FINE, KeptScratch, grow_tree
+from planner_service.tree.changes import Cells, Changes
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.growth import FINE, KeptScratch, floats_of_bits, grow_tree
 from planner_service.tree.padded_climbs import climbs_in
 from planner_service.tree.strides import StrideNetwork
 from shared_map.arrays import Floats

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ def grow_tree(
         grow_directed_costs(padded, climbs, bounds, root, cost, scratch_of)
         if parent is None:
             return math.inf
-        reach = float(np.array(cell_cost_range(cost.view(np.int32)), np.int32).view(np.float32)[1])
+        reach = range_of(cost)[1]
     else:
         reach = _grow_alike(padded, bounds, root, cost, scratch_of)
     if parent is None:
@@ -82,3 +83,15 @@ def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kep
         kept.clear()
         kept[size, 0] = wide_buckets.make_scratch(size, rule)
     return float(wide_buckets.grow_by_wide_buckets(padded, cost, root, width, kept[size, 0]))
+
+
+def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
+    """Two float32 numbers, given as integers of the same bits."""
+    lowest, highest = struct.unpack("=2f", struct.pack("=2i", *bits))
+    return lowest, highest
+
+
+def range_of(cell_cost: Floats) -> tuple[float, float, float]:
+    """(lowest, highest finite, highest) of cell costs."""
+    lowest, highest, last = cell_cost_range(cell_cost.view(np.int32))
+    return *floats_of_bits((lowest, highest)), floats_of_bits((last, last))[0]

@@ -15,8 +15,9 @@ from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.layout import NONE, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.pieces import CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
-from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
-from planner_service.tree.growth import KeptScratch, grow_tree
+from planner_service.tree.changes import Cells, Changes
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.growth import KeptScratch, floats_of_bits, grow_tree
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
@@ -169,7 +170,9 @@ class PieceTree:
         if self._moved:
             self._add_up()
         costs = np.empty(cells.size, np.float64)
-        pieces.costs_at(self.cost_grid.padded, self._labels, self._pieces, self._across, cells, costs)
+        pieces.costs_at(
+            self.cost_grid.padded, self._labels, self._pieces, self._across, np.ascontiguousarray(cells), costs
+        )
         return costs
 
     def time_at(self, cells: Cells) -> NDArray[np.float64]:

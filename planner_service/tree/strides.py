@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import stride_network
 from planner_service.kernels.stride_growth import Network
-from planner_service.tree.cost_grid import Cells, Changes, CostGrid
+from planner_service.tree.changes import Cells, Changes
+from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Bools, Bytes, Floats
 
 LEAST = 4

@@ -132,16 +132,16 @@ def test_no_way_is_taken_for_shorter_than_it_may_be_nor_for_much_longer(seed: in
     costs.load(pace)
     for _ in range(6):
         for cost_s in (0.5, 3.0, 40.0, 1e3, 1e9):
-            steps = costs.rounding(np.array([cost_s]))[0] * 2**24 - 8
+            steps = costs.rounding.at(np.array([cost_s]))[0] * 2**24 - 8
             assert most_steps(costs, cost_s) <= steps <= most_steps(costs, cost_s * 1.13) + 1
         row, col = (int(at) for at in rng.integers(0, 25, 2))
         pace[row : row + 5, col : col + 5] *= np.float32(rng.choice([0.3, 7.0, np.inf]))
-        snapshot, before = costs.snapshot(), costs.rounding(np.array([40.0]))
+        snapshot, before = costs.snapshot(), costs.rounding.at(np.array([40.0]))
         costs.apply(pace, [Window(row, col, row + 5, col + 5)])
-        np.testing.assert_array_equal(snapshot.rounding(np.array([40.0])), before)
+        np.testing.assert_array_equal(snapshot.rounding.at(np.array([40.0])), before)
         anew = CostGrid(GridSpec(30, 30, 1.0), PlannerConfig())
         anew.load(pace)
-        np.testing.assert_array_equal(anew._classes, costs._classes)
+        np.testing.assert_array_equal(anew.rounding.classes, costs.rounding.classes)
 
 
 def test_one_cheap_cell_leaves_certificates_as_tight_as_they_were() -> None:

@@ -7,7 +7,8 @@ import pytest
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import repair as kernels
-from planner_service.tree.cost_grid import Changes, CostGrid
+from planner_service.tree.changes import Changes
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
