@@ -62,7 +62,6 @@ HOOK, STAMP = 6, 7
 """Columns of `total` and `hook`."""
 
 ROOT_PIECE = np.uint8(252)
-_UNKNOWN = np.uint8(254)
 NO_PIECE = np.uint8(255)
 
 LOOK, REHOOK, _WAITS, _CHANGED = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)

@@ -36,7 +36,7 @@ GRID = GridSpec(96, 96, 1.0)
 
 
 def kinds_of_moves(config: PlannerConfig, row: StrategyRow, moves: int) -> list[str]:
-    """What each of so many moves of one cell to the east grew; "!" if a full growth, "~" if corridors were asked
+    """What each of so many moves of one cell to the east grew; "!" if a full growth, "~" if strides were asked
     for."""
     pace = np.ones((GRID.rows, GRID.cols), np.float32)
     tree = TargetTree(GRID, config, chosen_by=row)
