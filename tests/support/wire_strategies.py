@@ -309,7 +309,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     ),
     Obeyed: st.builds(Obeyed, role=ids, id=ids, incarnation=naturals),
     Beat: st.builds(Beat, role=ids, id=ids, incarnation=naturals, ready=st.booleans(), leads=st.booleans()),
-    Note: st.builds(Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts, cell=optional_cells),
+    Note: st.builds(
+        Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts,
+        cell=st.none() | st.integers(0, (1 << 32) - 1),
+    ),
 }  # fmt: skip
 
 EXAMPLES: tuple[Message, ...] = (

@@ -12,7 +12,7 @@ from swarm.wire.fields import (
     MOST_IDS,
     SMALL,
     Bucket,
-    Cell,
+    CellIndex,
     Count,
     Distance,
     Gauge,
@@ -71,7 +71,7 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     text: Text
     since_ns: StampNs
     over_ns: StampNs | None = None
-    cell: Cell | None = None
+    cell: CellIndex | None = None
     target: Id | None = None
 
 
@@ -119,5 +119,5 @@ class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
     stamp_ns: StampNs
     kind: Word
     text: Text
-    cell: Cell | None = None
+    cell: CellIndex | None = None
     target: Id | None = None

@@ -18,9 +18,11 @@ from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
+from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
+from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET, pack_column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
@@ -497,3 +499,9 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = msgspec.structs.replace(stats("planner", "t1", at_s=at_s, gauges={"ended": 1.0}))
     hear(recorder, ended, at_s=at_s + 1)
     assert not [alarm for alarm in recorder.summary(int((at_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
+
+
+@pytest.mark.parametrize("cell", [-1, -(1 << 31)])
+def test_nobody_tells_of_a_capture_outside_all_maps(cell: int) -> None:
+    with pytest.raises(ProtocolError):
+        decode(encode(capture("t1", cell)), Note)
