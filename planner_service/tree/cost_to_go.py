@@ -16,25 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import route_walk, stride_growth
-from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
-from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
+from planner_service.kernels.cell_costs import find_rim, merge_window
+from planner_service.kernels.layout import NONE, Labels
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.mend import Walk, make_walk, mend
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import FINE, KeptScratch, floats_of_bits, grow_tree
-from planner_service.tree.padded_climbs import climbs_in
+from planner_service.tree.growth import FINE, KeptScratch
 from planner_service.tree.strides import StrideNetwork
+from planner_service.tree.window_growth import box_of, grow_window
 from shared_map.arrays import Floats
-from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
-_SMALL = 1 << 16
-"""Padded cells of a small window."""
 MOST_SPREAD_SHARE = 48
 """While a tree is mended, what costs fall to spreads over one cell in so many at once, ten times as dear as
 evaluating it: beyond, whole branches have moved, and their trees are evaluated first."""
@@ -130,7 +127,7 @@ class CostToGoTree:
         grid = self.cost_grid
         if network.size != grid.size:
             raise ValueError(f"networks of {network.size} padded cells, the map has {grid.size}")
-        box = self._box(window)
+        box = box_of(grid, window)
         row, col = divmod(self.root, grid.grid.cols)
         half = max(row - box[0], col - box[1], box[2] - 1 - row, box[3] - 1 - col)
         scratch = stride_growth.make_scratch(len(network.arrays[0]), grid.size)
@@ -157,22 +154,13 @@ class CostToGoTree:
             # A step that is too steep may be one way only: whoever has a way to the new root may have none to the
             # old one, and be left without.
             return 0
-        row0, col0, row1, col1 = box = self._box(window)
-        width = col1 - col0 + 2
-        start, old = self._in_window(root, window), self._in_window(self.root, window)
-        part = np.empty((row1 - row0 + 2) * width, np.float32)
-        bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
-        cost = np.empty_like(part)
-        padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
-        climbs = None if grid.climbs is None else climbs_in(grid.climbs, grid.stride, box)
-        kept = self._kept if part.size <= _SMALL else None
-        grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, None, kept)
-        way = float(cost[old])
+        box, cost, _, way = grow_window(grid, root, self.root, window, self._kept, False)
         if not (way < math.inf and self.offset + way <= FINE * grid.lowest_cell_cost):
             return 0
         self.offset += way
         merge_window(cost, box, self.offset, grid.pad(self.root), self.cost, grid.stride)
         rows, cols = grid.grid.rows, grid.grid.cols
+        row0, col0, row1, col1 = box
         # A neighbour of a cell that got cheaper may lead there now.
         around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
         new_root = grid.pad(root)
@@ -185,20 +173,6 @@ class CostToGoTree:
         many = find_rim(cost, box, rows, grid.stride, rim, rim_cost)
         self.window_bound = (cost, box, rim[:many], rim_cost[:many])
         return window.cells
-
-    def _box(self, window: Window) -> tuple[int, int, int, int]:
-        """For kernels. Raises OutsideGridError on a window that is not inside the grid."""
-        row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
-        if not (0 <= row0 < row1 <= self.cost_grid.grid.rows and 0 <= col0 < col1 <= self.cost_grid.grid.cols):
-            raise OutsideGridError(f"{window} is not inside the grid")
-        return row0, col0, row1, col1
-
-    def _in_window(self, cell: int, window: Window) -> int:
-        """A cell's index in the window as a padded grid of its own. Raises OutsideGridError if it lies outside."""
-        row, col = self.cost_grid.grid.row_col(cell)
-        if not window.contains(row, col):
-            raise OutsideGridError(f"cell {cell} is not in {window}")
-        return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1
 
     def repair(self, changes: Changes) -> int:
         """Bring the tree up to date after the map changed. Returns cells visited, or -1 if so many are concerned

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import pieces, pieces_mend
-from planner_service.kernels.cell_costs import cut_window
-from planner_service.kernels.layout import NONE, PaddedGrid, step_offsets
+from planner_service.kernels.layout import NONE
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.pieces import CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import KeptScratch, floats_of_bits, grow_tree
-from swarm.errors import OutsideGridError
+from planner_service.tree.growth import KeptScratch
+from planner_service.tree.window_growth import grow_window
 from swarm.grid import Window
 
 MOST_LOOKS = 3.0
@@ -108,17 +107,7 @@ class PieceTree:
         if self.root < 0:
             raise ValueError("the tree has no root: grow it first")
         grid.check_root(root)
-        row0, col0, row1, col1 = box = window.row0, window.col0, window.row1, window.col1
-        if not (0 <= row0 < row1 <= grid.grid.rows and 0 <= col0 < col1 <= grid.grid.cols):
-            raise OutsideGridError(f"{window} is not inside the grid")
-        width = col1 - col0 + 2
-        start, old = self._in_window(root, window), self._in_window(self.root, window)
-        part = np.empty((row1 - row0 + 2) * width, np.float32)
-        bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
-        cost, parent = np.empty_like(part), np.full(part.size, NONE, np.uint8)
-        padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
-        grow_tree(padded, None, (*floats_of_bits(bits), grid.dearest_step), start, cost, parent, self._kept)
-        way = float(cost[old])
+        box, cost, parent, way = grow_window(grid, root, self.root, window, self._kept, True)
         if not way < math.inf:
             return 0
         if self._moved:
@@ -139,12 +128,6 @@ class PieceTree:
         """Make the tree exact, after whatever moves and repairs, or give way to a growth: `exact` tells. Returns
         cells looked at."""
         return self._mend(MOST_LOOKS * self._count + 64)
-
-    def _in_window(self, cell: int, window: Window) -> int:
-        row, col = self.cost_grid.grid.row_col(cell)
-        if not window.contains(row, col):
-            raise OutsideGridError(f"cell {cell} is not in {window}")
-        return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1
 
     def repair(self, changes: Changes) -> int:
         """Bring the tree up to date after the map changed, and make it exact, or give way: `exact` tells.
