@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 from planner_service.strategy import STRATEGIES, Growths, OnMove, Strategy, StrategyRow, WidestWindow
 from planner_service.tree.strides import FINE, LEAST
@@ -27,6 +28,10 @@ FINE_SHARE = 16
 _TICKS = 32
 """Over so many is averaged how often the target moves, and the row is chosen anew where that has changed by: """
 _NOTICED = 0.05
+
+_MEDIAN_OF = 5
+"""Of the last so many times the median counts: single ones take longer, as after a change of processors, or to cut
+a tree into pieces."""
 
 
 def is_slow_to_grow(grid: GridSpec) -> bool:
@@ -61,7 +66,8 @@ class GrowthTimes:
         self._tick_hz = config.tick_hz
         self._has_worker = has_worker
         self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
-        self._exact_measured = False
+        self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
+        self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
         """Of the last `_TICKS` ticks or so; what it was when the row was chosen."""
         self._ticks = 0
@@ -81,15 +87,15 @@ class GrowthTimes:
 
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took; not one that found networks too. A simulation does not call it."""
-        if not self._exact_measured:
-            self.exact_ns = self.exact_ns * took_ns // self.full_ns
-        self.full_ns = max(1, took_ns)
+        median_ns = _median_with(self._full_took_ns, took_ns)
+        if not self._exact_took_ns:
+            self.exact_ns = self.exact_ns * median_ns // self.full_ns
+        self.full_ns = max(1, median_ns)
         self._choose()
 
     def observe_exact_ns(self, took_ns: int) -> None:
         """What an exact move really took."""
-        self._exact_measured = True
-        self.exact_ns = max(1, took_ns)
+        self.exact_ns = max(1, _median_with(self._exact_took_ns, took_ns))
         self._choose()
 
     def _choose(self) -> None:
@@ -128,3 +134,9 @@ class GrowthTimes:
     def mends_quickly(self) -> bool:
         """Whether the whole tree may be made exact on the thread that answers."""
         return not self._has_worker or self.is_short(self.exact_ns)
+
+
+def _median_with(took_ns: deque[int], newest_ns: int) -> int:
+    """The median of the last times and one more, which is kept."""
+    took_ns.append(newest_ns)
+    return sorted(took_ns)[len(took_ns) // 2]

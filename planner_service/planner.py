@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 
 from planner_service.actions import Action, FindStrides, GrowTree, Refusal
@@ -43,8 +42,6 @@ MOST_STEPS = 4 << 20
 GOOD_GAP = 1.05
 """Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
 good already."""
-_MEDIAN_OF = 5
-"""Growths whose median CPU time `auto` goes by: single ones take longer, as after a change of processors."""
 
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 
@@ -113,8 +110,6 @@ class Planner:
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
         self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
-        self._took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
-        self._moves_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._status_due_ns = 0
         for name in COUNTS:
             counters.count(name, 0)
@@ -279,10 +274,7 @@ class Planner:
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
         if self._stopwatch is not None:
-            took = self._moves_took_ns if exact_move else self._took_ns
-            took.append(took_ns)
-            median_ns = sorted(took)[len(took) // 2]
-            (self.tree.times.observe_exact_ns if exact_move else self.tree.times.observe_full_ns)(median_ns)
+            (self.tree.times.observe_exact_ns if exact_move else self.tree.times.observe_full_ns)(took_ns)
 
     def _now(self) -> int:
         return 0 if self._stopwatch is None else self._stopwatch()

@@ -10,7 +10,6 @@ import dataclasses
 import math
 import random
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -273,8 +272,6 @@ class _Racer:
         self._plan = plan
         self._strategy = config.strategy
         self._trees = [TargetTree(field.grid, config) for _ in range(targets)]
-        self._took_ns: list[deque[int]] = [deque(maxlen=5) for _ in range(targets)]
-        """CPU time of each tree's last exact moves."""
         # All batches run the same frames: a frame's time is the sum over batches.
         self._frames = None if first else len(tally.frame_ms)
         self._spent_ms = 0.0
@@ -339,10 +336,7 @@ class _Racer:
         if update.kind == "full":
             tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
         elif update.kind == "exact":
-            # The median, as planners take it: to cut a tree into pieces once is no move.
-            took_ns = self._took_ns[n]
-            took_ns.append(time.thread_time_ns() - began_ns)
-            tree.times.observe_exact_ns(sorted(took_ns)[len(took_ns) // 2])
+            tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
         if tree.wants_strides:
             tree.take_strides(tree.stride_job().run())
         if count:
