@@ -20,6 +20,11 @@ def free_ports(count: int) -> list[int]:
         return [each.getsockname()[1] for each in sockets]
 
 
+def page_of(port: int) -> str:
+    """Address of the live view's page for a browser on this machine."""
+    return f"http://127.0.0.1:{port}/"
+
+
 def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
     """Raises BusError if a port that this machine needs is taken."""
     wanted: list[tuple[str, str, int]] = []

@@ -26,7 +26,7 @@ from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
-from launch_scripts.ports import check_ports
+from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
@@ -56,7 +56,6 @@ log = logging.getLogger(__name__)
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
-_QUIET_NOTES = frozenset({"live_view"})
 
 
 class _RefusedError(SwarmError):
@@ -116,6 +115,7 @@ class _Run:
         """Whether all that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
         self._up_at_s: float | None = None
+        self._web_port = 0
         """When the swarm was whole, on the run's clock."""
         self._recorder: Recorder | None = None
         self._metrics = self._open_metrics()
@@ -307,11 +307,11 @@ class _Run:
         if (compiled := self._warm_up.news()) is not None:
             self._terminal.say(compiled)
         for note in watcher.take_notes():
-            if note.kind == "live_view":
-                self._terminal.say(f"live view: {note.text}", "bold")
-                self._terminal.say(f"from elsewhere: {tunnel(note.text)}, then the same address")
-            elif note.kind not in _QUIET_NOTES:
-                self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
+            self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
+        if watcher.web_port != self._web_port:
+            self._web_port = watcher.web_port
+            self._terminal.say(f"live view: {page_of(self._web_port)}", "bold")
+            self._terminal.say(f"from elsewhere: {tunnel(self._web_port)}, then the same address")
         if self._terminal.due():
             state = watcher.recorder.summary(watcher.now_ns())
             self._terminal.show(self._title(watcher, state), state)
@@ -322,7 +322,7 @@ class _Run:
             up = facts.fact("processes_well").shown(state)
             return f"{self._scenario.name}: starting, {up} processes are up, {state.elapsed_s:.0f} s"
         end_s = self._up_at_s + self._scenario.seconds
-        live = f", live view {watcher.live_view}" if watcher.live_view else ""
+        live = f", live view {page_of(self._web_port)}" if self._web_port else ""
         return f"{self._scenario.name}: {state.elapsed_s:.0f} of {end_s:.0f} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:

@@ -28,7 +28,8 @@ class Watcher:
     def __init__(self, bus: Bus, recorder: Recorder, clock: Clock) -> None:
         self.recorder = recorder
         self.notes: list[Note] = []
-        self.live_view: str | None = None
+        self.web_port = 0
+        """Where the live view's page is; 0 until that is known."""
         self.routes_served = False
         self._hears_all_routes = True
         self._bus = bus
@@ -65,7 +66,9 @@ class Watcher:
             case Heard(message=message, fields=fields):
                 match message:
                     case Note():
-                        self._note(message)
+                        self.notes.append(message)
+                    case Stats(role="monitor", web_port=port) if port:
+                        self.web_port = port
                     case Followed():
                         if self._hears_all_routes:
                             self._hears_all_routes = False
@@ -81,11 +84,6 @@ class Watcher:
                 self.recorder.alive(peer, True, now_ns)
             case Disappeared(peer):
                 self.recorder.alive(peer, False, now_ns)
-
-    def _note(self, note: Note) -> None:
-        if note.kind == "live_view":
-            self.live_view = note.text
-        self.notes.append(note)
 
 
 def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:

@@ -6,7 +6,6 @@ import os
 import shutil
 import socket
 import sys
-import urllib.parse
 from pathlib import Path
 
 _FILES = (("report", "report.json"), ("report", "report.html"), ("picture", "report.png"))
@@ -30,9 +29,8 @@ def rerun_command() -> str:
     return "rerun" if shutil.which("rerun") or not beside.exists() else shown(beside)
 
 
-def tunnel(page: str) -> str:
+def tunnel(port: int) -> str:
     """How to reach a page of this machine from another one."""
-    port = urllib.parse.urlsplit(page).port
     return f"ssh -N -L {port}:127.0.0.1:{port} {os.environ.get('USER', 'USER')}@{socket.gethostname()}"
 
 

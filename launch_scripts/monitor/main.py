@@ -46,7 +46,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             inbox.post,
             sinks.streams,
             mesh=mesh,
-            live_url=sinks.live_url,
+            web_port=sinks.web_port,
             recording=None if path is None else RecordingWatch(path, sinks.begin_file),
             truth=load_truth(setup, terrain) if knows_truth else None,
             zones=scenario_areas(setup.scenario, terrain.grid),

@@ -47,7 +47,6 @@ _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, S
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _ENDED_KEPT = 4096
 _ANSWER_S = 5.0
-_ANNOUNCE_NS = NS_PER_S // 2
 _LAST_WORD_NS = NS_PER_S // 2
 """So long after a process went its last figures are waited for, which say whether it was asked to end."""
 
@@ -56,7 +55,7 @@ class MonitorService:
     """Shows a run on a recording stream.
 
     rec        a recording stream whose sinks are set
-    live_url   address of the live view; published once
+    web_port   port of the live view's page on this machine; 0: it has none
     recording  watches the file of the recording, if there is one
     truth      the true ground, where this process knows it
     zones      of the scenario
@@ -72,7 +71,7 @@ class MonitorService:
         rec: rr.RecordingStream | Streams,
         *,
         mesh: TerrainMesh | None = None,
-        live_url: str | None = None,
+        web_port: int = 0,
         recording: RecordingWatch | None = None,
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
@@ -85,8 +84,8 @@ class MonitorService:
         self._terrain = terrain
         self._bus = bus
         self._post = post
-        self._live_url = live_url
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._member.web_port = web_port
         self.counters: Counters = self._member.counters
         cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, cost_map)
@@ -154,7 +153,6 @@ class MonitorService:
         """Draws one frame."""
         self._sync.tick(now_ns)
         self._member.tick(now_ns)
-        self._announce(now_ns)
         self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
         self._drawing.set_time(self._frame, self._seconds())
@@ -198,12 +196,6 @@ class MonitorService:
             ended = peer in self._ended
             text = f"{peer.role} {peer.id} {'has ended as asked' if ended else 'is gone'}"
             self._drawing.note(text, "INFO" if ended else "WARN")
-
-    def _announce(self, now_ns: int) -> None:
-        """Publishes the live view's address, once links have had time to learn of subscribers."""
-        if self._live_url is not None and now_ns - self._started_ns >= _ANNOUNCE_NS:
-            self._member.note(now_ns, "live_view", self._live_url)
-            self._live_url = None
 
     def _watch_recording(self, now_ns: int) -> None:
         if self._recording is None:

@@ -49,6 +49,8 @@ class Member:
         """What people should know that watch the run."""
         self.counters = Counters()
         """All that this process counts; never reset."""
+        self.web_port = 0
+        """Where people can look at this process. Told each second: whoever begins to listen later hears it, too."""
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
@@ -140,6 +142,7 @@ class Member:
                 for name, each in self.counters.histograms_by.items()
             },
             alarms=self.alarms.told(),
+            web_port=self.web_port,
         )
         if self._before is not None:
             stats = carried(self._before, stats)

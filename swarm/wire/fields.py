@@ -102,6 +102,8 @@ AgeSeconds = Annotated[float, Meta(ge=0, le=1e10)]
 """How long ago something was heard."""
 Gap = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Cost over optimum or lower bound: 1 but for rounding, or more; inf is nothing proven."""
+WebPort = Annotated[int, Meta(ge=0, le=65535)]
+"""A page of the sender's own machine; 0 is none."""
 Gauge = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 """What a process measured of itself: any finite number."""
 

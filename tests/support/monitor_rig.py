@@ -62,7 +62,7 @@ class Rig(SwarmModel):
         scenario: Scenario,
         terrain: Terrain,
         path: Path | None,
-        live_url: str | None = None,
+        web_port: int = 0,
         config: MonitorConfig = SILENT,
     ) -> None:
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
@@ -74,7 +74,7 @@ class Rig(SwarmModel):
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup, terrain, bus, post, self.sinks.streams, mesh=mesh, live_url=live_url, layers=layers
+                setup, terrain, bus, post, self.sinks.streams, mesh=mesh, web_port=web_port, layers=layers
             ),
         )
 

@@ -97,7 +97,12 @@ class Sinks:
     @property
     def live_url(self) -> str | None:
         """Address for a browser on this machine."""
-        return None if self._page is None else self._page.url
+        return None if self._page is None else f"http://{LOOPBACK}:{self._page.port}/"
+
+    @property
+    def web_port(self) -> int:
+        """Port of that page; 0 without one."""
+        return 0 if self._page is None else self._page.port
 
     def tell_page(self, run: Callable[[], Mapping[str, Any]]) -> None:
         """What the page shows of the run beside the view, asked once a second for each page that is open."""

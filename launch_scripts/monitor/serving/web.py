@@ -71,8 +71,8 @@ class ViewerPage:
         threading.Thread(target=self._server.serve_forever, name="viewer-page", daemon=True).start()
 
     @property
-    def url(self) -> str:
-        return f"http://{LOOPBACK}:{self._server.port}/"
+    def port(self) -> int:
+        return self._server.port
 
     def close(self) -> None:
         self._server.close()

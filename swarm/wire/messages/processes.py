@@ -23,6 +23,7 @@ from swarm.wire.fields import (
     Metres,
     StampNs,
     Text,
+    WebPort,
     Word,
 )
 from swarm.wire.messages.base import Message, schema_of
@@ -81,6 +82,7 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     counts_by, histograms_by    name -> id of a target or vehicle -> the same, of that one alone
     since                       counts are those of all incarnations of this process from this one on; 0: of its own
     alarms                      what lasts, and the newest of what is over
+    web_port                    port of its own machine where people can look at it in a browser; 0: none
     """
 
     role: Id
@@ -97,6 +99,7 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     ] = {}
     since: Incarnation = 0
     alarms: Annotated[list[Alarm], Meta(max_length=64)] = []
+    web_port: WebPort = 0
 
 
 class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):

@@ -201,9 +201,10 @@ def test_the_gap_on_real_elevation_stays_small(model: str) -> None:
         "--strategies",
         "auto",
         "--cpu-budget",
-        "0.001",
+        "0.0001",
     )
-    assert report["rows"][0]["gap_mean"] < 1.02
+    # A budget too small for any renewal, and so the worst that a busy machine can do to `auto`.
+    assert report["rows"][0]["gap_mean"] < 1.05
     assert report["rows"][0]["proven_p50"] >= report["rows"][0]["gap_p50"]
 
 

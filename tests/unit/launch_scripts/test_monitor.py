@@ -29,7 +29,7 @@ from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Event
+from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
@@ -37,10 +37,10 @@ from swarm.liveness import Peer
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Note, Stats
+from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import FOLLOWED, NOTE, TOPICS
+from swarm.wire.topics import FOLLOWED, STATS, TOPICS
 
 
 @pytest.fixture(scope="module")
@@ -254,16 +254,15 @@ def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
     rig.close()
 
 
-def test_where_to_watch_is_told_once(scenario: Scenario, terrain: Terrain) -> None:
-    rig = Rig(scenario, terrain, None, live_url="http://127.0.0.1:1/")
+def test_where_to_watch_is_told_to_whoever_begins_to_listen_later(scenario: Scenario, terrain: Terrain) -> None:
+    rig = Rig(scenario, terrain, None, web_port=9090)
+    rig.run(30)
     heard: list[Event] = []
-    rig.speaker.subscribe(NOTE, heard.append)
-    rig.run(3)
+    rig.speaker.subscribe(STATS, heard.append)
+    rig.run(30)
     rig.close()
-    notes = [event.message for event in heard]  # type: ignore[union-attr]
-    assert [(note.kind, note.text) for note in notes if isinstance(note, Note)] == [
-        ("live_view", "http://127.0.0.1:1/")
-    ]
+    told = [event.message for event in heard if isinstance(event, Heard)]
+    assert [stats.web_port for stats in told if isinstance(stats, Stats) and stats.role == "monitor"][:1] == [9090]
 
 
 def test_who_ends_as_asked_is_no_warning_and_who_dies_is_one(scenario: Scenario, terrain: Terrain) -> None:
