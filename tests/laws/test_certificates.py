@@ -27,8 +27,8 @@ def checked(seeds: range) -> Findings:
 
 
 def test_no_life_breaks_a_law() -> None:
-    findings = checked(range(8))
-    assert findings.checks > 50_000
+    findings = checked(range(4))
+    assert findings.checks > 25_000
     assert {law for law, many in findings.violations.items() if many} == set()
 
 

@@ -126,7 +126,7 @@ def chases(seeds: range, most: int, happenings: int) -> int:
 
 
 def test_random_chases() -> None:
-    assert chases(range(20), 140, 6) < 40
+    assert chases(range(10), 140, 6) < 20
 
 
 @pytest.mark.thorough
