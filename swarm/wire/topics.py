@@ -29,7 +29,7 @@ from swarm.wire.messages.planning import (
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.messages.vehicles import Chasers, Fleet, Followed
+from swarm.wire.messages.vehicles import Chasers, Fleet, Followed, SharedCosts
 
 
 class Priority(Enum):
@@ -195,6 +195,12 @@ CHASERS = Topic(
     "when a vehicle takes or leaves the target or has driven past the cell told; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
 )  # fmt: skip
+SHARED_COSTS = Topic(
+    "shared-costs", "costs/{group}/{author}", SharedCosts,
+    "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
+    "only where `groups[].assignment` asks for it",
+    access(put="agent:author", hear="agent"), echoed=False,
+)  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
@@ -319,9 +325,9 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, LEAVE,
-    FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS,
-    OBEYED, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER,
+    ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
