@@ -209,10 +209,10 @@ STANDING = Topic(
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
-    "table", "table/{plot}/{agent}", Table,
-    "which cells the warden of a plot has granted, for its members; a member that is asked promises an epoch and "
-    "answers with what it has stored", "on change, at least 5 Hz where vehicles are",
-    access(put="agent:agent", serve="agent:agent", ask="agent", hear="agent"),
+    "table", "table/{plot}/{member}/{agent}", Table,
+    "which cells the warden of a plot has granted, for one of its members; a member that is asked promises an "
+    "epoch and answers with what it has stored", "on change, at least 5 Hz where vehicles are",
+    access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
     request=Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 GRANTED = Topic(
@@ -221,9 +221,9 @@ GRANTED = Topic(
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
+    "stored", "stored/{plot}/{member}/{agent}", Stored, "which table a member has on file, for another one",
     "per table by one member, 5 Hz by the other",
-    access(put="agent:agent", hear="agent"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", Known, "what an agent has on file about another, or a guest, for a new life of that",
