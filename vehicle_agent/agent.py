@@ -19,12 +19,14 @@ from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
+from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.local_map import LocalMap, meet
 from vehicle_agent.sensing.empty_places import EmptyPlaces
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
@@ -64,6 +66,7 @@ class Agent:
     bodies     what they must not drive into, though it speaks no right of way
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
+    group      what the other agents of the group told of their costs, if the assigner asks for it
 
     stopped    whether an operator wants a vehicle to stand
     """
@@ -78,6 +81,7 @@ class Agent:
         bodies: Bodies | None = None,
         assigner: Assigner | None = None,
         dynamics: PluginDynamics | None = None,
+        group: GroupCosts | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
@@ -111,9 +115,12 @@ class Agent:
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
         self._empty = EmptyPlaces(self._trackings)
+        self._unseen: set[str] = set()
+        """Targets which nobody sees: their planners say where to look."""
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
+        assigner, stagger = assigner or Spread(), chance.random()
+        self._assignment = Assignment(self.targets, assigner, config.reassign_s, stagger, group)
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -262,6 +269,9 @@ class Agent:
         ):
             self._assignment.ask_soon(now_ns)
         lost = self._trackings.lost(now_ns) | self._empty.of
+        for target in self._empty.unseen(lost) - self._unseen:
+            self._unseen.add(target)
+            del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
         for vehicle in self.vehicles.values():
@@ -347,7 +357,9 @@ class Agent:
     def _moved(self, pose: TargetPose, now_ns: int) -> None:
         known = self._poses.get(pose.target)
         self._poses[pose.target] = pose
-        if known is not None and pose.jumps != known.jumps:
+        found = pose.target in self._unseen
+        self._unseen.discard(pose.target)
+        if found or (known is not None and pose.jumps != known.jumps):
             for vehicle in self.vehicles.values():
                 if vehicle.target == pose.target:
                     self._check_reach(vehicle)
@@ -406,7 +418,12 @@ class Agent:
         return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
 
     def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
-        if route.status is not RouteStatus.OK:
+        searching = route.status is RouteStatus.SEARCHING
+        if searching and not math.isfinite(route.cost_s):
+            if not pushed:
+                vehicle.no_answer(now_ns)
+            return []
+        if route.status is not RouteStatus.OK and not searching:
             if not pushed:
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
@@ -417,7 +434,7 @@ class Agent:
                 vehicle.no_answer(now_ns)
             return []
         partial = route.remaining_s > 0.0
-        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed)
+        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching)
         path = self.holdings.path(vehicle.id)
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:
@@ -435,6 +452,13 @@ class Agent:
         """One planner's answer to `AskCosts`: float32 seconds, one per vehicle asked for."""
         self._assignment.costs_given(request, target, costs_s)
 
-    def costs_ended(self, request: int, now_ns: int) -> None:
-        """No more answers to `AskCosts` will come."""
-        self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns, self._empty.of)
+    def costs_ended(self, request: int, now_ns: int) -> SharedCosts | None:
+        """No more answers to `AskCosts` will come; returns what to tell the other agents of the group."""
+        standing = list(filter(self.stopped, self.vehicles))
+        return self._assignment.costs_ended(
+            request, self.vehicles, self._planners, now_ns, self._empty.of, standing
+        )
+
+    def hear_costs(self, told: SharedCosts, now_ns: int) -> None:
+        """What another agent of the group told of its vehicles."""
+        self._assignment.hear(told, now_ns)

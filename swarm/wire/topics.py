@@ -29,7 +29,7 @@ from swarm.wire.messages.planning import (
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.messages.vehicles import Chasers, Fleet, Followed
+from swarm.wire.messages.vehicles import Chasers, Fleet, Followed, SharedCosts
 
 
 class Priority(Enum):
@@ -187,13 +187,19 @@ BASE_TILES = Topic(
 )  # fmt: skip
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
-    access(put="agent:author", hear="targets monitor"),
+    access(put="agent:author", hear="targets monitor planner"),
 )  # fmt: skip
 CHASERS = Topic(
     "chasers", "target/{target}/chasers/{author}", Chasers,
     "which vehicles of an agent chase a target, for its planner, and where routes for them may begin",
     "when a vehicle takes or leaves the target or has driven past the cell told; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
+)  # fmt: skip
+SHARED_COSTS = Topic(
+    "shared-costs", "costs/{group}/{author}", SharedCosts,
+    "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
+    "only where `groups[].assignment` asks for it",
+    access(put="agent:author", hear="agent"), echoed=False,
 )  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
@@ -319,9 +325,9 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, LEAVE,
-    FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS,
-    OBEYED, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER,
+    ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
