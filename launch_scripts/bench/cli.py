@@ -235,6 +235,32 @@ def certificates(
 
 
 @app.command()
+def air(
+    dem: Annotated[str, typer.Option(help="A built-in terrain, or an elevation file.")] = "jacksboro",
+    cells: Annotated[int, typer.Option(min=16, max=160, help="A side of the crop.")] = 100,
+    grade: Annotated[float, typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface.")] = 0.15,
+    routes: Annotated[int, typer.Option(min=1, help="Routes whose clearance is looked at.")] = 100_000,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Flights over a surface that follows the terrain, beside the best way through 64 levels.
+
+    \b
+    swarm bench air
+    swarm bench air --dem ridge.tif --grade 0.2
+
+    The status is 1 where a flight comes nearer to the ground than its clearance.
+    """
+    from launch_scripts.bench.planning.air import run, tables
+    from shared_map.terrain.air_floor import Flight
+
+    report = run(dem, cells, 2, 150, routes, Flight(speed_mps=15.0, grade=grade), seed)
+    show(report, as_json, tables)
+    if report["clearance_broken"]:
+        raise typer.Exit(1)
+
+
+@app.command()
 def directed(
     sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
     repeats: Annotated[int, typer.Option(min=1, help="Roots, the same for both.")] = 7,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 import math
 
 import numpy as np
@@ -15,9 +16,9 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.air_floor import Flight, air_ground, clearance_floor, lifted_floor
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
-STEPS = [(south, east) for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]
+STEPS = tuple(zip(STEP_ROW, STEP_COL, strict=True))
 
 
 @st.composite
@@ -94,7 +95,7 @@ def test_along_every_route_of_an_air_class_the_clearance_is_kept_between_centres
     assert (walks.ends >= 0).all()
     for cell in reached.tolist():
         way = _way(costs, tree, cell)
-        for tail, head in zip(way, way[1:], strict=False):
+        for tail, head in itertools.pairwise(way):
             (r0, c0), (r1, c1) = divmod(tail, grid.cols), divmod(head, grid.cols)
             under = filled[min(r0, r1) : max(r0, r1) + 1, min(c0, c1) : max(c0, c1) + 1].max()
             heights_m = flown.height_m[r0, c0], flown.height_m[r1, c1]
@@ -103,11 +104,10 @@ def test_along_every_route_of_an_air_class_the_clearance_is_kept_between_centres
 
 def _way(costs: CostGrid, tree: CostToGoTree, cell: int) -> list[int]:
     """Cells of the route from a cell, by its parents one by one."""
-    offsets = [(-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1)]
     way = [cell]
     while way[-1] != tree.root:
-        south, east = offsets[int(tree.parent[costs.pad(way[-1])])]
-        way.append(way[-1] + south * costs.grid.cols + east)
+        code = int(tree.parent[costs.pad(way[-1])])
+        way.append(way[-1] + STEP_ROW[code] * costs.grid.cols + STEP_COL[code])
         assert len(way) <= costs.grid.cells
     return way
 
