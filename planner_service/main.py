@@ -22,6 +22,7 @@ from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
 from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
+from swarm.runtime.turns import Turns
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     network = scenario.network
     with (
         open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
-        closing(ThreadWorker("grow-tree", inbox)) as worker,
+        closing(ThreadWorker("grow-tree", inbox, Turns(setup.run_dir))) as worker,
         recorded(setup, terrain.digest) as boundary,
     ):
         service = PlannerService(

@@ -19,12 +19,14 @@ from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
+from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.local_map import LocalMap, meet
 from vehicle_agent.sensing.empty_places import EmptyPlaces
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
@@ -64,6 +66,7 @@ class Agent:
     bodies     what they must not drive into, though it speaks no right of way
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
+    group      what the other agents of the group told of their costs, if the assigner asks for it
 
     stopped    whether an operator wants a vehicle to stand
     """
@@ -78,6 +81,7 @@ class Agent:
         bodies: Bodies | None = None,
         assigner: Assigner | None = None,
         dynamics: PluginDynamics | None = None,
+        group: GroupCosts | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
@@ -115,7 +119,8 @@ class Agent:
         """Targets which nobody sees: their planners say where to look."""
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
+        assigner, stagger = assigner or Spread(), chance.random()
+        self._assignment = Assignment(self.targets, assigner, config.reassign_s, stagger, group)
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -447,6 +452,13 @@ class Agent:
         """One planner's answer to `AskCosts`: float32 seconds, one per vehicle asked for."""
         self._assignment.costs_given(request, target, costs_s)
 
-    def costs_ended(self, request: int, now_ns: int) -> None:
-        """No more answers to `AskCosts` will come."""
-        self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns, self._empty.of)
+    def costs_ended(self, request: int, now_ns: int) -> SharedCosts | None:
+        """No more answers to `AskCosts` will come; returns what to tell the other agents of the group."""
+        standing = list(filter(self.stopped, self.vehicles))
+        return self._assignment.costs_ended(
+            request, self.vehicles, self._planners, now_ns, self._empty.of, standing
+        )
+
+    def hear_costs(self, told: SharedCosts, now_ns: int) -> None:
+        """What another agent of the group told of its vehicles."""
+        self._assignment.hear(told, now_ns)

@@ -1,10 +1,11 @@
-"""Which target each vehicle goes for: at low cost, evenly spread over the targets, if the change is worth it."""
+"""Which target each vehicle goes for: at low cost, shared out over the targets, if the change is worth it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -13,11 +14,15 @@ from numpy.typing import NDArray
 from swarm.clock import NS_PER_S
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
-from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.messages.vehicles import SharedCosts, VehicleState
 from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.group_costs import GroupCosts
+from vehicle_agent.matching import HYSTERESIS, need_first, spread
 
 _RETRY_NS = NS_PER_S // 2
 _STRANDED_RETRY_NS = 3 * NS_PER_S
+_LEASE_PERIODS = 3
+"""An agent of the group that has told no costs for so many periods is gone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +45,6 @@ class Choice:
 
 
 UNSETTLED = Choice(None, settled=False)
-
-
-HYSTERESIS = 0.15
-"""Another target must be cheaper than the current one by this share, so that vehicles do not turn round at every
-change of the map."""
 
 
 def choose(
@@ -77,37 +77,6 @@ def choose(
     return Choice(best)
 
 
-def spread(costs_s: NDArray[np.float64], current: Sequence[int]) -> NDArray[np.int64]:
-    """Which target each vehicle goes for: the cheapest pairs first, to each target an even share of the vehicles.
-
-    If each took the cheapest, all would end up in one herd (docs/method.md): those which chase one target stand
-    together when it is caught, and have the same cheapest target again.
-
-    Parameters
-    ----------
-    costs_s : (targets, vehicles) float64, inf where there is no route
-    current : (vehicles,) the target of each now, -1 for none; another must be cheaper by `HYSTERESIS`
-
-    Returns
-    -------
-    (vehicles,) int64, index of a target. -1 for a vehicle all whose targets have their share or are out of reach.
-    """
-    targets, vehicles = costs_s.shape
-    most = -(-vehicles // targets)
-    costs_s = costs_s.copy()
-    for vehicle, target in enumerate(current):
-        if target >= 0:
-            costs_s[target, vehicle] *= 1.0 - HYSTERESIS
-    chosen = np.full(vehicles, -1, np.int64)
-    left = [most] * targets
-    order = np.argsort(costs_s, axis=None, kind="stable")[: int(np.isfinite(costs_s).sum())]
-    for target, vehicle in zip(*(each.tolist() for each in np.divmod(order, vehicles)), strict=True):
-        if chosen[vehicle] < 0 and left[target]:
-            chosen[vehicle] = target
-            left[target] -= 1
-    return chosen
-
-
 @dataclass(frozen=True, slots=True)
 class AssignmentWorld:
     """What an assigner is made with.
@@ -116,33 +85,41 @@ class AssignmentWorld:
     group    their group
     targets  those that the group may chase at the start; operators add and remove some
     seed     of the run
+    pursuers how many vehicles of the group each target shall get first
     """
 
     agent: str
     group: str
     targets: tuple[str, ...]
     seed: int
+    pursuers: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostTable:
     """What each vehicle would need to each target.
 
-    targets   those whose planners have answered
+    targets   those whose planners have answered; where costs are shared, ascending, those that others told of too
     vehicles  those that have a choice
     costs_s   (targets, vehicles) float64, inf where there is no route
     current   (vehicles,) index of the target of each now, -1 for none
+    others    where costs are shared: the same, of the vehicles of the group's other agents, as they told it last
     """
 
     targets: tuple[str, ...]
     vehicles: tuple[str, ...]
     costs_s: NDArray[np.float64]
     current: tuple[int, ...]
+    others: CostTable | None = None
 
 
 class Assigner(Protocol):
     """Says which vehicle of an agent goes for which target. A plug-in is made as
-    `Name(world: AssignmentWorld, options)`."""
+    `Name(world: AssignmentWorld, options)`.
+
+    One that has an attribute `shares_costs`, and it is true, is told the costs of the whole group: its agents tell
+    each other theirs, once a period.
+    """
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
         """(vehicles,) index of a target that the vehicle has a route to; -1 lets it keep its target, or take the
@@ -157,14 +134,57 @@ class Spread:
         return spread(table.costs_s, table.current)
 
 
-ASSIGNERS: Mapping[str, Callable[[], Assigner]] = {"spread": Spread}
+class Cheapest:
+    """Each vehicle the target that it reaches first, whatever the others do."""
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        return np.full(len(table.vehicles), -1, np.int64)
+
+
+class Balanced:
+    """First every target's pursuers out of the whole group, then each vehicle its cheapest: see `need_first`.
+
+    All agents solve one problem, which does not depend on who solves it or in which order words came, and each
+    takes what it says of its own vehicles. Where they hold different words, a target may have more pursuers for a
+    period.
+    """
+
+    shares_costs = True
+
+    def __init__(self, pursuers: int) -> None:
+        self._pursuers = pursuers
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        tables = [table] if table.others is None else [table, table.others]
+        ids = list(chain.from_iterable(each.vehicles for each in tables))
+        rows = sorted(range(len(table.targets)), key=table.targets.__getitem__)
+        columns = sorted(range(len(ids)), key=ids.__getitem__)
+        place = {row: n for n, row in enumerate(rows)} | {-1: -1}
+        costs_s = np.concatenate([each.costs_s for each in tables], 1)[np.ix_(rows, columns)]
+        now = list(chain.from_iterable(each.current for each in tables))
+        needed = need_first(costs_s, [place[now[n]] for n in columns], self._pursuers)
+        chosen = np.full(len(ids), -1, np.int64)
+        chosen[columns] = [rows[each] if each >= 0 else -1 for each in needed.tolist()]
+        return chosen[: len(table.vehicles)]
+
+
+ASSIGNERS: Mapping[str, Callable[[AssignmentWorld], Assigner]] = {
+    "spread": lambda world: Spread(),
+    "cheapest": lambda world: Cheapest(),
+    "balanced": lambda world: Balanced(world.pursuers),
+}
 """The built-in assigners."""
+
+
+def shares_costs(assigner: Assigner) -> bool:
+    """Whether the agents of a group tell each other their costs for it."""
+    return getattr(assigner, "shares_costs", False) is True
 
 
 def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
     """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
     if plugin.factory is None:
-        return ASSIGNERS[plugin.named.name]()
+        return ASSIGNERS[plugin.named.name](world)
     return PluginAssigner(plugin.make(world), Guard(plugin, tell))
 
 
@@ -174,9 +194,11 @@ class PluginAssigner:
     def __init__(self, assigner: Assigner, guard: Guard) -> None:
         self._assigner = assigner
         self._guard = guard
+        self.shares_costs = shares_costs(assigner)
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
-        told = replace(table, costs_s=table.costs_s.copy())
+        others = table.others and replace(table.others, costs_s=table.others.costs_s.copy())
+        told = replace(table, costs_s=table.costs_s.copy(), others=others)
         return self._guard.ask(
             lambda: self._assigner.assign(told),
             lambda chosen: _checked(chosen, table.costs_s),
@@ -206,10 +228,19 @@ class Assignment:
     assigner    which of them each goes for
     stagger     share of the period by which the first request is followed early, so that agents ask one after the
                 other
+    group       what the group's other agents told; None if the assigner does not ask for it
     """
 
-    def __init__(self, targets: Sequence[str], assigner: Assigner, reassign_s: float, stagger: float) -> None:
+    def __init__(
+        self,
+        targets: Sequence[str],
+        assigner: Assigner,
+        reassign_s: float,
+        stagger: float,
+        group: GroupCosts | None = None,
+    ) -> None:
         self._targets = targets
+        self._group = group
         self._assigner = assigner
         self._reassign_ns = int(reassign_s * NS_PER_S)
         self._stagger_ns = int(stagger * self._reassign_ns)
@@ -254,17 +285,21 @@ class Assignment:
         planners: Mapping[str, int],
         now_ns: int,
         empty: Collection[str] = (),
-    ) -> None:
-        """All planners that will answer have: each vehicle takes its target.
+        standing: Collection[str] = (),
+    ) -> SharedCosts | None:
+        """All planners that will answer have: each vehicle takes its target. Returns what to tell the group.
 
-        empty  targets that are not where their planners lead to: whoever has a way to another goes for that
+        empty     targets that are not where their planners lead to: whoever has a way to another goes for that
+        standing  vehicles that an operator lets stand: no target's pursuers where costs are shared
         """
         asked = self._open
         if asked is None or asked.request != request:
-            return
+            return None
         self._open = None
         stuck = not self._costs_s
-        told = self._spread(asked, vehicles, empty)
+        if self._group is not None:
+            self._group.expire(now_ns - _LEASE_PERIODS * self._reassign_ns)
+        told = self._spread(asked, vehicles, empty, standing)
         for index, id in enumerate(asked.vehicles):
             vehicle = vehicles.get(id)
             if vehicle is None:
@@ -280,20 +315,60 @@ class Assignment:
         if stuck:
             retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
+        return self._tell(asked, vehicles, empty, standing, now_ns)
 
-    def _spread(self, asked: AskCosts, vehicles: Mapping[str, Vehicle], empty: Collection[str]) -> dict[str, str]:
+    def hear(self, told: SharedCosts, now_ns: int) -> None:
+        """What another agent of the group told of its vehicles."""
+        if self._group is not None:
+            self._group.hear(told, now_ns)
+
+    def _tell(
+        self,
+        asked: AskCosts,
+        vehicles: Mapping[str, Vehicle],
+        empty: Collection[str],
+        standing: Collection[str],
+        now_ns: int,
+    ) -> SharedCosts | None:
+        """What the other agents of the group reckon with: the costs of those vehicles that may chase any target."""
+        if self._group is None:
+            return None
+        may = [n for n, id in enumerate(asked.vehicles) if id in vehicles and id not in standing]
+        costs_s = {
+            target: column[may]
+            for target, column in self._costs_s.items()
+            if target in self._targets and target not in empty
+        }
+        ids = [asked.vehicles[n] for n in may]
+        return self._group.tell(ids, costs_s, [vehicles[id].target for id in ids], now_ns)
+
+    def _spread(
+        self,
+        asked: AskCosts,
+        vehicles: Mapping[str, Vehicle],
+        empty: Collection[str],
+        standing: Collection[str] = (),
+    ) -> dict[str, str]:
         """The target of each vehicle that has a choice, so that not all go for the same."""
         targets = [target for target in self._targets if target in self._costs_s and target not in empty]
         # A vehicle whose planner is silent keeps to it, or is told that nothing is known.
         held = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
         now = {id: None if target in empty else target for id, target in held.items()}
         free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
+        if self._group is not None:
+            free = [n for n in free if asked.vehicles[n] not in standing]
         if not free or not targets:
             return {}
-        costs_s = np.array([self._costs_s[target] for target in targets], np.float64)[:, free]
+        others = None
+        if self._group is not None:
+            targets = sorted({*targets, *self._group.targets.difference(empty).intersection(self._targets)})
+            ids, table, theirs = self._group.rows(targets)
+            others = CostTable(tuple(targets), ids, table, theirs)
+        unknown = np.full(len(asked.vehicles), np.inf)
+        costs_s = np.array([self._costs_s.get(target, unknown) for target in targets], np.float64)[:, free]
         current = [-1 if (target := now[asked.vehicles[n]]) is None else targets.index(target) for n in free]
         names = tuple(asked.vehicles[n] for n in free)
-        chosen = self._assigner.assign(CostTable(tuple(targets), names, costs_s, tuple(current)))
+        chosen = self._assigner.assign(CostTable(tuple(targets), names, costs_s, tuple(current), others))
         return {
             asked.vehicles[n]: targets[each] for n, each in zip(free, chosen.tolist(), strict=True) if each >= 0
         }

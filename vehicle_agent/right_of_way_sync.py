@@ -17,7 +17,7 @@ from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.plots import Plots
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE
+from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
@@ -66,7 +66,6 @@ class RightOfWaySync:
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
-        self._seats = frozenset(plot for plot in range(plots.count) if setup.id in plots.members(plot))
         self._asking = False
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
@@ -81,10 +80,11 @@ class RightOfWaySync:
         self._bus.watch_alive(self._post, role="agent")
         self._bus.serve(KNOWN, self._post, agent=self._id)
         self._bus.serve(TABLE, self._post, agent=self._id)
-        for plot in sorted(self._seats):
-            self._bus.collect(STANDING, plot=plot, member=self._id)
-            self._bus.subscribe(TABLE, self._post, plot=plot)
-            self._bus.subscribe(STORED, self._post, plot=plot)
+        # Not one by one for each seat: every subscription has a thread of its own, and of a large map's plots few
+        # agents have hundreds of seats.
+        self._bus.collect(STANDING, member=self._id)
+        self._bus.subscribe(TABLE, self._post, member=self._id)
+        self._bus.subscribe(STORED, self._post, member=self._id)
         self._bus.collect(GRANTED, host=self._id)
         self._ask_known()
 
@@ -98,8 +98,7 @@ class RightOfWaySync:
             case Heard(message=Stored() as stored):
                 self._perform(core.hear_stored(stored, now_ns))
             case Asked(topic=topic, request=Claim() as claim) if topic is TABLE:
-                if event.fields["plot"].isdecimal():
-                    self._answer(event, core.hear_claim(int(event.fields["plot"]), claim.epoch, now_ns))
+                self._hear_claim(event, claim.epoch, now_ns)
                 event.end()
             case Asked(topic=topic, request=KnownRequest() as request) if topic is KNOWN:
                 self._answer(event, core.answer_known(request))
@@ -174,16 +173,31 @@ class RightOfWaySync:
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
 
+    def _hear_claim(self, asked: Asked, epoch: int, now_ns: int) -> None:
+        """A claim is answered to the member whose epoch it is, under its own name."""
+        if not asked.fields["plot"].isdecimal():
+            return
+        plot, plots = int(asked.fields["plot"]), self.core.plots
+        if plot < plots.count and asked.fields["member"] == plots.warden(plot, epoch):
+            self._answer(asked, self.core.hear_claim(plot, epoch, now_ns))
+
     def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:
         """Perform what has to be done first, and answer with the last."""
         for action in actions:
             match action:
                 case Table():
-                    asked.answer(replace(action, agent=self._id), plot=action.plot, agent=self._id)
+                    member = asked.fields["member"]
+                    asked.answer(replace(action, agent=self._id), plot=action.plot, member=member, agent=self._id)
                 case Known():
                     asked.answer(action, agent=self._id)
                 case _:
                     self._perform([action])
+
+    def _tell_members(self, topic: Topic, message: Table | Stored) -> None:
+        """Tell the other members of a plot, each by itself."""
+        for member in self.core.plots.members(message.plot):
+            if member != self._id:
+                self._bus.publish(topic, message, plot=message.plot, member=member, agent=self._id)
 
     def _perform(self, actions: Sequence[Action]) -> None:
         for action in actions:
@@ -200,16 +214,15 @@ class RightOfWaySync:
                 case Granted():
                     self._bus.publish(GRANTED, action, plot=action.plot, host=action.host, agent=self._id)
                 case Table():
-                    self._bus.publish(TABLE, action, plot=action.plot, agent=self._id)
+                    self._tell_members(TABLE, action)
                 case Stored():
-                    self._bus.publish(STORED, action, plot=action.plot, agent=self._id)
+                    self._tell_members(STORED, action)
                 case AskPromises(plot, epoch, members):
                     for member in members:
                         tag = f"promise-{plot}-{epoch}"
                         claim = Claim(epoch=epoch)
-                        self._bus.ask(
-                            TABLE, claim, self._post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, plot=plot, agent=member
-                        )
+                        seats: dict[str, str | int] = {"plot": plot, "member": self._id, "agent": member}
+                        self._bus.ask(TABLE, claim, self._post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
                         self._refused.add(text)

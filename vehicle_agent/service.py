@@ -18,6 +18,7 @@ from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
+from swarm.config.plugin_names import assignment_key
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
 from swarm.plugins.find import named_plugin
@@ -32,7 +33,7 @@ from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.messages.vehicles import Followed, SharedCosts, VehicleState
 from swarm.wire.topics import (
     BODY,
     CHASERS,
@@ -43,11 +44,12 @@ from swarm.wire.topics import (
     POSE,
     PUSHED_ROUTE,
     ROUTE,
+    SHARED_COSTS,
     SIGHTED,
     TRUE_POSE,
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes
-from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of
+from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
@@ -55,6 +57,7 @@ from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
 from vehicle_agent.fleet import FleetReport, directions_of
+from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
@@ -129,12 +132,22 @@ class AgentService:
         )
         bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)
-        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed)
-        assigner = assigner_of(named_plugin(scenario, "vehicles.assignment"), assigned, self._faults.append)
+        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed, plan.group.pursuers)
+        named = named_plugin(scenario, assignment_key(scenario, group))
+        assigner = assigner_of(named, assigned, self._faults.append)
+        self._group_costs = GroupCosts(self._author, group, setup.id) if shares_costs(assigner) else None
         driven = DynamicsWorld(setup.id, grid, scenario.seed)
         dynamics = dynamics_of(named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append)
         self._agent = Agent(
-            plan, scenario, local, sensor, self._right_of_way.core.holdings, bodies, assigner, dynamics
+            plan,
+            scenario,
+            local,
+            sensor,
+            self._right_of_way.core.holdings,
+            bodies,
+            assigner,
+            dynamics,
+            self._group_costs,
         )
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
@@ -178,6 +191,8 @@ class AgentService:
             for target in sorted(self._untracked.targets):
                 self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.collect(PUSHED_ROUTE, agent=self._setup.id)
+        if self._group_costs is not None:
+            self._bus.collect(SHARED_COSTS, group=self._agent.plan.group.name)
         self._right_of_way.start(now_ns)
         self._bus.serve(LEAVE, self._post, agent=self._setup.id)
 
@@ -206,7 +221,9 @@ class AgentService:
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
                 agent.routes_ended(_number(tag), now_ns)
             case AskEnded(tag=tag, topic=topic) if topic is COST:
-                agent.costs_ended(_number(tag), now_ns)
+                told = agent.costs_ended(_number(tag), now_ns)
+                if told is not None:
+                    self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
             case Appeared(peer):
                 self._roster.appeared(peer)
                 agent.set_planners(self._planners(), now_ns)
@@ -225,6 +242,10 @@ class AgentService:
         self._sync.tick(now_ns)
         agent = self._agent
         self._hear_pushed(now_ns)
+        if self._group_costs is not None:
+            for heard in self._bus.collected(SHARED_COSTS):
+                assert isinstance(heard.message, SharedCosts)
+                agent.hear_costs(heard.message, now_ns)
         self._right_of_way.hear_granted(now_ns)
         if self._entering is not None:
             self._entering.tick(self._right_of_way.core.informed, now_ns)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import shown
-from swarm.config.scenario import Scenario, TargetConfig
+from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
 from swarm.config.values import Assigner, Dynamics, Sensor, Strategy, Walk
 from swarm.errors import ConfigError
 
@@ -97,11 +97,27 @@ def plugins_of(scenario: Scenario) -> list[NamedPlugin]:
     return [
         NamedPlugin(sensor, "vehicles.sensor", vehicles.sensor, vehicles.sensor_options),
         NamedPlugin(assignment, "vehicles.assignment", vehicles.assignment, vehicles.assignment_options),
+        *(
+            _assignment_named_by(group.assignment, f"groups[{n}].assignment", vehicles)
+            for n, group in enumerate(scenario.groups)
+            if group.assignment is not None
+        ),
         NamedPlugin(dynamics, "vehicles.dynamics", vehicles.dynamics, vehicles.dynamics_options),
         NamedPlugin(strategy, "planner.strategy", planner.strategy, planner.strategy_options),
         *(walk_named_by(target, f"targets[{n}].walk") for n, target in enumerate(scenario.targets)),
         *cost_layers_of(scenario),
     ]
+
+
+def assignment_key(scenario: Scenario, group: str) -> str:
+    """The key that says which assigner a group has: its own, or that of all vehicles."""
+    own = next((n for n, each in enumerate(scenario.groups) if each.name == group and each.assignment), None)
+    return "vehicles.assignment" if own is None else f"groups[{own}].assignment"
+
+
+def _assignment_named_by(name: str, key: str, vehicles: VehicleConfig) -> NamedPlugin:
+    kind = PLUGIN_KINDS["assignment"]
+    return NamedPlugin(kind, key, name, {} if name in kind.built_in else vehicles.assignment_options)
 
 
 def walk_named_by(target: TargetConfig, key: str) -> NamedPlugin:

@@ -95,6 +95,10 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     cells     explicit places for the first vehicles: [row, col], or as `start` of targets
     reads     groups whose marks and positions its vehicles take in, besides their own; "*" is all
     writes    groups that may take in its marks and positions; both must agree
+
+    assignment  which vehicle goes for which target: as `vehicles.assignment`, which counts if this is not given; a
+                plug-in takes `vehicles.assignment_options`
+    pursuers    balanced: so many vehicles each target gets first, those which together are the quickest there
     """
 
     name: Name = "all"
@@ -104,6 +108,8 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     cells: tuple[tuple[int, int] | PlaceText, ...] = ()
     reads: tuple[GroupName, ...] = ("*",)
     writes: tuple[GroupName, ...] = ("*",)
+    assignment: Annotated[str, plugin_name(Assigner)] | None = None
+    pursuers: Annotated[int, Meta(ge=1, le=16)] = 1
 
 
 class VehicleConfig(Section, frozen=True, kw_only=True):
@@ -118,7 +124,9 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     reassign_s          how often a vehicle asks which target is the cheapest
     sensor              truth: sees the true ground within `sense_range_m`; or a plug-in
     sensor_options      what a plug-in for `sensor` takes
-    assignment          spread: the cheapest pairs first, to each target an even share of the vehicles; or a plug-in
+    assignment          spread: the cheapest pairs first, to each target an even share of an agent's vehicles;
+                        cheapest: each vehicle the target that it reaches first; balanced: every target first gets
+                        its pursuers out of the whole group, all others go for the cheapest; or a plug-in
     assignment_options  what a plug-in for `assignment` takes
     dynamics            ground: vehicles are as fast as the ground allows; or a plug-in, which only slows
     dynamics_options    what a plug-in for `dynamics` takes

@@ -44,7 +44,7 @@ Walk = Literal["still", "random", "waypoints", "evade", "external"]
 
 Sensor = Literal["truth"]
 
-Assigner = Literal["spread"]
+Assigner = Literal["spread", "cheapest", "balanced"]
 
 Dynamics = Literal["ground"]
 

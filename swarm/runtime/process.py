@@ -22,6 +22,7 @@ from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.own_usage import OwnUsage
 from swarm.runtime.stats import ENDED, Counters
+from swarm.runtime.turns import Turns
 
 log = logging.getLogger(__name__)
 
@@ -58,10 +59,14 @@ class Service(Protocol):
 
 class ThreadWorker:
     """A `Worker` on one thread. Kernels release the interpreter's lock, so the process goes on meanwhile. An error
-    in a job is raised in the process's own thread, by its next `take`."""
+    in a job is raised in the process's own thread, by its next `take`.
 
-    def __init__(self, name: str, inbox: Inbox) -> None:
+    turns  in which long jobs of this machine are run; each at once if not given
+    """
+
+    def __init__(self, name: str, inbox: Inbox, turns: Turns | None = None) -> None:
         self._inbox = inbox
+        self._turns = turns or Turns(None)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         """What is to be run; None ends the thread."""
         self._closed = False
@@ -71,8 +76,9 @@ class ThreadWorker:
 
     def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
         def run() -> None:
-            began_ns = time.thread_time_ns()
-            result = job()
+            with self._turns.one(model_ns):
+                began_ns = time.thread_time_ns()
+                result = job()
             post(WorkDone(tag, result, time.thread_time_ns() - began_ns))
 
         self._jobs.put(run)

@@ -29,7 +29,7 @@ from swarm.wire.messages.planning import (
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.messages.vehicles import Chasers, Fleet, Followed
+from swarm.wire.messages.vehicles import Chasers, Fleet, Followed, SharedCosts
 
 
 class Priority(Enum):
@@ -195,6 +195,12 @@ CHASERS = Topic(
     "when a vehicle takes or leaves the target or has driven past the cell told; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
 )  # fmt: skip
+SHARED_COSTS = Topic(
+    "shared-costs", "costs/{group}/{author}", SharedCosts,
+    "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
+    "only where `groups[].assignment` asks for it",
+    access(put="agent:author", hear="agent"), echoed=False,
+)  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
@@ -203,10 +209,10 @@ STANDING = Topic(
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
-    "table", "table/{plot}/{agent}", Table,
-    "which cells the warden of a plot has granted, for its members; a member that is asked promises an epoch and "
-    "answers with what it has stored", "on change, at least 5 Hz where vehicles are",
-    access(put="agent:agent", serve="agent:agent", ask="agent", hear="agent"),
+    "table", "table/{plot}/{member}/{agent}", Table,
+    "which cells the warden of a plot has granted, for one of its members; a member that is asked promises an "
+    "epoch and answers with what it has stored", "on change, at least 5 Hz where vehicles are",
+    access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
     request=Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 GRANTED = Topic(
@@ -215,9 +221,9 @@ GRANTED = Topic(
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
+    "stored", "stored/{plot}/{member}/{agent}", Stored, "which table a member has on file, for another one",
     "per table by one member, 5 Hz by the other",
-    access(put="agent:agent", hear="agent"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", Known, "what an agent has on file about another, or a guest, for a new life of that",
@@ -319,9 +325,9 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, LEAVE,
-    FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS,
-    OBEYED, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER,
+    ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

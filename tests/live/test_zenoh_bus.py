@@ -360,16 +360,16 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     listening = thief.declare_subscriber("swarm/stored/**", said.append)
     hears.subscribe(STORED, heard)
     world.settle()
-    ours.publish(STORED, stored(), plot=0, agent="a0")
+    ours.publish(STORED, stored(), plot=0, member="a1", agent="a0")
     world.until(lambda: said and heard)
     put = (said[0].payload.to_bytes(), said[0].attachment.to_bytes())
-    thief.put("swarm/stored/0/a1", put[0], attachment=put[1])
-    thief.put("swarm/stored/0/a0", put[0], attachment=put[1])
+    thief.put("swarm/stored/0/a1/a2", put[0], attachment=put[1])
+    thief.put("swarm/stored/0/a1/a0", put[0], attachment=put[1])
     world.until(lambda: len(heard) == 2)  # a repetition is nothing new
     assert hears.counts["payloads_dropped"] == 1
     listening.undeclare()
 
-    hears.serve(TABLE, answering((table(), {})), plot=0, agent="a0")
+    hears.serve(TABLE, answering((table(), {})), plot=0, member="a1", agent="a0")
     world.settle()
     questions = []
 
@@ -377,22 +377,22 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
         questions.append((query.payload.to_bytes(), query.attachment.to_bytes()))
         query.drop()
 
-    spy = thief.declare_queryable("swarm/table/0/a0", note_question)
+    spy = thief.declare_queryable("swarm/table/0/a1/a0", note_question)
     world.settle()
-    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, agent="a0").of(Replied)) == 1
-    answers = thief.get("swarm/table/0/a0", payload=questions[0][0], attachment=questions[0][1])
+    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0").of(Replied)) == 1
+    answers = thief.get("swarm/table/0/a1/a0", payload=questions[0][0], attachment=questions[0][1])
     [answer] = [reply.ok for reply in answers if reply.ok is not None]
     spy.undeclare()
     hears.close()
 
     def again(query):
-        query.reply("swarm/table/0/a0", answer.payload.to_bytes(), attachment=answer.attachment.to_bytes())
+        query.reply("swarm/table/0/a1/a0", answer.payload.to_bytes(), attachment=answer.attachment.to_bytes())
         query.drop()
 
-    spy = thief.declare_queryable("swarm/table/0/a0", again)
+    spy = thief.declare_queryable("swarm/table/0/a1/a0", again)
     world.settle()
-    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, agent="a0").of(Replied)) == 1
-    assert asked(world, ours, TABLE, Claim(epoch=6), plot=0, agent="a0").of(Replied) == []
+    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, member="a1", agent="a0").of(Replied)) == 1
+    assert asked(world, ours, TABLE, Claim(epoch=6), plot=0, member="a1", agent="a0").of(Replied) == []
     spy.undeclare()
 
 

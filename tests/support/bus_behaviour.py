@@ -50,8 +50,8 @@ def test_a_process_does_not_hear_itself_where_the_topic_says_so(world: World):
     b.subscribe(STORED, others, plot=1)
     world.settle()
     stored = Stored(plot=1, agent="a0", epoch=3, seq=4)
-    a.publish(STORED, stored, plot=1, agent="a0")
-    b.publish(STORED, stored, plot=1, agent="a0")
+    a.publish(STORED, stored, plot=1, member="a1", agent="a0")
+    b.publish(STORED, stored, plot=1, member="a1", agent="a0")
     world.until(lambda: own and others)
     world.settle()
     assert [[event.message for event in box] for box in (own, others)] == [[stored], [stored]]

@@ -43,6 +43,7 @@ from swarm.wire.messages.vehicles import (
     Chasers,
     Fleet,
     Followed,
+    SharedCosts,
     VehicleState,
 )
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
@@ -153,6 +154,25 @@ def chasers(draw: st.DrawFn) -> Chasers:
 
 
 @st.composite
+def shared_costs(draw: st.DrawFn) -> SharedCosts:
+    agent, group = draw(st.sampled_from(["a0", "a1"])), draw(st.sampled_from(["all", "north"]))
+    named, target_ids = draw(st.integers(0, 4)), draw(st.lists(ids, max_size=4, unique=True))
+    many = named * len(target_ids)
+    costs_s = draw(st.lists(st.floats(0, width=32), min_size=many, max_size=many))
+    return SharedCosts(
+        author=f"{group}.{agent}.7",
+        group=group,
+        stamp_ns=draw(naturals),
+        ids=[f"{agent}-{n:02d}" for n in range(named)],
+        target_ids=target_ids,
+        costs_s=pack_column(costs_s, "<f4"),
+        targets=bytes(
+            draw(st.lists(st.sampled_from([*range(len(target_ids)), NO_TARGET]), min_size=named, max_size=named))
+        ),
+    )
+
+
+@st.composite
 def route_requests(draw: st.DrawFn) -> RouteRequest:
     asked = draw(st.lists(cells, max_size=5))
     place = draw(st.none() | st.tuples(cells, cells))
@@ -202,6 +222,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     BaseMapTile: st.builds(BaseMapTile, layer=texts, region=regions, data=st.binary(max_size=50)),
     Fleet: fleets(),
     Chasers: chasers(),
+    SharedCosts: shared_costs(),
     Standing: st.builds(
         Standing, plot=plots, agent=ids, life=naturals, seq=naturals, knows=stamps,
         vehicles=st.lists(stands, max_size=3), dead=st.lists(naturals, max_size=2), ended=st.booleans(),
@@ -349,6 +370,10 @@ EXAMPLES: tuple[Message, ...] = (
         targets=bytes([0, NO_TARGET]),
     ),
     Chasers(target="t0", author="a0.7", stamp_ns=10, ids=["a0-00"], cells=pack_column([4], "<u4")),
+    SharedCosts(
+        author="all.a0.7", group="all", stamp_ns=10, ids=["a0-00"], target_ids=["t0", "t1"],
+        costs_s=pack_column([90.0, math.inf], "<f4"), targets=bytes([0]),
+    ),
     Standing(
         plot=0, agent="a0", life=1 << 32, seq=9, knows=(3, 17), dead=[5],
         vehicles=[Stand("a0-00", 4, 5, [4, 5], [6], [], 0, 1200)],

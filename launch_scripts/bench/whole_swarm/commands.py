@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts.bench.options import AsJson, Seed, names_of, numbers_of
+from launch_scripts.bench.options import AsJson, Picture, Seed, check_picture, names_of, numbers_of
 from launch_scripts.bench.show import progress_of, show
 from swarm.errors import ConfigError
 
@@ -88,6 +88,55 @@ def swarm(
         command = " ".join(["swarm bench swarm", *words, *(["--simulated"] if simulated else [])])
         write_sizes(write, report, command)
     _exit_if(bool(broken(report)))
+
+
+@app.command()
+def assignment(
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="The seeds A to B - 1.")] = "0:20",
+    rows: Annotated[str, typer.Option(help="Which of the five chases, several with commas.")] = "1,2,3,4,5",
+    per_agent: Annotated[int, typer.Option(min=1, max=1000, help="Vehicles that an agent hosts.")] = 25,
+    alone: Annotated[bool, typer.Option("--alone", help="And each target as if it were alone.")] = False,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="The scenario `clustered` instead, as `swarm simulate` runs it.")
+    ] = False,
+    picture: Picture = None,
+    as_json: AsJson = False,
+) -> None:
+    """How soon targets are captured, by each rule that says which vehicle chases which. Some six minutes.
+
+    \b
+    swarm bench assignment
+    swarm bench assignment --rows 1,3 --seeds 0:5 --picture sharing.png
+    swarm bench assignment --simulated --seeds 7:8
+
+    Chases on the demo's terrain in cells of 150 m, without messages and traffic: 20 vehicles that start
+    clustered after 5 targets, 100 after 10, 20 after 5 that evade and of which each needs 3; and the first two from
+    starts all over the map. A target that is captured is gone. Every rule meets the same starts and targets. With
+    --alone also how soon all vehicles together would capture each target if it were the only one: near what any
+    rule can reach. The picture is of the first chase, of the first seed.
+    """
+    from launch_scripts.bench.assignment import ROWS, World, run, run_simulated, tables
+    from launch_scripts.simulation.campaign import parse_seeds
+
+    some = parse_seeds(seeds)
+    numbers = numbers_of(rows, "rows")
+    if max(numbers) > len(ROWS):
+        raise ConfigError(f"--rows is {rows!r}, expected numbers of 1 to {len(ROWS)}")
+    check_picture(picture)
+    chosen = [ROWS[n - 1] for n in numbers]
+    if simulated:
+        with progress_of("assignment") as progress:
+            report = run_simulated(some, progress)
+        show(report, as_json)
+        return
+    world = World(per_agent)
+    if picture is not None:
+        from launch_scripts.bench.assignment_picture import save_chases
+
+        save_chases(world, chosen[0], some.start, picture)
+    with progress_of("assignment") as progress:
+        report = run(world, chosen, some, alone, progress)
+    show(report, as_json, tables)
 
 
 @app.command()

@@ -19,6 +19,7 @@ from swarm.wire.fields import (
     Region,
     StampNs,
     VehicleId,
+    check_column,
 )
 from swarm.wire.fields import column as column
 from swarm.wire.fields import pack_column as pack_column
@@ -96,6 +97,46 @@ class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
     stamp_ns: StampNs
     ids: Annotated[list[VehicleId], SMALL]
     cells: Annotated[bytes, Column("<u4", per="ids")]
+
+
+MOST_SHARED_TARGETS = 64
+"""Targets of a group that is shared out; those of the lowest ids where there are more."""
+
+
+class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-costs")):
+    """What the vehicles of one agent need to each target, for the other agents of their group. The newest replaces
+    the older.
+
+    costs_s  float32 per vehicle and target, the targets of one vehicle side by side; inf where there is no way
+    targets  uint8   the one that each vehicle chases, as an index into target_ids, NO_TARGET for none of these
+    """
+
+    author: Id
+    group: Id
+    stamp_ns: StampNs
+    ids: Annotated[list[VehicleId], SMALL]
+    target_ids: Annotated[list[Id], Meta(max_length=MOST_SHARED_TARGETS)]
+    costs_s: Annotated[bytes, Column("<f4", least=0, most=math.inf)]
+    targets: Annotated[bytes, Column("<u1", per="ids")]
+
+    @property
+    def agent(self) -> str:
+        """Id of the agent: an author is named after its group, its agent and its incarnation."""
+        return self.author.removeprefix(f"{self.group}.").rpartition(".")[0]
+
+    def relate(self) -> None:
+        if not self.author.startswith(f"{self.group}.") or not self.agent:
+            raise ValueError(f"author {self.author!r} is no agent of the group {self.group!r}")
+        check_column("costs_s", self.costs_s, 4, len(self.ids) * len(self.target_ids))
+        prefix = f"{self.agent}-"
+        strange = next((id for id in self.ids if not id.startswith(prefix)), None)
+        if strange is not None:
+            raise ValueError(f"vehicle {strange!r} is none of agent {self.agent}")
+        for name, told in (("ids", self.ids), ("target_ids", self.target_ids)):
+            if len(set(told)) < len(told):
+                raise ValueError(f"{name} has one twice")
+        if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):
+            raise ValueError("a target index points past target_ids")
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):

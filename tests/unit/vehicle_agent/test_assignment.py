@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.plugins.find import Plugin
-from vehicle_agent.assignment import HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
+from vehicle_agent.assignment import AssignmentWorld, CostTable, assigner_of
+from vehicle_agent.matching import HYSTERESIS, spread
 
 
 @st.composite
