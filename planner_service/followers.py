@@ -80,6 +80,9 @@ class Followers:
     def ids(self) -> Iterable[str]:
         return self._by_id.keys()
 
+    def all_items(self) -> Iterable[tuple[str, Follower]]:
+        return self._by_id.items()
+
     @property
     def cells(self) -> NDArray[np.int64]:
         """Where they all are."""

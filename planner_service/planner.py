@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from planner_service.actions import Action, FindStrides, GrowTree, Refusal
 from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
+from planner_service.search.lookout import Hidden, Lookout, is_place
+from planner_service.search.searcher import Searcher
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
@@ -44,6 +48,7 @@ GOOD_GAP = 1.05
 good already."""
 
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
+SEARCH_COUNTS = ("searches", "search_places")
 
 
 class Planner:
@@ -58,6 +63,7 @@ class Planner:
     shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     time_scale      seconds on the terrain per second: by it a target is taken for teleported
+    hidden          of a target that only vehicles see: it is searched for while nobody does
     """
 
     def __init__(
@@ -75,6 +81,7 @@ class Planner:
         shelf: StrideShelf | None = None,
         leads: bool = True,
         time_scale: float = 1.0,
+        hidden: Hidden | None = None,
     ) -> None:
         self.target = target
         self.leads = leads
@@ -111,7 +118,13 @@ class Planner:
         self._growth_ms = 0.0
         self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
         self._status_due_ns = 0
-        for name in COUNTS:
+        self.lookout: Lookout | None = None
+        """None for a target that has a tracker."""
+        if hidden is not None:
+            seed = f"{hidden.seed}/{incarnation}"
+            searcher = Searcher(tree.cost_grid, hidden.sense_range_m, hidden.slowness, seed)
+            self.lookout = Lookout(hidden, searcher, time_scale)
+        for name in COUNTS if hidden is None else COUNTS + SEARCH_COUNTS:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
@@ -151,6 +164,7 @@ class Planner:
     def tick(self, now_ns: int) -> list[Action]:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
         actions = self._keep_up(now_ns)
+        self._look_out(now_ns)
         if self.tree.ready and self.tree.wants_strides:
             actions.append(FindStrides(self.tree.stride_job(self._shelf)))
         self.followers.drop_silent(now_ns)
@@ -210,6 +224,8 @@ class Planner:
         """Take in the newest pose and all map changes since the last time, if there are any."""
         pose = self._watch.pose
         if pose is None:
+            if self._is_searching and self.tree.map_version != self._cost_map.version:
+                self._learn_map()
             return []  # the first growth takes the map as it is then, whatever changed before
         now_known = (pose.cell, self._cost_map.version)
         self.tree.times.note_tick(self._told is not None and pose.cell != self._told[0])
@@ -218,6 +234,27 @@ class Planner:
         if self._wants_full and self._growing_since_ns is None:
             return [self._grow(now_ns)]
         return []
+
+    @property
+    def _is_searching(self) -> bool:
+        return self.lookout is not None and self.lookout.active
+
+    def _look_out(self, now_ns: int) -> None:
+        """Search for the target while nobody sees it."""
+        lookout, pose, grid = self.lookout, self._watch.pose, self._grid
+        if lookout is None:
+            return
+        if self.tree.map_version < 0:
+            self._learn_map()
+        place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
+        age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
+        lookout.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
+        self.counters.counts["searches"] = lookout.searches
+        self.counters.counts["search_places"] = lookout.searcher.decisions
+
+    def _learn_map(self) -> None:
+        """Take in the map without a target to lead to."""
+        self.tree.update(self._cost_map.pace_s_per_m, -1, self._take_dirty(), self._cost_map.version)
 
     def _take_in(self, news: tuple[int, int], now_ns: int) -> None:
         dirty = self._take_dirty()
@@ -285,11 +322,14 @@ class Planner:
         cells = self._cells(request)
         most = MOST_STEPS // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
-        routes = self.tree.routes(cells, max_cells)
-        if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
+        if self.lookout is not None and self.lookout.active:
+            routes = self.lookout.routes(cells, request.vehicles, max_cells, self.tree.map_version)
+        else:
             routes = self.tree.routes(cells, max_cells)
+            if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
+                routes = self.tree.routes(cells, max_cells)
+            self._certify(routes, now_ns)
         self.counters.count("routes_served", len(routes))
-        self._certify(routes, now_ns)
         for index, vehicle in enumerate(request.vehicles):
             self.followers.given(vehicle, routes[index], request.max_cells, now_ns, now_ns + self._push_ns)
         return RouteReply(
@@ -338,13 +378,17 @@ class Planner:
     def _costs(self, request: CostRequest, now_ns: int) -> CostReply:
         cells = self._cells(request)
         self.counters.count("costs_served", len(cells))
+        costs_s = self.tree.cost_to_go_at(cells)
+        if self.lookout is not None and self.lookout.active:
+            on_map = [0 <= cell < self._grid.cells and self.tree.cost_grid.passable(cell) for cell in cells]
+            costs_s = self.lookout.costs_s(costs_s, np.array(on_map, np.bool_))
         return CostReply(
             target=self.target,
             incarnation=self._incarnation,
             target_cell=self.tree.target_cell,
             map_version=max(self.tree.map_version, 0),
             tree_age_ms=self._age_ms(now_ns),
-            cost_to_go_s=pack_column(self.tree.cost_to_go_at(cells), "<f4"),
+            cost_to_go_s=pack_column(costs_s, "<f4"),
             pose_age_s=self._watch.age_s(now_ns),
             tracker_lost=self._watch.lost(now_ns),
         )
@@ -363,6 +407,8 @@ class Planner:
 
     def _pushes(self, now_ns: int) -> list[Action]:
         """Newer routes for followers which a change concerns and which have not had one for a while."""
+        if self._is_searching:
+            return self._places_to_push(now_ns)
         target_cell = self.tree.target_cell
         if not self.tree.ready or target_cell is None:
             return []
@@ -379,6 +425,25 @@ class Planner:
                     continue
                 self.followers.sent(follower, route, now_ns + self._push_ns)
                 pushes.append(self._pushed(id, route, target_cell))
+        self.counters.count("pushes", len(pushes))
+        return pushes
+
+    def _places_to_push(self, now_ns: int) -> list[Action]:
+        """Other places for vehicles whose own is not worth the way any more, and for those which still follow a
+        route to where the target was."""
+        assert self.lookout is not None
+        searcher, pushes = self.lookout.searcher, list[Action]()
+        searcher.forget_all_but(self.followers.ids())
+        for id, follower in self.followers.all_items():
+            if not searcher.may_decide:
+                break
+            if not searcher.wants_place(id) or now_ns < follower.push_ns:
+                continue
+            route = searcher.route(id, follower.cell, follower.max_cells, self.tree.map_version)[0]
+            follower.push_ns = now_ns + self._push_ns
+            if is_place(route):
+                self.followers.sent(follower, route, now_ns + self._push_ns)
+                pushes.append(self._pushed(id, route, searcher.goals[id]))
         self.counters.count("pushes", len(pushes))
         return pushes
 

@@ -10,10 +10,12 @@ from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
+from planner_service.search.lookout import hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.strides import StrideSearch
 from shared_map.cost_map import CostMap
+from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
@@ -31,12 +33,14 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.topics import CHASERS, COST, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.messages.vehicles import Chasers, Fleet
+from swarm.wire.topics import CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
 _GROW, _SEARCH = "grow-tree", "find-strides"
+_PRESENCE_NS = 5 * NS_PER_S
+"""A vehicle of which nothing was heard for so long sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
 """A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
 
@@ -74,6 +78,8 @@ class PlannerService:
         filter = MarkFilter(terrain.grid, self._heard_groups)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
+        self._presence = Presence(terrain.grid, _PRESENCE_NS, scenario.vehicles.sense_range_m, filter)
+        """Who looks where; nothing is heard of it for a target that has a tracker."""
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._faults: list[str] = []
@@ -103,6 +109,7 @@ class PlannerService:
             shelf=prepared,
             leads=False,
             time_scale=scenario.time_scale,
+            hidden=hidden_target(scenario, self._target) if self._untracked else None,
         )
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version = 0
@@ -122,6 +129,7 @@ class PlannerService:
         self._sync.start(now_ns)
         if self._untracked:
             self._bus.subscribe(SIGHTED, self._post, target=self._target)
+            self._bus.collect(FLEET)
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
@@ -162,6 +170,7 @@ class PlannerService:
             self._planner.hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
+        self._look(now_ns)
         self._obey()
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
         self._perform(self._planner.tick(now_ns), now_ns)
@@ -178,6 +187,18 @@ class PlannerService:
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
         self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
+
+    def _look(self, now_ns: int) -> None:
+        """Take in where vehicles are, who would see a target that nobody tracks."""
+        lookout = self._planner.lookout
+        if lookout is None:
+            return
+        for heard in self._bus.collected(FLEET):
+            assert isinstance(heard.message, Fleet)
+            self._presence.hear(heard.message, now_ns)
+        self._presence.expire(now_ns)
+        vehicles = self._presence.vehicles
+        lookout.hear_vehicles(vehicles.east_m, vehicles.south_m)
 
     def _answer(self, now_ns: int) -> None:
         """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""
@@ -207,6 +228,8 @@ class PlannerService:
             if heard != self._heard_groups:
                 self._heard_groups = heard
                 self._replica.hear(heard)
+        if self._planner.lookout is not None:
+            self._planner.lookout.time_scale = book.setting("time_scale", scenario.time_scale)
         self._planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
             book.setting("planner.push_s", scenario.planner.push_s),

@@ -87,6 +87,11 @@ class TargetTree:
         self._is_better_bound = False
 
     @property
+    def cost_grid(self) -> CostGrid:
+        """The cell costs of the map as it was last told; its owner is this tree."""
+        return self._costs
+
+    @property
     def strategy(self) -> StrategyRow:
         """The row in force now; it changes with `observe_full_ns`, as under `auto`."""
         row = self.times.row

@@ -115,6 +115,8 @@ class Agent:
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
         self._empty = EmptyPlaces(self._trackings)
+        self._unseen: set[str] = set()
+        """Targets which nobody sees: their planners say where to look."""
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         assigner, stagger = assigner or Spread(), chance.random()
@@ -267,6 +269,9 @@ class Agent:
         ):
             self._assignment.ask_soon(now_ns)
         lost = self._trackings.lost(now_ns) | self._empty.of
+        for target in self._empty.unseen(lost) - self._unseen:
+            self._unseen.add(target)
+            del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
         for vehicle in self.vehicles.values():
@@ -352,7 +357,9 @@ class Agent:
     def _moved(self, pose: TargetPose, now_ns: int) -> None:
         known = self._poses.get(pose.target)
         self._poses[pose.target] = pose
-        if known is not None and pose.jumps != known.jumps:
+        found = pose.target in self._unseen
+        self._unseen.discard(pose.target)
+        if found or (known is not None and pose.jumps != known.jumps):
             for vehicle in self.vehicles.values():
                 if vehicle.target == pose.target:
                     self._check_reach(vehicle)
@@ -411,7 +418,12 @@ class Agent:
         return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
 
     def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
-        if route.status is not RouteStatus.OK:
+        searching = route.status is RouteStatus.SEARCHING
+        if searching and not math.isfinite(route.cost_s):
+            if not pushed:
+                vehicle.no_answer(now_ns)
+            return []
+        if route.status is not RouteStatus.OK and not searching:
             if not pushed:
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
@@ -422,7 +434,7 @@ class Agent:
                 vehicle.no_answer(now_ns)
             return []
         partial = route.remaining_s > 0.0
-        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed)
+        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching)
         path = self.holdings.path(vehicle.id)
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:

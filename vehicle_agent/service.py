@@ -214,8 +214,10 @@ class AgentService:
                 self.counters.observe("route_query_ms", took_s * 1e3)
                 self.counters.count("routes_received", len(reply.routes))
                 self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
-            case Replied(tag=tag, message=CostReply() as reply) if reply.target_cell is not None:
-                agent.costs_given(_number(tag), reply.target, column(reply.cost_to_go_s, "<f4"))
+            case Replied(tag=tag, message=CostReply() as reply):
+                costs_s = column(reply.cost_to_go_s, "<f4")
+                if reply.target_cell is not None or np.isfinite(costs_s).any():  # never seen, and searched for
+                    agent.costs_given(_number(tag), reply.target, costs_s)
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
                 agent.routes_ended(_number(tag), now_ns)
             case AskEnded(tag=tag, topic=topic) if topic is COST:
@@ -414,7 +416,9 @@ class AgentService:
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
-            if 0 < route.lower_bound_s < math.inf:
+            if route.searching:
+                self.counters.count("followed_searching")  # nothing is to be proven of these
+            elif 0 < route.lower_bound_s < math.inf:
                 excess = max(route.cost_s / route.lower_bound_s - 1.0, 0.0)
                 self.counters.observe("followed_gap_excess", excess)
                 self.counters.observe_by(GAPS_TO, route.target, excess)

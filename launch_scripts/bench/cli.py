@@ -438,4 +438,49 @@ def presence(
     show(report, as_json)
 
 
+@app.command()
+def search(
+    scenario: Annotated[Path, typer.Argument(help="Its terrain, sensor range and speeds.")],
+    walks: Annotated[
+        str, typer.Option(help="How the target moves: waypoints, evade, random, still.")
+    ] = "waypoints",
+    strategies: Annotated[str, typer.Option(help="stay, random (within reach), belief.")] = "random,belief",
+    seeds: Annotated[str, typer.Option(help="First and behind the last, as 0:50.")] = "0:10",
+    vehicles: Annotated[int, typer.Option(min=1, help="How many search.")] = 10,
+    lost: Annotated[float, typer.Option(min=0, help="Seconds since the target was seen last.")] = 900.0,
+    hours: Annotated[float, typer.Option(min=0.01, help="Never seen is: not within so long.")] = 3.0,
+    near: Annotated[bool, typer.Option("--near", help="Vehicles start where it was seen last.")] = False,
+    join: Annotated[
+        list[Path] | None, typer.Option(help="Reports (--json) of other seeds to join instead.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Seconds until vehicles see a target again that nobody sees, by how they search.
+
+    \b
+    swarm bench search jacksboro.toml --walks waypoints,evade --seeds 0:50
+    swarm bench search jacksboro.toml --lost 30 --near
+
+    A loop without claims, messages or hidden ground; the search is the planner's.
+    Runs of many seeds may be split: write parts with --json, and join them.
+    """
+    import json
+
+    from launch_scripts.bench.search_times import STRATEGIES, joined, run, tables
+    from launch_scripts.world.walks import WALKS
+    from swarm.config.load import load_scenario
+
+    if join:
+        show(joined([json.loads(path.read_text()) for path in join]), as_json, tables)
+        return
+    first, colon, behind = seeds.partition(":")
+    if not (colon and first.isdigit() and behind.isdigit() and int(first) < int(behind)):
+        raise ConfigError(f"--seeds is {seeds!r}, expected two numbers such as 0:50")
+    chosen = names_of(walks, "walks", tuple(WALKS)), names_of(strategies, "strategies", STRATEGIES)
+    span = range(int(first), int(behind))
+    with progress_of("search") as progress:
+        report = run(load_scenario(scenario), *chosen, span, vehicles, lost, hours, near, progress)
+    show(report, as_json, tables)
+
+
 app.add_typer(whole_swarm.app)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 
-_ROUTED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED})
+_ROUTED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED, VehicleState.SEARCHING})
 _RESTING = frozenset({VehicleState.ARRIVED, VehicleState.STRANDED})
 """A vehicle at its target, or without any way to one, has nowhere to drive."""
 

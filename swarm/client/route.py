@@ -18,8 +18,11 @@ from swarm.wire.routes import RouteStatus
 class Route:
     """A planner's route from a vehicle's cell to its target, or the reason why there is none.
 
+    While nobody sees the target the status is "searching", and the route leads to a place where it may be.
+
     target         id of the target
-    status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target
+    status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target;
+                   searching
     cells          from the vehicle's cell to the target's, or as far as the planner tells
     cost_s         seconds that it takes
     lower_bound_s  proven: no route is quicker on the planner's present map
@@ -41,8 +44,9 @@ class Route:
     @classmethod
     def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
         """A route of an answer, or one that was pushed. Raises ValueError if it leaves the terrain."""
-        ok = route.status is RouteStatus.OK
-        cells = tuple(walk(frame.grid, route.start, route.directions)) if ok else ()
+        searching = route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
+        led = searching or route.status is RouteStatus.OK
+        cells = tuple(walk(frame.grid, route.start, route.directions)) if led else ()
         age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
         return cls(
             frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
@@ -53,6 +57,12 @@ class Route:
     def ok(self) -> bool:
         """Whether there is a way."""
         return self.status == RouteStatus.OK
+
+    @property
+    def searching(self) -> bool:
+        """Whether it leads to a place where the target may be, which nobody sees: at its end ask again. It has no
+        cells while no such place is known yet."""
+        return self.status == RouteStatus.SEARCHING
 
     @property
     def arrived(self) -> bool:
@@ -78,8 +88,10 @@ class Route:
         """Whether it says no more than the rest of the one before, of which the vehicle has driven a part."""
         if (self.status, self.arrived, self.tracker_lost) != (before.status, before.arrived, before.tracker_lost):
             return False
-        if not self.ok or self.cells == before.cells:
+        if not (self.ok or self.searching) or self.cells == before.cells:
             return True
+        if not self.cells:
+            return False
         if self.cells[0] not in before.cells:
             return False
         rest = before.cells[before.cells.index(self.cells[0]) :]

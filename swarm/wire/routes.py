@@ -28,11 +28,14 @@ class RouteStatus(enum.StrEnum):
     LETHAL_START = "lethal_start"
     NO_TARGET = "no_target"
     """The planner does not know yet where the target is, or it stands on a lethal cell or outside."""
+    SEARCHING = "searching"
+    """Nobody sees the target: the route leads to a place where it may be, and nothing is proven of it. At its end
+    ask again. Without steps and with an infinite cost no place has been found yet: ask later."""
 
 
 STATUSES = tuple(RouteStatus)
 """Columns hold the index of a status in this tuple."""
-OK, UNREACHABLE, OUTSIDE, LETHAL_START, NO_TARGET = range(len(STATUSES))
+OK, UNREACHABLE, OUTSIDE, LETHAL_START, NO_TARGET, SEARCHING = range(len(STATUSES))
 
 
 class Route(Bounded, frozen=True, kw_only=True):

@@ -187,7 +187,7 @@ BASE_TILES = Topic(
 )  # fmt: skip
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
-    access(put="agent:author", hear="targets monitor"),
+    access(put="agent:author", hear="targets monitor planner"),
 )  # fmt: skip
 CHASERS = Topic(
     "chasers", "target/{target}/chasers/{author}", Chasers,

@@ -47,6 +47,7 @@ class GivenRoute:
     cost_s         its cost, in seconds
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
+    searching      whether it leads to a place where the target may be, which nobody sees
     """
 
     target: str
@@ -55,6 +56,7 @@ class GivenRoute:
     lower_bound_s: float
     partial: bool
     pushed: bool = False
+    searching: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,7 @@ class Follow:
     cells: tuple[int, ...]
     cost_s: float
     lower_bound_s: float
+    searching: bool = False
 
 
 # --- the core -----------------------------------------------------------------------------------------------
@@ -90,6 +93,7 @@ class Vehicle:
     tracked       whether that target has a tracker that lives; else it was in reach, and may be anywhere
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
     asked         the target of the open route request, None if there is none
+    searching     whether its last route led to a place where its target may be, which nobody sees
     """
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
@@ -103,6 +107,7 @@ class Vehicle:
         self.planner_gone = False
         self.gone_since_ns = 0
         self.asked: str | None = None
+        self.searching = False
         self._need: Reason | None = None
         """Why it needs a route; None if it needs none."""
         self._retry_ns = _RETRY_NS
@@ -123,7 +128,7 @@ class Vehicle:
         self.asked = None
         if target != self.target:
             self.target = target
-            self.in_reach = self.planner_gone = False
+            self.in_reach = self.planner_gone = self.searching = False
         if self.state is VehicleState.IDLE:
             self.state = VehicleState.WAITING
         self._need_route(Reason.ASSIGNED, now_ns)
@@ -131,7 +136,7 @@ class Vehicle:
     def release(self) -> None:
         """Go for no target any more, until another is assigned."""
         self.target = self.asked = self._need = None
-        self.in_reach = self.planner_gone = False
+        self.in_reach = self.planner_gone = self.searching = False
         self.route.drop()
         self.state = VehicleState.IDLE
 
@@ -157,6 +162,7 @@ class Vehicle:
         self.in_reach = in_reach
         if in_reach:
             self._need = None
+            self.searching = False
         self._settle()
 
     def set_tracked(self, tracked: bool) -> None:
@@ -165,6 +171,8 @@ class Vehicle:
         self._settle()
 
     def target_jumped(self, now_ns: int) -> None:
+        """Its target is somewhere else, or is seen again."""
+        self.searching = False
         if self.in_reach:
             self._settle()
         else:
@@ -181,7 +189,8 @@ class Vehicle:
             return None
         if self._need is None and self.state is not VehicleState.STRANDED:
             if self.route.left == 0 and self.motion.at_rest:
-                self._need = Reason.CONTINUED if self.route.partial else Reason.RAN_OUT
+                continues = self.route.partial or self.searching
+                self._need = Reason.CONTINUED if continues else Reason.RAN_OUT
             elif self.route.partial and self.route.left <= PREFETCH_CELLS:
                 self._need = Reason.CONTINUED
             self._settle()
@@ -239,11 +248,12 @@ class Vehicle:
     def _begin(self, given: GivenRoute, path: Sequence[int]) -> Follow:
         self._need = None
         self._retry_ns = _RETRY_NS
+        self.searching = given.searching
         if self.state is VehicleState.STRANDED:
             self.state = VehicleState.FOLLOWING
         (start,) = self.route.near(1)
         driven = (*path[: path.index(start)], start, *self.route.ahead())
-        return Follow(self.id, given.target, driven, given.cost_s, given.lower_bound_s)
+        return Follow(self.id, given.target, driven, given.cost_s, given.lower_bound_s, given.searching)
 
     def _need_route(self, reason: Reason, now_ns: int) -> None:
         self._need = reason
@@ -263,6 +273,8 @@ class Vehicle:
             self.state = VehicleState.ARRIVED if self.tracked else VehicleState.OUTDATED
         elif self.planner_gone:
             self.state = VehicleState.LOST
+        elif self.searching:
+            self.state = VehicleState.SEARCHING
         elif self.route.left:
             self.state = VehicleState.FOLLOWING if self.tracked else VehicleState.OUTDATED
         elif self.state is not VehicleState.STRANDED:

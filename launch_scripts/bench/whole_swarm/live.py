@@ -38,7 +38,7 @@ _TURN_S = 0.2
 _JOINED_WITHIN_S = 30.0
 _ANSWER_S = 10.0
 """How long after the window the client may still wait for an answer."""
-_ANSWERED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED})
+_ANSWERED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED, VehicleState.SEARCHING})
 """States of a vehicle which has a route, needs none, or was told that there is none."""
 _UP = "all processes are alive"
 

@@ -25,7 +25,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
 from swarm.wire.readable import COMPASS, encode_readable
-from swarm.wire.routes import RouteStatus
+from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import COST, ROUTE
 
 if TYPE_CHECKING:
@@ -52,10 +52,16 @@ class Answer:
 
     def path(self) -> list[int]:
         """The cells of the route; none without one."""
-        if isinstance(self.reply, CostReply) or self.reply.routes[0].status is not RouteStatus.OK:
+        if isinstance(self.reply, CostReply) or not _leads(self.reply.routes[0]):
             return []
         (route,) = self.reply.routes
         return walk(self.frame.grid, route.start, route.directions)
+
+
+def _leads(route: Route) -> bool:
+    """Whether there is a way: to the target, or to a place where it is looked for."""
+    searching = route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
+    return searching or route.status is RouteStatus.OK
 
 
 def ask_planner(
@@ -152,18 +158,23 @@ def _show_cost(answer: Answer, reply: CostReply) -> None:
 
 def _show_route(answer: Answer, reply: RouteReply) -> None:
     (found,) = reply.routes
-    if found.status is not RouteStatus.OK:
+    if not _leads(found):
         meaning = {
             RouteStatus.UNREACHABLE: "there is no way from there",
             RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
             RouteStatus.LETHAL_START: "the cell is lethal, no vehicle can stand on it",
             RouteStatus.NO_TARGET: "the planner does not know where its target is",
+            RouteStatus.SEARCHING: "nobody sees the target, and others are told first where to look: ask again",
         }[found.status]
         typer.echo(f"{found.status.value}: {meaning}")
         return
     gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
     typer.echo(f"from {written(answer.frame, answer.start)}")
-    typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")
+    if found.status is RouteStatus.SEARCHING:
+        place = written(answer.frame, answer.path()[-1])
+        typer.echo(f"searching: nobody sees {reply.target}; {place} is a place to look at, in {found.cost_s:.1f} s")
+    else:
+        typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")
     rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
     many = len(found.directions)
     typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")

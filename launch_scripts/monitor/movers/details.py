@@ -23,6 +23,7 @@ _DOES = {
     VehicleState.STRANDED: "stranded",
     VehicleState.LOST: "goes on without its planner",
     VehicleState.OUTDATED: "goes by an old pose",
+    VehicleState.SEARCHING: "looks for its target",
 }
 
 

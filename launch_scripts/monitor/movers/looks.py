@@ -62,6 +62,7 @@ SHADES: dict[VehicleState, Shade] = {
     VehicleState.STRANDED: Shade((0, 0, 0), 0.9, "stranded"),
     VehicleState.LOST: Shade((128, 132, 138), 0.85, "planner or target lost"),
     VehicleState.OUTDATED: Shade((128, 132, 138), 0.85, None),
+    VehicleState.SEARCHING: Shade((255, 255, 255), 0.35, "searches"),
 }
 
 

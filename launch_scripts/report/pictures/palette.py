@@ -22,6 +22,7 @@ STATE_COLOURS = {
     VehicleState.STRANDED: PINK,
     VehicleState.LOST: BLACK,
     VehicleState.OUTDATED: YELLOW,
+    VehicleState.SEARCHING: SKY,
 }
 
 

@@ -47,6 +47,8 @@ class VehicleState(enum.IntEnum):
     """Its planner is gone: keeps the last route it has, and says so."""
     OUTDATED = 6
     """Goes by an old pose: its target's tracker is lost."""
+    SEARCHING = 7
+    """Looks where its target may be, which nobody sees."""
 
 
 NO_TARGET = 255

@@ -97,7 +97,7 @@ COLUMNS = RouteBatch.of([Route(status=RouteStatus.OK, start=5, cost_s=1.0, direc
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"statuses": bytes([5])}, "statuses has 5, expected uint8 of 0 ... 4"),
+        ({"statuses": bytes([9])}, "statuses has 9, expected uint8 of 0 ... 5"),
         ({"statuses": bytes([0, 0])}, "starts has 8 bytes, expected 2 values of 8"),
         ({"starts": np.array([1 << 40]).tobytes()}, "starts has 1099511627776"),
         ({"steps": b"\x02\x00"}, "steps has 2 bytes, expected 1 values of 4"),

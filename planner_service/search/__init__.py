@@ -1,0 +1,1 @@
+"""Where a target may be that nobody sees, and who looks where."""

@@ -1,0 +1,148 @@
+"""When a planner searches for its target, and what it answers meanwhile. Pure: time is an argument."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.search.searcher import OFFSET_S, Searcher
+from shared_map.arrays import Floats
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import Scenario, ids_of
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.routes import Route, RouteBatch, RouteStatus
+
+UNSEEN_NS = 2 * NS_PER_S
+"""A target in sight is told of twice a second: one that is not told of for so long, though a vehicle is where it
+was, is not there."""
+LISTEN_NS = 5 * NS_PER_S
+"""A planner that has just begun listens for so long before it takes its target for never seen."""
+_LONGEST_S = 1e7
+
+
+@dataclass(frozen=True, slots=True)
+class Hidden:
+    """What a planner has to know of a target that only vehicles see.
+
+    sense_range_m    how far they see it
+    capture_range_m  how near captures it
+    slowness         how many times as long as a vehicle it takes for a cell, at least; inf if it stands still
+    jumps            whether it is somewhere else once it is captured
+    seed             of the run and the target
+    """
+
+    sense_range_m: float
+    capture_range_m: float
+    slowness: float
+    jumps: bool
+    seed: str
+
+
+class Lookout:
+    """Begins the search when nobody sees the target, and ends it with a sighting.
+
+    time_scale  seconds on the terrain per second
+    """
+
+    def __init__(self, hidden: Hidden, searcher: Searcher, time_scale: float) -> None:
+        self.searcher = searcher
+        self.time_scale = time_scale
+        self.searches = 0
+        """How often it has begun to."""
+        self._hidden = hidden
+        self._places_m: list[tuple[float, float]] = []
+        self._first_ns: int | None = None
+        self._ticked_ns = 0
+        self._searched: TargetPose | None = None
+        """What was the newest pose when the search began."""
+
+    @property
+    def active(self) -> bool:
+        return self.searcher.active
+
+    def hear_vehicles(self, east_m: Floats, south_m: Floats) -> None:
+        """Where all vehicles are that count, m from the grid's corner."""
+        self._places_m = list(zip(east_m.tolist(), south_m.tolist(), strict=True))
+
+    def tick(
+        self,
+        pose: TargetPose | None,
+        place_m: tuple[float, float],
+        age_ns: int,
+        lost: bool,
+        pace: Floats,
+        now_ns: int,
+    ) -> None:
+        """Begin or end the search if it is time to, and follow what vehicles have looked at.
+
+        pose     the newest; None before the first
+        place_m  its (east, south) from the grid's corner
+        age_ns   time since it was heard; lost: whether it holds no more
+        pace     (rows, cols) float32, the map
+        """
+        if self._first_ns is None:
+            self._first_ns = self._ticked_ns = now_ns
+        elapsed_s = (now_ns - self._ticked_ns) / NS_PER_S * self.time_scale
+        self._ticked_ns = now_ns
+        if self.active and pose is not self._searched:
+            self.searcher.end()
+        if not self.active:
+            nearest_m = min((math.dist(place_m, each) for each in self._places_m), default=math.inf)
+            if self._is_unseen(pose, nearest_m, age_ns, lost, now_ns):
+                caught = self._hidden.jumps and nearest_m <= 2 * self._hidden.capture_range_m
+                cell = None if pose is None or caught else pose.cell
+                age_s = min(age_ns / NS_PER_S * self.time_scale, _LONGEST_S)
+                self.searcher.begin(pace, cell, age_s)
+                self._searched = pose
+                self.searches += self.active
+        self.searcher.tick(elapsed_s, self._places_m)
+
+    def _is_unseen(self, pose: TargetPose | None, nearest_m: float, age_ns: int, lost: bool, now_ns: int) -> bool:
+        if pose is None:
+            assert self._first_ns is not None
+            return now_ns - self._first_ns >= LISTEN_NS
+        look_m = max(self._hidden.sense_range_m / 2, min(self._hidden.capture_range_m, self._hidden.sense_range_m))
+        return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
+
+    def routes(self, cells: Sequence[int], vehicles: Sequence[str], max_cells: int, version: int) -> RouteBatch:
+        """A route to where each is to look, in order."""
+        named: Sequence[str | None] = vehicles or [None] * len(cells)
+        found: list[Route] = []
+        for n, cell in enumerate(cells):
+            vehicle = named[n] if n < len(named) else None
+            found.append(self.searcher.route(vehicle, cell, max_cells, version)[0])
+        return RouteBatch.of(found)
+
+    def costs_s(self, to_last_s: Floats, open_: NDArray[np.bool_]) -> Floats:
+        """float32, s: what it takes to find the target, so that it is compared with others.
+
+        to_last_s  to where it was last; inf where there is no way, or none is known
+        open_      whether the cell asked for can be driven from
+        """
+        known: Floats = np.where(np.isfinite(to_last_s), to_last_s, np.float32(OFFSET_S)) + np.float32(OFFSET_S)
+        costs_s: Floats = np.where(open_, known, np.float32(np.inf)).astype(np.float32)
+        return costs_s
+
+
+def is_place(route: Route) -> bool:
+    """Whether a route leads to a place to look at, which is known."""
+    return route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
+
+
+def hidden_target(scenario: Scenario, target: str) -> Hidden:
+    """What a scenario says of a target that only vehicles see."""
+    config = next(each for each in scenario.targets if target in ids_of(each))
+    speed_m_per_s = config.speed_m_per_s
+    # A target never outruns a vehicle: that of an outside process is taken to be as quick.
+    slowness = math.inf if speed_m_per_s <= 0 else max(1.0, scenario.cost.flat_speed_m_per_s / speed_m_per_s)
+    return Hidden(
+        sense_range_m=scenario.vehicles.sense_range_m,
+        capture_range_m=scenario.vehicles.capture_range_m,
+        slowness=slowness,
+        jumps=config.caught == "jump" and config.is_simulated,
+        seed=f"{scenario.seed}/{target}",
+    )

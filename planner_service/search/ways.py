@@ -1,0 +1,98 @@
+"""Ways from a vehicle to where it is to look, on the cell costs of a planner's tree. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels.layout import NONE
+from planner_service.kernels.route_walk import OK, price_routes
+from planner_service.tree.cost_grid import CostGrid
+from shared_map.arrays import Floats
+from swarm.grid import GridSpec, walk
+from swarm.wire.routes import SEARCHING, RouteBatch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """A whole way.
+
+    cells       from the vehicle to the goal
+    directions  uint8, of the steps between them
+    """
+
+    cells: tuple[int, ...]
+    directions: NDArray[np.uint8]
+
+
+class Ways:
+    """Grows from vehicles' cells. Holds room for one growth, which is made with the first."""
+
+    def __init__(self, costs: CostGrid) -> None:
+        self._costs = costs
+        self._cost: Floats = np.empty(0, np.float32)
+        self._parent: NDArray[np.uint8] = np.empty(0, np.uint8)
+        self._root = -1
+
+    @property
+    def grid(self) -> GridSpec:
+        return self._costs.grid
+
+    def passable(self, cell: int) -> bool:
+        """Whether a vehicle can stand on a cell of the grid."""
+        return self._costs.passable(cell)
+
+    def grow(self, cell: int) -> None:
+        """Find the cheapest ways between a passable cell and all others."""
+        if not self._cost.size:
+            self._cost = np.empty(self._costs.size, np.float32)
+            self._parent = np.empty(self._costs.size, np.uint8)
+        self._parent.fill(NONE)
+        self._costs.grow(self._costs.pad(cell), self._cost, self._parent)
+        self._root = cell
+
+    def costs_s(self, cells: NDArray[np.int64]) -> Floats:
+        """float32, s: between the cell of the last growth and these; inf where there is no way, or for -1."""
+        found: Floats = np.full(cells.shape, np.inf, np.float32)
+        known = cells >= 0
+        found[known] = self._cost[self._costs.pad_all(cells[known])]
+        return found
+
+    def way_to(self, goal: int) -> Way:
+        """The way from the cell of the last growth to one that is not inf by `costs_s`."""
+        start, costs = self._root, self._costs
+        if costs.climbs is not None:  # downhill is not uphill: the way back is another
+            self.grow(goal)
+            directions = self._walked(goal, start)
+        else:
+            back = self._walked(start, goal)
+            directions = (back[::-1] ^ 4).astype(np.uint8)
+        return Way(tuple(walk(self.grid, start, directions.tobytes())), directions)
+
+    def _walked(self, root: int, start: int) -> NDArray[np.uint8]:
+        costs = self._costs
+        starts = np.array([costs.pad(start)], np.int64)
+        return costs.walk(self._parent, costs.pad(root), starts, 0, costs.time_cost).directions
+
+    def route(self, way: Way, at: int, max_cells: int) -> RouteBatch:
+        """The rest of a way from the cell with this number, or its next `max_cells` steps (0 is all), as one route
+        whose status is SEARCHING: nothing is proven of it."""
+        costs = self._costs
+        rest = way.directions[at:]
+        on_way = costs.pad_all(np.array(way.cells[at:], np.int64))
+        parent = self._parent
+        parent.fill(NONE)
+        parent[on_way[:-1]] = rest
+        root, starts = int(on_way[-1]), on_way[:1]
+        walks = costs.walk(parent, root, starts, max_cells, costs.time_cost)
+        rests = costs.rests(parent, root, walks.last, costs.time_cost)
+        statuses, prices = np.array([OK], np.uint8), np.zeros((4, 1))
+        if not price_routes((costs.grid.resolution_m, costs.diagonal), walks[1:], rests, statuses, prices):
+            raise AssertionError("a way does not end at its goal")
+        if not np.isfinite(prices).all():
+            return RouteBatch.none(np.array(way.cells[at : at + 1], np.int64), SEARCHING)
+        statuses[0] = SEARCHING
+        begun = np.array(way.cells[at : at + 1], np.int64)
+        return RouteBatch(statuses, begun, walks.directions, walks.ends, *prices)

@@ -1,0 +1,150 @@
+"""What a search never does, whatever the map, the motion and what is said of vehicles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from planner_service.search.belief import Belief
+from planner_service.search.blocks import blocks_of
+from planner_service.search.searcher import Searcher
+from planner_service.tree.cost_grid import CostGrid
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, walk
+from swarm.wire.routes import RouteStatus
+
+METRES = 10.0
+_SIDES = st.integers(1, 26)
+_SEEDS = st.integers(0, 2**32 - 1)
+_ANY = st.floats(allow_nan=True, allow_infinity=True, width=32)
+_PLACES = st.lists(st.tuples(_ANY | st.floats(-50, 300), _ANY | st.floats(-50, 300)), max_size=6)
+
+
+def _pace(rows: int, cols: int, seed: int) -> NDArray[np.float32]:
+    chance = np.random.default_rng(seed)
+    pace = (0.1 + chance.random((rows, cols))).astype(np.float32)
+    pace[chance.random((rows, cols)) < chance.choice([0.0, 0.2, 0.5])] = np.inf
+    pace[chance.integers(rows), chance.integers(cols)] = 0.3
+    return pace
+
+
+@settings(max_examples=80, deadline=None)
+@given(_SIDES, _SIDES, _SEEDS, st.floats(1, 8) | st.just(math.inf), st.lists(st.tuples(st.floats(0, 400), _PLACES)))
+def test_a_belief_sums_to_one_and_lies_where_the_target_can_be(
+    rows: int, cols: int, seed: int, slowness: float, story: list[tuple[float, list[tuple[float, float]]]]
+) -> None:
+    pace = _pace(rows, cols, seed)
+    blocks = blocks_of(GridSpec(rows, cols, METRES), pace, 30.0)
+    at = tuple(np.argwhere(blocks.open)[seed % int(blocks.open.sum())].tolist())
+    row, col = np.mgrid[: blocks.shape[0], : blocks.shape[1]]
+    arrival_s = np.hypot(row - at[0], col - at[1]) * 20.0
+    belief = Belief(blocks, slowness, at, arrival_s, float(seed % 200))
+    for seconds, places in story[:12]:
+        belief.predict(seconds)
+        belief.seen(places, 30.0)
+        assert (belief.mass >= 0).all()
+        assert abs(float(belief.mass.sum(dtype=np.float64)) - 1.0) < 1e-4
+        assert not belief.total[~belief.reachable].any()
+        assert not belief.total[~blocks.open].any()
+
+
+@settings(max_examples=40, deadline=None)
+@given(_SIDES, _SIDES, _SEEDS)
+def test_what_moves_is_neither_lost_nor_made(rows: int, cols: int, seed: int) -> None:
+    blocks = blocks_of(GridSpec(rows, cols, METRES), _pace(rows, cols, seed), 20.0)
+    belief = Belief(blocks, 2.0)
+    for _ in range(20):
+        belief._drive(belief.step_s)
+    assert abs(float(belief.mass.sum(dtype=np.float64)) - 1.0) < 1e-4
+    assert not belief.total[~blocks.open].any()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(2, 26), st.integers(2, 26), _SEEDS, st.booleans(), _PLACES)
+def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones_again(
+    rows: int, cols: int, seed: int, known: bool, places: list[tuple[float, float]]
+) -> None:
+    pace = _pace(rows, cols, seed)
+    costs = CostGrid(GridSpec(rows, cols, METRES), PlannerConfig())
+    costs.load(pace)
+    chance = np.random.default_rng(seed)
+    open_ = np.flatnonzero(np.isfinite(pace))
+    last = int(chance.choice(open_)) if known else None
+    asked = [int(cell) for cell in chance.integers(-2, rows * cols + 2, 5)]
+    told = []
+    for _ in range(2):
+        searcher = Searcher(costs, 30.0, 3.0, f"{seed}")
+        searcher.begin(pace, last, 60.0)
+        searcher.tick(40.0, places)
+        routes = [searcher.route(f"v{n}", cell, 0, 0)[0] for n, cell in enumerate(asked)]
+        told.append((routes, dict(searcher.goals)))
+    (routes, goals), again = told
+    assert (routes, goals) == again
+    for n, (cell, route) in enumerate(zip(asked, routes, strict=True)):
+        if not 0 <= cell < rows * cols:
+            assert route.status is RouteStatus.OUTSIDE
+        elif np.isinf(pace.reshape(-1)[cell]):
+            assert route.status is RouteStatus.LETHAL_START
+        elif route.status is RouteStatus.SEARCHING:
+            path = walk(costs.grid, route.start, route.directions)
+            assert path[0] == cell
+            assert path[-1] == goals[f"v{n}"] != cell
+            assert np.isfinite(pace.reshape(-1)[path]).all()
+            lengths = [METRES * (math.sqrt(2) if code % 2 else 1.0) for code in route.directions]
+            assert route.cost_s == pytest.approx(float(np.dot(lengths, pace.reshape(-1)[path[1:]])), rel=1e-5)
+            assert route.lower_bound_s == 0
+        else:
+            assert route.status is RouteStatus.UNREACHABLE
+
+
+def test_vehicles_look_at_places_apart_from_each_other() -> None:
+    pace = np.full((200, 200), 0.2, np.float32)
+    costs = CostGrid(GridSpec(200, 200, METRES), PlannerConfig())
+    costs.load(pace)
+    searcher = Searcher(costs, 50.0, 2.0, "s")
+    searcher.begin(pace, None, 0.0)
+    for n in range(8):
+        assert searcher.route(f"v{n}", 100 * 200 + 100 + n, 0, 0)[0].status is RouteStatus.SEARCHING
+    cells = np.array(list(searcher.goals.values()))
+    places = np.stack(np.divmod(cells, 200), axis=1) * METRES
+    apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) + 1e9 * np.eye(8)
+    assert apart.min() > 5 * 50.0
+
+
+def test_a_vehicle_that_comes_late_in_a_tick_is_told_to_ask_again_and_is_told_a_place_in_the_next() -> None:
+    pace = np.full((40, 40), 0.2, np.float32)
+    costs = CostGrid(GridSpec(40, 40, METRES), PlannerConfig())
+    costs.load(pace)
+    searcher = Searcher(costs, 50.0, 2.0, "s")
+    searcher.begin(pace, None, 0.0)
+    statuses = [searcher.route(f"v{n}", n, 0, 0)[0] for n in range(20)]
+    late = [route for route in statuses if math.isinf(route.cost_s)]
+    assert late
+    assert all(route.status is RouteStatus.SEARCHING and not route.directions for route in late)
+    searcher.tick(0.1, [])
+    assert math.isfinite(searcher.route("v19", 19, 0, 0)[0].cost_s)
+
+
+def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_looked() -> None:
+    pace = np.full((100, 100), 0.2, np.float32)
+    grid = GridSpec(100, 100, METRES)
+    costs = CostGrid(grid, PlannerConfig())
+    costs.load(pace)
+    searcher = Searcher(costs, 100.0, 4.0, "s")
+    searcher.begin(pace, 5050, 60.0)
+    route = searcher.route("v", 0, 0, 0)[0]
+    path = walk(grid, route.start, route.directions)
+    rest = searcher.route("v", path[3], 0, 0)[0]
+    assert rest.directions == route.directions[3:]
+    goal = searcher.goals["v"]
+    row, col = divmod(goal, 100)
+    searcher.tick(
+        60.0, [(col * METRES, row * METRES), (col * METRES + 90, row * METRES), (col * METRES, row * METRES + 90)]
+    )
+    searcher.tick(60.0, [(col * METRES + x, row * METRES + y) for x in (-100, 0, 100) for y in (-100, 0, 100)])
+    assert searcher.wants_place("v")
