@@ -126,7 +126,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     sensor_options      what a plug-in for `sensor` takes
     assignment          spread: the cheapest pairs first, to each target an even share of an agent's vehicles;
                         cheapest: each vehicle the target that it reaches first; balanced: every target first gets
-                        its pursuers out of the whole group, all others go for the cheapest; or a plug-in
+                        its pursuers out of the whole group, the rest are spread over it; or a plug-in
     assignment_options  what a plug-in for `assignment` takes
     dynamics            ground: vehicles are as fast as the ground allows; or a plug-in, which only slows
     dynamics_options    what a plug-in for `dynamics` takes
