@@ -12,6 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from launch_scripts.bench.search_times import TICK_S, Ground, Run
 from launch_scripts.report.pictures.palette import BLUE, INK, ORANGE, RED
@@ -36,8 +37,7 @@ def draw(file: Path) -> None:
     grid, pace = ground.terrain.grid, ground.terrain.pace_s_per_m
     km = grid.resolution_m / 1e3
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(12.0, 4.3), layout="constrained")
-        figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[union-attr]
+        figure = Figure(figsize=(12.0, 4.3), layout=ConstrainedLayoutEngine(h_pad=0.12))
         every = figure.subplots(1, len(_AFTER_S))
         now_s = 0.0
         for axes, after_s in zip(every, _AFTER_S, strict=True):
