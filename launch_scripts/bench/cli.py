@@ -109,6 +109,31 @@ def paper(
 
 
 @app.command()
+def learning(
+    seeds: Annotated[str, typer.Option(help="Seeds A:B, B not among them.")] = "0:12",
+    agents: Annotated[int, typer.Option(min=1, max=10, help="Authors that ten vehicles report to.")] = 1,
+    right: Annotated[bool, typer.Option("--right", help="The prior is right: count false alarms.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """What vehicles learn of a class whose prior pace is wrong by three: error of the map and regret of routes.
+
+    \b
+    swarm bench learning
+    swarm bench learning --right --seeds 0:50
+    """
+    from launch_scripts.bench.planning.learning import run_learning, tables
+    from launch_scripts.simulation.campaign import parse_seeds
+    from shared_map.terrain.terrain import build_terrain
+    from swarm.config.ground import TerrainConfig
+    from swarm.config.scenario import Scenario
+
+    terrain = build_terrain(Scenario(terrain=TerrainConfig(source="jacksboro")))
+    with progress_of("learning") as progress:
+        report = run_learning(terrain, list(parse_seeds(seeds)), agents, not right, progress)
+    show(report, as_json, tables)
+
+
+@app.command()
 def scale(
     sizes: Annotated[
         str | None,

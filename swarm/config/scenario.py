@@ -195,10 +195,13 @@ class MapConfig(Section, frozen=True, kw_only=True):
     digest_s            every replica publishes this often which sets it holds
     author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
     total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
+    learning            vehicles measure how fast they drive on each kind of ground, and all processes correct the
+                        prior pace of that kind by it
     compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
                         compacted with those of other dead authors. Longer than a partition is likely to last
     """
 
+    learning: bool = False
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
     digest_s: Positive = 1.0
