@@ -350,6 +350,36 @@ def moves(
 
 
 @app.command()
+def pulled(
+    routes: Annotated[int, typer.Option(min=1, help="Routes to pull.")] = 20_000,
+    field: Annotated[
+        str, typer.Option(help="open, terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces.")
+    ] = "terrain",
+    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side; of a file, its middle.")] = 256,
+    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were pulled.")] = 100,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Routes of straight segments beside those over neighbours: saving, time, and that none is dearer.
+
+    \b
+    swarm bench pulled --field open
+    swarm bench pulled --field ridge.tif --routes 100000
+
+    Both are priced by the integral of the pace. One route in twenty is priced again,
+    apart from the kernel. The status is 1 where one was dearer, wrong or through what
+    is lethal. Pulling some 150 steps is timed beside growing the tree.
+    """
+    from launch_scripts.bench.planning.pulled import run, tables
+
+    with progress_of("pulled") as progress:
+        report = run(field, size, routes, seconds, seed, progress)
+    show(report, as_json, tables)
+    if report["dearer"] or report["priced_again_wrong"]:
+        raise typer.Exit(1)
+
+
+@app.command()
 def terrain(
     size: Annotated[int, typer.Option(min=64, help="Cells a side.")] = 4096,
     repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs of each pass.")] = 3,
