@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from swarm.config.classes import class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import choice, explain, located, nearest
 from swarm.config.ground import ZoneConfig
@@ -43,7 +44,7 @@ def read_scenario(
     """The scenario of a text, and what is wrong with it: at most so many sentences. None where not all keys could
     be read."""
     try:
-        raw = with_preset(parse_toml(text, source, ConfigError))
+        raw = with_class_costs(with_preset(parse_toml(text, source, ConfigError)))
     except ConfigError as error:
         return None, [str(error)]
     faults: list[str] = []
@@ -64,7 +65,12 @@ def read_scenario(
     if scenario is None or faults:
         return None, faults
     try:
-        scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
+        classes = tuple(
+            msgspec.structs.replace(each, cost=with_slope_csv(each.cost, f"{source}: classes[{n}]", base))
+            for n, each in enumerate(scenario.classes)
+        )
+        cost = with_slope_csv(scenario.cost, source, base)
+        scenario = msgspec.structs.replace(scenario, cost=cost, classes=classes)
     except ConfigError as error:
         return None, [str(error)]
     faults += islice(_faults(scenario, source), most)
@@ -124,6 +130,7 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     yield from _said(check_cost, scenario.cost, source)
     if scenario.cost.directional:
         yield from _said(_check_directional, scenario.planner, source)
+    yield from class_faults(scenario, source)
     yield from _group_faults(scenario, source)
     shown = scenario.monitor.show_target
     if shown and shown not in scenario.target_ids:
@@ -233,6 +240,10 @@ def anchored(scenario: Scenario, base: Path) -> Scenario:
         codes = str(base / codes)
     hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
     cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
+    classes = tuple(
+        msgspec.structs.replace(each, cost=msgspec.structs.replace(each.cost, zones=cost.zones))
+        for each in scenario.classes
+    )
     network = scenario.network
     if network.tls is not None:
         tls = network.tls
@@ -241,7 +252,8 @@ def anchored(scenario: Scenario, base: Path) -> Scenario:
     files = {"source": source, "photo": photo, "labels": labels, "cover": cover, "cover_codes": codes}
     terrain = msgspec.structs.replace(terrain, **files, hidden=hidden)
     folder = str(base / scenario.plugin_folder)
-    return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network, plugin_folder=folder)
+    changed = {"terrain": terrain, "cost": cost, "classes": classes, "network": network}
+    return msgspec.structs.replace(scenario, **changed, plugin_folder=folder)
 
 
 def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:

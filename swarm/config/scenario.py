@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from swarm.config.classes import GROUND, MOST_CLASSES, ClassConfig
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.values import (
     MOST_TARGETS,
@@ -99,6 +100,8 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     assignment  which vehicle goes for which target: as `vehicles.assignment`, which counts if this is not given; a
                 plug-in takes `vehicles.assignment_options`
     pursuers    balanced: so many vehicles each target gets first, those which together are the quickest there
+
+    vehicle_class  name of the class of its vehicles; "ground" is that of `cost` and `vehicles`
     """
 
     name: Name = "all"
@@ -110,6 +113,7 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     writes: tuple[GroupName, ...] = ("*",)
     assignment: Annotated[str, plugin_name(Assigner)] | None = None
     pursuers: Annotated[int, Meta(ge=1, le=16)] = 1
+    vehicle_class: Name = GROUND
 
 
 class VehicleConfig(Section, frozen=True, kw_only=True):
@@ -281,6 +285,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost           how terrain becomes pace
     targets        what is chased
     groups         which vehicles there are
+    classes        kinds of vehicles that differ from `cost` and `vehicles`
     rovers         simulated outside vehicles that the swarm's must not drive into
     vehicles       how vehicles behave
     planner        how a planner keeps its tree
@@ -299,6 +304,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost: CostConfig = CostConfig()
     targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
     groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
+    classes: Annotated[tuple[ClassConfig, ...], Meta(max_length=MOST_CLASSES)] = ()
     rovers: Annotated[tuple[RoverConfig, ...], Meta(max_length=256)] = ()
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()

@@ -1,0 +1,138 @@
+"""Classes of vehicles: several kinds on one terrain, each with its own limits and its own rule of cost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from swarm.config.cost_rules import PRESETS, check_cost
+from swarm.config.explain import choice
+from swarm.config.ground import CostConfig
+from swarm.config.values import Name, Positive, Section
+from swarm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from swarm.config.scenario import Scenario
+
+GROUND = "ground"
+"""The class of vehicles of which nothing else is said: that of `[cost]` and `[vehicles]`."""
+MOST_CLASSES = 7
+"""Beside `GROUND`."""
+SHARED = ("zones", "layers", "directional")
+"""Settings of `[cost]` that hold for every class."""
+
+
+class ClassConfig(Section, frozen=True, kw_only=True):
+    """A class of vehicles, beside "ground", which is that of `[cost]` and `[vehicles]`.
+
+    name                   what groups and queries call it
+    kind                   ground: it drives
+    cost                   what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
+                           and `directional` are those of `[cost]`
+    max_speed_m_per_s      none of the speeds of its cost is more than this: level, on roads, downhill
+    sense_range_m          radius of its simulated sensor; `vehicles.sense_range_m` if not given
+    acceleration_m_per_s2  its speed changes by no more in a second; at once if not given
+    turn_rate_deg_per_s    it turns by no more in a second, and slows where its way asks for more; at once if not
+                           given
+    """
+
+    name: Name
+    kind: Literal["ground"] = "ground"
+    cost: CostConfig = CostConfig()
+    max_speed_m_per_s: Annotated[float, Meta(ge=0.01, le=340)] | None = None
+    sense_range_m: Positive | None = None
+    acceleration_m_per_s2: Annotated[float, Meta(ge=0.01, le=1000)] | None = None
+    turn_rate_deg_per_s: Annotated[float, Meta(ge=0.1, le=10_000)] | None = None
+
+
+def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
+    """What was read of a scenario, with the whole cost of every class: that of `[cost]`, then the settings of the
+    class's own preset, then what it says itself.
+
+    What is no table is left to the check of types. To do it again changes nothing.
+    """
+    classes, common = raw.get("classes"), raw.get("cost", {})
+    if not isinstance(classes, list) or not isinstance(common, dict):
+        return raw
+    whole = []
+    for each in classes:
+        own = each.get("cost", {}) if isinstance(each, dict) else None
+        whole.append({**each, "cost": _over(common, own)} if isinstance(own, dict) else each)
+    return {**raw, "classes": whole}
+
+
+def _over(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    preset = next((row.settings for name, row in PRESETS.items() if name == own.get("preset")), {})
+    named = {**preset, **own}
+    changes_rule = named.get("slope_rule", common.get("slope_rule")) != common.get("slope_rule")
+    tables = {"slope_table", "slope_csv"}
+    left_out = tables if changes_rule or tables & named.keys() else set()
+    below = {key: value for key, value in common.items() if key not in left_out}
+    cost = {**below, **named}
+    factors = [each.get("class_factor") for each in (common, preset, own)]
+    if any(isinstance(each, dict) for each in factors) and all(isinstance(each, dict | None) for each in factors):
+        cost["class_factor"] = {key: value for each in factors for key, value in (each or {}).items()}
+    return cost
+
+
+def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
+    """What is wrong with the classes of a scenario, one sentence each."""
+    names = [each.name for each in scenario.classes]
+    doubled = [name for name, times in Counter(names).items() if times > 1]
+    if doubled:
+        yield f"{source}: classes: two classes are called {doubled[0]!r}; rename one"
+    if GROUND in names:
+        yield f"{source}: classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
+    for n, each in enumerate(scenario.classes):
+        for key in SHARED:
+            if getattr(each.cost, key) != getattr(scenario.cost, key):
+                yield f"{source}: classes[{n}].cost.{key} is for all classes alike: give it in [cost] instead"
+        try:
+            check_cost(each.cost, f"{source}: classes[{n}]")
+        except ConfigError as error:
+            yield str(error)
+    known = [GROUND, *names]
+    for n, group in enumerate(scenario.groups):
+        if group.vehicle_class not in known:
+            there = choice(group.vehicle_class, known, " there are ")
+            yield f"{source}: groups[{n}].vehicle_class is {group.vehicle_class!r}, which is no class{there}"
+
+
+def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
+    """The settings of a class; None of `GROUND`. Raises ConfigError that names the classes there are."""
+    if name == GROUND:
+        return None
+    for each in scenario.classes:
+        if each.name == name:
+            return each
+    known = [GROUND, *(each.name for each in scenario.classes)]
+    raise ConfigError(f"scenario {scenario.name} has no class {name!r}{choice(name, known, ' there are ')}")
+
+
+def of_class(scenario: Scenario, name: str) -> Scenario:
+    """The scenario as it is for vehicles of one class: its cost and its sensor are theirs. That of `GROUND` is the
+    scenario itself. Raises ConfigError on an unknown class."""
+    own = class_named(scenario, name)
+    if own is None:
+        return scenario
+    vehicles = scenario.vehicles
+    if own.sense_range_m is not None:
+        vehicles = msgspec.structs.replace(vehicles, sense_range_m=own.sense_range_m)
+    return msgspec.structs.replace(scenario, cost=_limited(own), vehicles=vehicles)
+
+
+def _limited(own: ClassConfig) -> CostConfig:
+    cost, most = own.cost, own.max_speed_m_per_s
+    if most is None:
+        return cost
+    top = cost.top_speed_m_per_s
+    return msgspec.structs.replace(
+        cost,
+        flat_speed_m_per_s=min(cost.flat_speed_m_per_s, most),
+        road_speed_m_per_s=min(cost.road_speed_m_per_s, most),
+        top_speed_m_per_s=most if top is None else min(top, most),
+    )

@@ -1,0 +1,96 @@
+"""Classes of vehicles in a scenario: what each inherits, and the sentence for each fault."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from swarm.config.classes import of_class
+from swarm.config.cost_rules import cost_of_preset
+from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.config.write import scenario_text
+from swarm.errors import ConfigError
+
+_TWO = """
+cost = { slope_rule = "table", slope_table = [[-30, 2.0], [0, 1.0], [30, 4.0]], max_slope_deg = 25.0 }
+[[groups]]
+vehicle_class = "walker"
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 0.5
+sense_range_m = 40.0
+cost = { preset = "hiker", class_factor = { rock = 1.25 } }
+[[classes]]
+name = "same"
+"""
+
+
+def test_a_class_is_what_it_says_over_its_preset_over_the_common_cost() -> None:
+    scenario = parse_scenario(_TWO)
+    walker = of_class(scenario, "walker")
+    assert (walker.cost.slope_rule, walker.cost.max_slope_deg, walker.cost.slope_table) == ("tobler", 40.0, ())
+    speeds = walker.cost.flat_speed_m_per_s, walker.cost.road_speed_m_per_s, walker.cost.top_speed_m_per_s
+    assert speeds == (0.5, 0.5, 0.5)
+    assert walker.vehicles.sense_range_m == 40.0
+    assert walker.cost.class_factor == {"rock": 1.25}
+    assert scenario.groups[0].vehicle_class == "walker"
+
+
+def test_a_class_that_says_nothing_is_the_scenario_itself() -> None:
+    scenario = parse_scenario(_TWO)
+    assert of_class(scenario, "ground") is scenario
+    assert of_class(scenario, "same") == scenario
+    assert parse_scenario("").classes == ()
+
+
+def test_a_written_scenario_has_the_same_classes(tmp_path: Path) -> None:
+    scenario = load_of(tmp_path, _TWO)
+    (tmp_path / "again.toml").write_text(scenario_text(scenario, tmp_path))
+    assert load_scenario(tmp_path / "again.toml") == scenario
+
+
+def test_classes_keep_the_preset_of_the_common_cost() -> None:
+    scenario = parse_scenario(
+        'cost = { preset = "wheeled" }\nclasses = [{ name = "slow", cost = { rough_per_m = 1 } }]'
+    )
+    cost = of_class(scenario, "slow").cost
+    assert cost.max_slope_deg == cost_of_preset("wheeled").max_slope_deg
+    assert cost.rough_per_m == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('classes = [{ name = "a" }, { name = "a" }]', "classes: two classes are called 'a'; rename one"),
+        ('classes = [{ name = "ground" }]', "classes: 'ground' is the class of [cost] and [vehicles] itself"),
+        ('groups = [{ vehicle_class = "boat" }]', "groups[0].vehicle_class is 'boat', which is no class"),
+        ('classes = [{ name = "a", wings = 2 }]', "wings"),
+        ('classes = [{ name = "a", kind = "air" }]', "classes[0].kind"),
+        (
+            'classes = [{ name = "a", cost = { directional = true } }]',
+            "cost.directional is for all classes",
+        ),
+        ('classes = [{ name = "a", cost = { slope_rule = "table" } }]', "classes[0]: cost: slope_rule"),
+        ('classes = [{ name = "a", cost = { preset = "plane" } }]', "classes[0].cost.preset"),
+        ("classes = [3]", "classes[0]"),
+        ("classes = 3", "classes"),
+        ("classes = [{ }]", "name"),
+    ],
+)
+def test_a_fault_is_said_in_one_sentence(text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_scenario(text)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_class_is_said_with_those_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"has no class 'boat'.*ground"):
+        of_class(Scenario(), "boat")
+
+
+def load_of(folder: Path, text: str) -> Scenario:
+    (folder / "scenario.toml").write_text(text)
+    return load_scenario(folder / "scenario.toml")
