@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shared_map.learning.words import told
 from shared_map.replication.digest import Held, Ledger, fingerprint
 from shared_map.replication.limits import Capacity
 from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
@@ -50,9 +51,9 @@ class HeldSets:
 
     def off_grid(self, received: MarkSet) -> bool:
         """Whether a set states something about cells which this grid does not have. What is learned is told about
-        the tile beyond the last one, and not by operators."""
+        the tile beyond the last one, as `words` has it, and not by operators."""
         if received.tile == self._tile_count:
-            return is_zone(received.author)
+            return is_zone(received.author) or told(received) is None
         return received.tile >= self._tile_count or (self._ragged and fault(received, self._grid) is not None)
 
     def is_news(self, received: MarkSet, held: MarkSet | None) -> bool:
