@@ -205,12 +205,12 @@ class MapConfig(Section, frozen=True, kw_only=True):
                         compacted with those of other dead authors. Longer than a partition is likely to last
     """
 
-    learning: bool = False
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
+    learning: bool = False
     compact_after_s: Positive = 60.0
 
 

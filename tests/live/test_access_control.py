@@ -71,7 +71,6 @@ FORBIDDEN = [
     ("planner", "put", "target/t0/pose"),
     ("planner", "hear", "world/target/t0/pose"),
     ("planner", "hear", "target/t1/chasers/blue.a0.1"),
-    ("planner", "hear", "fleet/0/blue.a0.1"),
     ("planner", "raise", "alive/planner/t1/1"),
     ("standby", "serve", "target/t1/route"),
     ("standby", "serve", "target/t0.r1/route"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 
 import msgspec
@@ -70,7 +71,8 @@ def test_any_valid_message_on_its_key_raises_nowhere(topic):
     def forge(message, as_somebody):
         if as_somebody:
             said = [name for name in topic.fields if isinstance(getattr(message, name, None), str)]
-            message = msgspec.structs.replace(message, **{name: chance.choice(KNOWN) for name in said})
+            with contextlib.suppress(ValueError):  # fields that do not fit each other: no codec would take them
+                message = msgspec.structs.replace(message, **{name: chance.choice(KNOWN) for name in said})
         stranger.publish_bytes(topic, encode(message), key_fields(topic, message, chance))
         simulation.run_until(simulation.now_s + 0.05)
 

@@ -253,7 +253,7 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
     summary = recorder.summary(2 * NS_PER_S)
     assert summary.states == {
         "idle": 0, "waiting": 0, "following": 1, "arrived": 1, "stranded": 0, "lost": 0,
-            "outdated": 0,
+            "outdated": 0, "searching": 0,
     }  # fmt: skip
 
 
