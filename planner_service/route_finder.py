@@ -39,6 +39,26 @@ class FoundRoute:
         return max(self.cost_s / self.lower_bound_s, 1.0) if self.lower_bound_s > 0 else np.inf
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PulledRoute:
+    """A route of straight segments between centres of cells that a route over neighbours passes.
+
+    Both costs are integrals of the pace along the way, where half of a step lies in the cell that it leaves.
+    `FoundRoute.cost_s` prices a step by the cell that it enters, and its lower bound holds for routes over
+    neighbours alone: a pulled route may cost less than it.
+
+    turns        int64 (n, 2), row and col of the cells where it turns, with the start and the target
+    cost_s       s, along the segments; never more than `grid_cost_s`
+    grid_cost_s  s, along the route over neighbours
+    length_m     m, of the segments
+    """
+
+    turns: NDArray[np.int64]
+    cost_s: float
+    grid_cost_s: float
+    length_m: float
+
+
 class RouteFinder:
     """Cheapest routes from everywhere to one target, kept up with as the target moves and the map changes.
 
@@ -75,7 +95,9 @@ class RouteFinder:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
         self.grid = GridSpec(rows, cols, resolution_m)
-        self._tree = TargetTree(self.grid, PlannerConfig(**{"strategy": "full", **settings}), climb)
+        self._config = PlannerConfig(**{"strategy": "full", **settings})
+        self._directional = climb is not None
+        self._tree = TargetTree(self.grid, self._config, climb)
         self._version = 0
         self._target = self.grid.cell(*target)
         self._update([])
@@ -109,6 +131,35 @@ class RouteFinder:
             cells = np.stack(np.divmod(np.array(walk(self.grid, cell, found.directions)), self.grid.cols), axis=1)
         return FoundRoute(found.status, cells, found.cost_s, found.lower_bound_s, found.length_m)
 
+    def pull(self, route: FoundRoute) -> PulledRoute:
+        """A route pulled straight: fewer turns, less time, no lethal cell and no corner that its steps may not cut.
+
+        The cheapest chain of segments between the route's own cells, by dynamic programming over some of them:
+        those up to 64 cells back, ever farther apart, and where the way to the cell before turned.
+
+        Raises ValueError where uphill is not downhill, on a route that does not lead to a target, and on one
+        that the map's changes have shut.
+        """
+        # Compiled only for those who pull: no planner waits for it at its first start.
+        from planner_service.kernels.pull import pull
+
+        if self._directional:
+            raise ValueError("routes are not pulled where uphill is not downhill: a climb has a price per step")
+        if route.status is not RouteStatus.OK:
+            raise ValueError(
+                f"route is {route.status.value!r}, expected 'ok': only a route to the target is pulled"
+            )
+        cells = np.ascontiguousarray(route.cells @ np.array((self.grid.cols, 1), np.int64))
+        costs = np.empty((2, cells.size), np.float64)
+        before, turns = np.empty(cells.size, np.int64), np.empty(cells.size, np.int64)
+        count = pull(self._pace.ravel(), self.grid.cols, self._config.corner_cutting, cells, costs, before, turns)
+        if not np.isfinite(costs[1, -1]):
+            raise ValueError("the route passes a cell or a corner that is shut by now: ask for it again")
+        at = _without_straight_turns(route.cells[turns[:count]])
+        metres = self.grid.resolution_m
+        length_m = float(np.hypot(*np.diff(at, axis=0).T).sum()) * metres
+        return PulledRoute(at, float(costs[1, -1]) * metres, float(costs[0, -1]) * metres, length_m)
+
     def cost_to_go_s(self) -> NDArray[np.float32]:
         """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""
         costs: NDArray[np.float32] = self._tree.cost_to_go_at(np.arange(self.grid.cells))
@@ -122,3 +173,11 @@ class RouteFinder:
             tree.adopt(grown, pace, self._target, [], self._version, [])
         if tree.wants_strides:
             tree.take_strides(tree.stride_job().run())
+
+
+def _without_straight_turns(turns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Without those in which the route goes straight on; both segments and the one cross the same cells."""
+    legs = np.diff(turns, axis=0)
+    into, out = legs[:-1], legs[1:]
+    straight = (into[:, 0] * out[:, 1] == into[:, 1] * out[:, 0]) & ((into * out).sum(axis=1) > 0)
+    return turns[np.concatenate(((True,), ~straight, (True,)))[-len(turns) :]]

@@ -77,7 +77,7 @@ class PlannerService:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
-        self._cost_map = CostMap(terrain)
+        self._cost_map = CostMap(terrain, learning=scenario.map.learning)
         self._heard_groups = readable_for_target(scenario, self._target)
         filter = MarkFilter(terrain.grid, self._heard_groups)
         self._untracked = self._target in scenario.untracked

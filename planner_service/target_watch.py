@@ -116,13 +116,15 @@ class TargetWatch:
         assert pose is not None
         self._lost, self._lost_since_ns = True, self._tracking.heard_ns
         self._count("trackers_lost")
+        then = "routes lead to where it was"
         if not self._tracker:
+            then = "it is searched for"
             why = f"no vehicle has seen it for {(now_ns - self._tracking.heard_ns) / NS_PER_S:.1f} s"
         elif self._handed_over:
             why = f"{self._tracker} has handed it over, and nobody else tracks it"
         else:
             why = f"{self._tracker} has been silent for longer than its lease of {pose.lease_s:g} s"
-        self._tell("tracker-lost", f"{why}; routes lead to where it was", pose.cell)
+        self._tell("tracker-lost", f"{why}; {then}", pose.cell)
 
     def _refuse(self, pose: TargetPose) -> None:
         self._count("poses_refused")

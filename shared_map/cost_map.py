@@ -1,23 +1,27 @@
 """The composite cost map of one process: the prior ground, the marks over it, and inflation.
 
-A mark replaces the ground of its cell. Then a cell is lethal where a vehicle in its middle would touch lethal
+What is learned of a kind of ground changes the pace of all its cells; a mark replaces the ground of its cell. Then
+a cell is lethal where a vehicle in its middle would touch lethal
 ground. After any sequence of `apply` the composite equals one built from the last statement about each cell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats, private_copy
+from shared_map.arrays import Bytes, Floats, private_copy
+from shared_map.learning.factors import factors_of, keys_of
+from shared_map.learning.words import KEYS, told
 from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
 
 MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""
@@ -44,10 +48,14 @@ class CostMap:
 
     pace_s_per_m    float32 (rows, cols)  what may be driven and how fast; changed in place
     ground_s_per_m  float32 (rows, cols)  the same without inflation: compare what a sensor sees with this
-    version         grows by one with every `apply` that changed the ground
+    prior_s_per_m   float32 (rows, cols)  the ground without marks: what is known beforehand, and what is learned
+    factors         float32 (KEYS,)       what is learned: by what the prior of each kind of ground is multiplied
+    version         grows by one with every `apply` and `learn` that changed the ground
+
+    learning  take in what authors have learned
     """
 
-    def __init__(self, terrain: Terrain) -> None:
+    def __init__(self, terrain: Terrain, *, learning: bool = False) -> None:
         self.terrain = terrain
         self.grid = terrain.grid
         self.version = 0
@@ -56,7 +64,18 @@ class CostMap:
         self.ground_s_per_m: Floats = self.pace_s_per_m
         if self._halves:
             self.ground_s_per_m = private_copy(terrain.ground_s_per_m)
-        self._prior = np.asarray(terrain.ground_s_per_m).reshape(-1)
+        self.prior_s_per_m: Floats = np.asarray(terrain.ground_s_per_m)
+        if learning:
+            self.prior_s_per_m = private_copy(terrain.ground_s_per_m)
+        self._prior = self.prior_s_per_m.reshape(-1)
+        self.factors: Floats = np.ones(KEYS, np.float32)
+        self.keys: Bytes | None = None
+        """The kind of ground of each cell: uint8 (rows, cols). None if nothing is learned."""
+        self._stated: NDArray[np.bool_] | None = None
+        """Where a mark is; None if nothing is learned."""
+        if learning:
+            self.keys = keys_of(terrain.classes, terrain.elevation_m, self.grid.resolution_m)
+            self._stated = np.zeros(self.grid.cells, np.bool_)
         self._dirty: list[Window] = []
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
@@ -73,6 +92,8 @@ class CostMap:
         where = np.asarray(cells, np.int64)
         if int(where.min()) < 0 or int(where.max()) >= self.grid.cells:
             raise OutsideGridError(f"a mark is on cell {int(where.max())} of {self.grid.rows} x {self.grid.cols}")
+        if self._stated is not None:
+            self._stated[where] = np.asarray(kinds) != MarkKind.CLEAR
         where, values = self._last_of_each(where, np.asarray(kinds), np.asarray(paces, np.float32))
         ground = self.ground_s_per_m.reshape(-1)
         was = ground[where]
@@ -93,6 +114,9 @@ class CostMap:
         places: list[int] = cells.tolist()
         if places and not 0 <= min(places) <= max(places) < self.grid.cells:
             raise OutsideGridError(f"a mark is on cell {max(places)} of {self.grid.rows} x {self.grid.cols}")
+        if self._stated is not None:
+            for cell, kind in zip(places, kinds.tolist(), strict=True):
+                self._stated[cell] = kind != MarkKind.CLEAR
         ground = self.ground_s_per_m.reshape(-1)
         before: dict[int, float] = {}
         for cell, kind, pace in zip(places, kinds.tolist(), paces.tolist(), strict=True):
@@ -115,6 +139,30 @@ class CostMap:
             box = Window(row, col, row + 1, col + 1)
             boxes[tile] = boxes[tile].union(box) if tile in boxes else box
         self._dirty = merged(boxes.values(), self._dirty)
+
+    def learn(self, words: Sequence[MarkSet]) -> None:
+        """Make these the words of all authors about kinds of ground. Those which are none change nothing. A change
+        of factors is one of the whole map. Lethal cells stay lethal, and marked cells as they are marked."""
+        if self.keys is None or self._stated is None:
+            return
+        factors = factors_of([said for each in words if (said := told(each))])
+        if (factors == self.factors).all():
+            return
+        self.factors = factors
+        known = np.asarray(self.terrain.ground_s_per_m)
+        by = factors[self.keys]
+        fresh = np.where(np.isinf(known) | (by == 1), known, np.clip(known * by, PACE_LEAST, PACE_MOST))
+        np.copyto(self.prior_s_per_m, fresh)
+        pace, ground, free = self.pace_s_per_m, self.ground_s_per_m, ~self._stated.reshape(known.shape)
+        changed = free & (ground != fresh)
+        if not changed.any():
+            return
+        ground[changed] = fresh[changed]
+        if self._halves:
+            changed &= np.isfinite(pace)
+            pace[changed] = fresh[changed]
+        self.version += 1
+        self._dirty = [self.grid.window]
 
     def take_dirty(self) -> list[Window]:
         """Windows which cover every cell whose pace changed since the last call, 32 at most; none touches

@@ -228,6 +228,11 @@ class Agent:
                 self._go_out(ways_out)
         return compare(sight, self._map.ground, self._map.prior)
 
+    def take_driven(self) -> list[tuple[int, float]]:
+        """(cell, s/m) of each step that was driven freely since the last call (see `Driver`)."""
+        driven, self._driver.driven = self._driver.driven, []
+        return driven
+
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, look: bool = False) -> None:
         """End routes before cells that are lethal now, and paths also before corners that are.
 

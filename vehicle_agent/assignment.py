@@ -142,7 +142,7 @@ class Cheapest:
 
 
 class Balanced:
-    """First every target's pursuers out of the whole group, then each vehicle its cheapest: see `need_first`.
+    """First every target's pursuers out of the whole group, then even shares: see `need_first` and `spread`.
 
     All agents solve one problem, which does not depend on who solves it or in which order words came, and each
     takes what it says of its own vehicles. Where they hold different words, a target may have more pursuers for a
@@ -162,9 +162,10 @@ class Balanced:
         place = {row: n for n, row in enumerate(rows)} | {-1: -1}
         costs_s = np.concatenate([each.costs_s for each in tables], 1)[np.ix_(rows, columns)]
         now = list(chain.from_iterable(each.current for each in tables))
-        needed = need_first(costs_s, [place[now[n]] for n in columns], self._pursuers)
+        current = [place[now[n]] for n in columns]
+        shared = spread(costs_s, current, need_first(costs_s, current, self._pursuers))
         chosen = np.full(len(ids), -1, np.int64)
-        chosen[columns] = [rows[each] if each >= 0 else -1 for each in needed.tolist()]
+        chosen[columns] = [rows[each] if each >= 0 else -1 for each in shared.tolist()]
         return chosen[: len(table.vehicles)]
 
 

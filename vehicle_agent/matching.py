@@ -18,7 +18,7 @@ _LONGEST_S = 1e7
 """Longer ways count as so long, so that all sums in whole milliseconds are exact in float64."""
 
 
-def spread(costs_s: NDArray[np.float64], current: Sequence[int]) -> NDArray[np.int64]:
+def spread(costs_s: Costs, current: Sequence[int], before: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
     """Which target each vehicle goes for: the cheapest pairs first, to each target an even share of the vehicles.
 
     If each took the cheapest, all would end up in one herd (docs/method.md): those which chase one target stand
@@ -28,6 +28,7 @@ def spread(costs_s: NDArray[np.float64], current: Sequence[int]) -> NDArray[np.i
     ----------
     costs_s : (targets, vehicles) float64, inf where there is no route
     current : (vehicles,) the target of each now, -1 for none; another must be cheaper by `HYSTERESIS`
+    before  : (vehicles,) int64, the target of those that have one for sure, -1 for the rest; none if not given
 
     Returns
     -------
@@ -39,11 +40,11 @@ def spread(costs_s: NDArray[np.float64], current: Sequence[int]) -> NDArray[np.i
     for vehicle, target in enumerate(current):
         if target >= 0:
             costs_s[target, vehicle] *= 1.0 - HYSTERESIS
-    chosen = np.full(vehicles, -1, np.int64)
-    left = [most] * targets
+    chosen = np.full(vehicles, -1, np.int64) if before is None else before.copy()
+    left = (most - np.bincount(chosen[chosen >= 0], minlength=targets)).tolist()
     order = np.argsort(costs_s, axis=None, kind="stable")[: int(np.isfinite(costs_s).sum())]
     for target, vehicle in zip(*(each.tolist() for each in np.divmod(order, vehicles)), strict=True):
-        if chosen[vehicle] < 0 and left[target]:
+        if chosen[vehicle] < 0 < left[target]:
             chosen[vehicle] = target
             left[target] -= 1
     return chosen

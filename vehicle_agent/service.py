@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
+from shared_map.learning.factors import Measured
 from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
@@ -58,6 +59,7 @@ from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.group_costs import GroupCosts
+from vehicle_agent.learning import Learning
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
@@ -101,7 +103,9 @@ class AgentService:
         self._bus = bus
         self._post = post
         self._setup = setup
-        self._cost_map = CostMap(terrain)
+        self._cost_map = CostMap(terrain, learning=scenario.map.learning)
+        keys = self._cost_map.keys
+        self._learning = None if keys is None else Learning(Measured(keys), terrain.ground_s_per_m)
         group = plan.group.name
         self._author = author_of(group, setup.author)
         self._replica = MapReplica(
@@ -114,7 +118,7 @@ class AgentService:
         near = scenario.map.interest == "near"
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
-        local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
+        local = LocalMap(grid, pace, ground, self._cost_map.prior_s_per_m, truth, terrain.climb)
         self._faults: list[str] = []
         """What plug-ins did wrong and nobody has been told yet."""
         world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
@@ -265,6 +269,9 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
+        driven = agent.take_driven()
+        if self._learning is not None and (said := self._learning.tick(driven, now_ns)):
+            self._sync.publish(self._replica.write_learned(said, now_ns))
         columns = Places(self._cost_map.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)
         self._perform(agent.decide(now_ns))

@@ -109,6 +109,31 @@ def paper(
 
 
 @app.command()
+def learning(
+    seeds: Annotated[str, typer.Option(help="Seeds A:B, B not among them.")] = "0:12",
+    agents: Annotated[int, typer.Option(min=1, max=10, help="Authors that ten vehicles report to.")] = 1,
+    right: Annotated[bool, typer.Option("--right", help="The prior is right: count false alarms.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """What vehicles learn of a class whose prior pace is wrong by three: error of the map and regret of routes.
+
+    \b
+    swarm bench learning
+    swarm bench learning --right --seeds 0:50
+    """
+    from launch_scripts.bench.planning.learning import run_learning, tables
+    from launch_scripts.simulation.campaign import parse_seeds
+    from shared_map.terrain.terrain import build_terrain
+    from swarm.config.ground import TerrainConfig
+    from swarm.config.scenario import Scenario
+
+    terrain = build_terrain(Scenario(terrain=TerrainConfig(source="jacksboro")))
+    with progress_of("learning") as progress:
+        report = run_learning(terrain, list(parse_seeds(seeds)), agents, not right, progress)
+    show(report, as_json, tables)
+
+
+@app.command()
 def scale(
     sizes: Annotated[
         str | None,
@@ -235,6 +260,32 @@ def certificates(
 
 
 @app.command()
+def air(
+    dem: Annotated[str, typer.Option(help="A built-in terrain, or an elevation file.")] = "jacksboro",
+    cells: Annotated[int, typer.Option(min=16, max=160, help="A side of the crop.")] = 100,
+    grade: Annotated[float, typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface.")] = 0.15,
+    routes: Annotated[int, typer.Option(min=1, help="Routes whose clearance is looked at.")] = 100_000,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Flights over a surface that follows the terrain, beside the best way through 64 levels.
+
+    \b
+    swarm bench air
+    swarm bench air --dem ridge.tif --grade 0.2
+
+    The status is 1 where a flight comes nearer to the ground than its clearance.
+    """
+    from launch_scripts.bench.planning.air import run, tables
+    from shared_map.terrain.air_floor import Flight
+
+    report = run(dem, cells, 2, 150, routes, Flight(speed_mps=15.0, grade=grade), seed)
+    show(report, as_json, tables)
+    if report["clearance_broken"]:
+        raise typer.Exit(1)
+
+
+@app.command()
 def directed(
     sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
     repeats: Annotated[int, typer.Option(min=1, help="Roots, the same for both.")] = 7,
@@ -296,6 +347,36 @@ def moves(
     with progress_of("moves") as progress:
         report = run(size, field if dem is None else str(dem), moves, seed, progress)
     show(report, as_json, tables)
+
+
+@app.command()
+def pulled(
+    routes: Annotated[int, typer.Option(min=1, help="Routes to pull.")] = 20_000,
+    field: Annotated[
+        str, typer.Option(help="open, terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces.")
+    ] = "terrain",
+    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side; of a file, its middle.")] = 256,
+    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were pulled.")] = 100,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Routes of straight segments beside those over neighbours: saving, time, and that none is dearer.
+
+    \b
+    swarm bench pulled --field open
+    swarm bench pulled --field ridge.tif --routes 100000
+
+    Both are priced by the integral of the pace. One route in twenty is priced again,
+    apart from the kernel. The status is 1 where one was dearer, wrong or through what
+    is lethal. Pulling some 150 steps is timed beside growing the tree.
+    """
+    from launch_scripts.bench.planning.pulled import run, tables
+
+    with progress_of("pulled") as progress:
+        report = run(field, size, routes, seconds, seed, progress)
+    show(report, as_json, tables)
+    if report["dearer"] or report["priced_again_wrong"]:
+        raise typer.Exit(1)
 
 
 @app.command()

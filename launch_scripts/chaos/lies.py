@@ -23,6 +23,7 @@ from swarm.wire.fields import OR_INFINITE, Characters, Column, taken_apart
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap
 from swarm.wire.messages.marks import DIGEST_ROW, MarkSet, MarkSets
+from swarm.wire.messages.vehicles import NO_TARGET, SharedCosts
 from swarm.wire.routes import Route, RouteBatch, Routes
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 from swarm.wire.topics import Topic
@@ -85,7 +86,27 @@ class Lies:
         if kind is BaseMap:
             regions = GridSpec(fields["rows"], fields["cols"], 1.0).regions
             fields["digests"] = {"ground": bytes(BASE_DIGEST_BYTES * regions)}
+        if kind is SharedCosts:
+            fields |= self._shared_costs()
         return kind(**fields)
+
+    def _shared_costs(self) -> dict[str, Any]:
+        """One agent's, about its own vehicles."""
+        agent = self._chance.choice(("a0", "a1"))
+        ids = [f"{agent}-{n:02d}" for n in range(self._chance.choice((0, 1, 2, 9)))]
+        target_ids = self._chance.sample(
+            list(dict.fromkeys(self._names)), self._chance.choice((0, 1, min(len(set(self._names)), 5)))
+        )
+        costs_s = self._column(Column("<f4", least=0, most=math.inf), len(ids) * len(target_ids))
+        chased = [self._chance.choice((*range(len(target_ids)), NO_TARGET)) for _ in ids]
+        return {
+            "author": f"all.{agent}.1",
+            "group": "all",
+            "ids": ids,
+            "target_ids": target_ids,
+            "costs_s": costs_s,
+            "targets": bytes(chased),
+        }
 
     def _statements(self) -> dict[str, bytes]:
         many = self._chance.choice([0, 1, 3, 40])

@@ -87,7 +87,7 @@ class MonitorService:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._member.web_port = web_port
         self.counters: Counters = self._member.counters
-        cost_map = CostMap(terrain)
+        cost_map = CostMap(terrain, learning=setup.scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role, at_ticks=True)
         self._mesh = mesh or TerrainMesh(terrain)

@@ -22,7 +22,8 @@ class Blocks:
     side_cells   cells of a side
     side_m       metres of it
     share        float32 (rows, cols), passable share of the cells; 0 where all is lethal
-    pace_s_per_m float32 (rows, cols), mean pace of the passable cells; 1 where there are none
+    pace_s_per_m float32 (rows, cols), mean pace of as many of its quickest cells as cross it; 1 where all is
+                 lethal
     places       int64 (rows, cols), the passable cell nearest to the middle of the block; -1 where there is none
     steps        float32 (8, rows, cols), 1 where the neighbour in that direction has a passable cell, else 0
     """
@@ -88,7 +89,10 @@ def blocks_of(grid: GridSpec, pace_s_per_m: Floats, range_m: float) -> Blocks:
     cells = padded.reshape(rows, side, cols, side).swapaxes(1, 2).reshape(rows, cols, side * side)
     passable = np.isfinite(cells)
     many = passable.sum(axis=2, dtype=np.int64)
-    means = np.where(passable, cells, 0).sum(axis=2, dtype=np.float64) / np.maximum(many, 1)
+    # A target crosses a block along its cheapest lane, as on a road: a row of cells, not all of them.
+    lane = np.sort(cells, axis=2)[:, :, :side]
+    in_lane = np.isfinite(lane)
+    means = np.where(in_lane, lane, 0).sum(axis=2, dtype=np.float64) / np.maximum(in_lane.sum(axis=2), 1)
     down, right = np.divmod(np.arange(side * side), side)
     middle = (side - 1) / 2
     off = (down - middle) ** 2 + (right - middle) ** 2

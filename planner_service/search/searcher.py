@@ -23,7 +23,7 @@ from swarm.wire.routes import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, Rou
 
 OFFSET_S = 900.0
 """Places that cost less than this differ little: near ones are preferred, but not for every scrap of belief."""
-APART_BLOCKS = 6
+APART_BLOCKS = 3
 """Around a place that a vehicle has been given, no other is given one."""
 KEPT_SHARE = 0.3
 """A place is given up when no more than this share of the belief around it is left."""

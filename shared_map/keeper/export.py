@@ -60,6 +60,7 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
             "marks": _marks(each, grid),
         }
         for each in sorted(sets, key=lambda each: (each.tile, each.author))
+        if each.tile < grid.tiles  # what is learned is about no cell
     ]
     lines = ",\n ".join(json.dumps(each) for each in listed)  # a line a set; a line a mark takes thrice that
     head = json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid)})
@@ -144,6 +145,8 @@ def to_cells(
     kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
     stamps_ns = np.zeros(grid.cells, np.int64)
     for tile in replica.held.tiles:
+        if tile == grid.tiles:
+            continue
         won = replica.winners(tile)
         cells = grid_cells(grid, tile_corners(grid, tile), won.cells)
         kind[cells], stamps_ns[cells] = won.kinds, won.stamps_ns

@@ -16,6 +16,7 @@ from shared_map.keeper.zones import free_name, rows_of, zone_sets, zones_of
 from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync
+from shared_map.replication.tiles import beyond_tile
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
@@ -220,7 +221,9 @@ class KeeperService:
         so that it can always put back what was dropped."""
         plan = self._plan
         plan.update(self.replica.held.ledger, now_ns)
-        tiles = plan.take_due(_COMPACT_TILES, now_ns)
+        # What a dead author has learned stays as it was said: nothing overrules it.
+        beyond = beyond_tile(self.replica.grid)
+        tiles = [tile for tile in plan.take_due(_COMPACT_TILES, now_ns) if tile != beyond]
         compacted: list[MarkSet] = []
         try:
             for tile in tiles:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
-from shared_map.replication.tiles import region_tiles
+from shared_map.replication.tiles import beyond_tile, region_tiles
 from swarm.config.scenario import Scenario
 from swarm.config.values import RESERVED_GROUP
 from swarm.grid import GridSpec
@@ -83,7 +83,9 @@ class MarkFilter:
     def limit_to(self, regions: frozenset[int]) -> None:
         """From now on accept only sets about these regions."""
         self.regions = regions
-        self._tiles = frozenset(tile for region in regions for tile in region_tiles(self._grid, region))
+        self._tiles = frozenset(
+            [beyond_tile(self._grid), *(tile for region in regions for tile in region_tiles(self._grid, region))]
+        )
 
     def accepts_author(self, author: str, group: str) -> bool:
         """Whether the policy of groups lets us read this author, which states to be of this group."""
@@ -92,7 +94,7 @@ class MarkFilter:
         return group in self.groups and author.startswith(f"{group}.")
 
     def accepts_tile(self, tile: int) -> bool:
-        """Whether a tile lies in the regions of interest."""
+        """Whether a tile lies in the regions of interest, or beyond the map: what is learned concerns all."""
         return self._tiles is None or tile in self._tiles
 
     def accepted(self, sets: Sequence[tuple[str, list[int]]]) -> list[tuple[str, list[int]]]:

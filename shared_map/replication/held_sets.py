@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shared_map.learning.words import told
 from shared_map.replication.digest import Held, Ledger, fingerprint
 from shared_map.replication.limits import Capacity
-from shared_map.replication.marks import fault, is_tombstone, supersedes
+from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
 from shared_map.replication.tombstones import Tombstones
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.messages.marks import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
@@ -49,7 +50,10 @@ class HeldSets:
         return sorted(self._tiles)
 
     def off_grid(self, received: MarkSet) -> bool:
-        """Whether a set states something about cells which this grid does not have."""
+        """Whether a set states something about cells which this grid does not have. What is learned is told about
+        the tile beyond the last one, as `words` has it, and not by operators."""
+        if received.tile == self._tile_count:
+            return is_zone(received.author) or told(received) is None
         return received.tile >= self._tile_count or (self._ragged and fault(received, self._grid) is not None)
 
     def is_news(self, received: MarkSet, held: MarkSet | None) -> bool:
@@ -123,7 +127,7 @@ class HeldSets:
         return [tile for tile in newer if not self.tombstones.above(tile, author, numbers[tile])]
 
     def _could_hold(self, author: str, tile: int) -> bool:
-        if tile >= self._tile_count:
+        if tile > self._tile_count:
             return False
         return not self.capacity.full_for(author) or self.get(tile, author) is not None
 

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from shared_map.learning.words import Said, stated
 from shared_map.replication.digest import Held
 from shared_map.replication.filter import MarkFilter
 from shared_map.replication.held_sets import HeldSets
@@ -31,7 +32,7 @@ from shared_map.replication.marks import (
     statements,
 )
 from shared_map.replication.merge import TileChange, new_winners, winners
-from shared_map.replication.tiles import tile_cells
+from shared_map.replication.tiles import beyond_tile, tile_cells
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec
@@ -40,9 +41,11 @@ from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
 
 
 class CostSink(Protocol):
-    """Where winning statements go: the cost map."""
+    """Where winning statements go, and what authors have learned: the cost map."""
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> object: ...
+
+    def learn(self, words: Sequence[MarkSet]) -> object: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +197,12 @@ class MapReplica:
         """Bring the cost map from the winners of these sets (by tile) at `before_ns` to those of what is held now.
         Returns how many winners changed in each tile."""
         changes = [TileChange(tile, sets, self.held.of_tile(tile)) for tile, sets in before.items()]
+        beyond = beyond_tile(self.grid)
+        if beyond in before:
+            # Nothing there is about a cell, so no set of it has winners.
+            changes = [TileChange(c.tile, [], []) if c.tile == beyond else c for c in changes]
+            if self._cost_map is not None:
+                self._cost_map.learn(self.held.of_tile(beyond))
         won = new_winners(self.grid, changes, before_ns, self._now_ns)
         if len(won.cells):
             self.counts["marks_merged"] += len(won.cells)
@@ -341,15 +350,20 @@ class MapReplica:
         if lifetime_s is None and len(np.unique(cells)) == len(cells):
             # What we state already, and wins for ever, need not be stated again.
             wins = (own.stamps_ns[cells] != NO_STATEMENT) & (own.stamps_ns[cells] == won.stamps_ns[cells])
-            stated = wins & (won.kinds[cells] == kinds) & (won.paces[cells] == paces)
-            stated &= own.untils_ns[cells] == FOREVER
-            if stated.all():
+            known = wins & (won.kinds[cells] == kinds) & (won.paces[cells] == paces)
+            known &= own.untils_ns[cells] == FOREVER
+            if known.all():
                 return
-            cells, kinds, paces, stamps = cells[~stated], kinds[~stated], paces[~stated], stamps[~stated]
+            cells, kinds, paces, stamps = cells[~known], kinds[~known], paces[~known], stamps[~known]
         own.kinds[cells], own.paces[cells], own.stamps_ns[cells] = kinds, paces, stamps
         own.untils_ns[cells] = FOREVER if lifetime_s is None else stamps + int(lifetime_s * NS_PER_S)
         self.counts["marks_written"] += len(cells)
         self._put_own(tile, sparse(own))
+
+    def write_learned(self, said: Mapping[int, Said], now_ns: int) -> list[PublishSet]:
+        """State what we have learned (`shared_map.learning.words`), instead of what we said of it before."""
+        self._put_own(beyond_tile(self.grid), Statements(*stated(said, now_ns)))
+        return self.tick(now_ns)
 
     def retract(self, cells: ArrayLike, now_ns: int) -> list[PublishSet]:
         """Take back what we stated about cells, as if we had never stated it; what others state about them stands.
@@ -372,12 +386,12 @@ class MapReplica:
         own = self.held.get(tile, self.author)
         return dense(NO_STATEMENTS if own is None else statements(own))
 
-    def _put_own(self, tile: int, stated: Statements) -> None:
+    def _put_own(self, tile: int, said: Statements) -> None:
         """Replace our set of a tile, under the next number."""
         assert self.author is not None
         held = self.held.get(tile, self.author)
         epoch, seq = (1, 0) if held is None else (held.epoch, next_seq(held.seq))
-        self._replace_own(mark_set(self.author, self.group, tile, epoch, seq, stated))
+        self._replace_own(mark_set(self.author, self.group, tile, epoch, seq, said))
 
     def _reassert(self, received: MarkSet) -> None:
         """A keeper took us for dead, and replaced our set: state the same again under a higher epoch."""
@@ -386,9 +400,9 @@ class MapReplica:
             self.counts["sets_refused"] += 1
             return
         held = self.held.get(received.tile, self.author)
-        stated = NO_STATEMENTS if held is None else statements(held)
+        said = NO_STATEMENTS if held is None else statements(held)
         seq = 0 if held is None else next_seq(held.seq)
-        self._replace_own(mark_set(self.author, self.group, received.tile, received.epoch + 1, seq, stated))
+        self._replace_own(mark_set(self.author, self.group, received.tile, received.epoch + 1, seq, said))
 
     def _replace_own(self, own: MarkSet) -> None:
         before = {own.tile: self.held.of_tile(own.tile)}

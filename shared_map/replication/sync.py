@@ -14,7 +14,7 @@ from shared_map.replication.limits import Quota, owner_of
 from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.pending_digests import PendingDigest, PendingDigests
 from shared_map.replication.replica import MapReplica, Merged, PublishSet
-from shared_map.replication.tiles import region_tiles
+from shared_map.replication.tiles import beyond_region, beyond_tile, region_of, region_tiles
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
@@ -125,12 +125,16 @@ class MapSync:
             return
         self._regions = regions
         new, grid = sorted(regions - before), self.replica.grid
+        if not before:
+            self._listen(region=beyond_region(grid))
         for region in new:
             self._listen(region=region)
         for region in sorted(before - regions):
             self._bus.unsubscribe(MARKS, region=region)
         self.replica.limit_to(regions)
         tiles = [tile for region in new for tile in region_tiles(grid, region)]
+        if not before:
+            tiles.append(beyond_tile(grid))
         if tiles:
             self._bus.ask(MARKS, MarksRequest(tiles=tiles, bulk=True), self._post, tag=_ENTER)
 
@@ -204,7 +208,7 @@ class MapSync:
     def _put(self, mark_set: MarkSet) -> None:
         if mark_set.author == self.replica.author:
             self._changed.setdefault(mark_set.tile, None)
-        region = self.replica.grid.region_of_tile(mark_set.tile)
+        region = region_of(self.replica.grid, mark_set.tile)
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
 
     def _take_in(self, now_ns: int) -> None:
@@ -295,7 +299,7 @@ class MapSync:
                 asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
         else:
             for each in sets:
-                region = self.replica.grid.region_of_tile(each.tile)
+                region = region_of(self.replica.grid, each.tile)
                 asked.answer(each, region=region, tile=each.tile, author=each.author)
         asked.end()
 

@@ -11,6 +11,22 @@ _TILE_BITS = TILE_CELLS.bit_length() - 1
 _TILE_MASK = TILE_CELLS - 1
 
 
+def beyond_tile(grid: GridSpec) -> int:
+    """The number after the last tile. Sets about it state nothing of cells, but what their authors have learned
+    (`shared_map.learning.words`)."""
+    return grid.tiles
+
+
+def beyond_region(grid: GridSpec) -> int:
+    """The number after the last region: under it go the sets about `beyond_tile`."""
+    return grid.region_of_tile(grid.tiles - 1) + 1
+
+
+def region_of(grid: GridSpec, tile: int) -> int:
+    """The region under whose key the sets about a tile go."""
+    return beyond_region(grid) if tile == beyond_tile(grid) else grid.region_of_tile(tile)
+
+
 def tile_corners(grid: GridSpec, tiles: ArrayLike) -> NDArray[np.uint32]:
     """Flat index (uint32) of the north-west cell of each tile."""
     tile_rows, tile_cols = np.divmod(np.asarray(tiles, np.int64), grid.tile_cols)

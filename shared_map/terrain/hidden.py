@@ -17,6 +17,7 @@ from shared_map.terrain.synthetic.noise import fractal_noise
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import CostConfig, HiddenConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 RUBBLE_FACTOR = np.float32(3.0)
 CONNECTED_SHARE = 0.85
@@ -39,6 +40,9 @@ def true_ground(
     classes      uint8    (rows, cols)  TerrainClass
     """
     truth = np.array(ground, np.float32)
+    for name, factor in hidden.class_factor.items():
+        there = (classes == TerrainClass[name.upper()]) & np.isfinite(truth)
+        truth[there] = np.clip(truth[there] * np.float32(factor), PACE_LEAST, PACE_MOST)
     rng = np.random.default_rng([seed, 5])
     whole = _Parts(truth).largest
     _rubble(truth, hidden.rubble_fields, rng)

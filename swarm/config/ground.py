@@ -93,12 +93,14 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
     rubble_fields  ragged patches, 4 to 10 cells in radius, of three times the pace
     flooded_share  share of the passable cells which is one flooded, lethal valley
     zones          zones painted on the truth only
+    class_factor   by how much the true pace of a whole class differs from the prior: { grass = 3.0 }
     """
 
     closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
     rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
     flooded_share: Annotated[float, Meta(ge=0, le=0.3)] = 0.0
     zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
+    class_factor: dict[ClassName, Annotated[float, Meta(ge=0.1, le=10)]] = msgspec.field(default_factory=dict)
 
 
 class TerrainConfig(Section, frozen=True, kw_only=True):

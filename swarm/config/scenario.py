@@ -130,7 +130,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     sensor_options      what a plug-in for `sensor` takes
     assignment          spread: the cheapest pairs first, to each target an even share of an agent's vehicles;
                         cheapest: each vehicle the target that it reaches first; balanced: every target first gets
-                        its pursuers out of the whole group, all others go for the cheapest; or a plug-in
+                        its pursuers out of the whole group, the rest are spread over it; or a plug-in
     assignment_options  what a plug-in for `assignment` takes
     dynamics            ground: vehicles are as fast as the ground allows; or a plug-in, which only slows
     dynamics_options    what a plug-in for `dynamics` takes
@@ -199,10 +199,13 @@ class MapConfig(Section, frozen=True, kw_only=True):
     digest_s            every replica publishes this often which sets it holds
     author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
     total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
+    learning            vehicles measure how fast they drive on each kind of ground, and all processes correct the
+                        prior pace of that kind by it
     compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
                         compacted with those of other dead authors. Longer than a partition is likely to last
     """
 
+    learning: bool = False
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
     digest_s: Positive = 1.0

@@ -113,7 +113,7 @@ def test_vehicles_look_at_places_apart_from_each_other() -> None:
     cells = np.array(list(searcher.goals.values()))
     places = np.stack(np.divmod(cells, 200), axis=1) * METRES
     apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) + 1e9 * np.eye(8)
-    assert apart.min() > 5 * 50.0
+    assert apart.min() > 2 * 50.0
 
 
 def test_a_vehicle_that_comes_late_in_a_tick_is_told_to_ask_again_and_is_told_a_place_in_the_next() -> None:

@@ -17,6 +17,8 @@ class Driver:
     passable  whether the step between two neighbours is allowed now
     dynamics  how fast vehicles drive; as the ground allows if not given
 
+    driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs taken out:
+              what vehicles measure; the owner empties it
     entered   cells that vehicles have entered and not looked around from; the owner empties it
     """
 
@@ -28,12 +30,17 @@ class Driver:
         dynamics: PluginDynamics | None,
     ) -> None:
         self.entered: dict[int, None] = {}
+        self.driven: list[tuple[int, float]] = []
+        self._steps: dict[str, tuple[int, float]] = {}
+        """Vehicle -> (head of its step, seconds that it has driven of it), of steps that are measured."""
         self._climb = local_map.climb
         self._physics = local_map.physics.reshape(-1)
         self._holdings = holdings
         self._passable = passable
         self._dynamics = dynamics
         self._left_s: dict[str, float] = {}
+        self._rolling: set[str] = set()
+        """Vehicles that did not stop when they came to the middle of the cell where they are."""
 
     def begin(self, vehicles: Iterable[str], seconds: float) -> None:
         """Give each of these so much time."""
@@ -60,20 +67,27 @@ class Driver:
         while left_s > 0.0:
             if motion.at_rest:
                 if stopped(vehicle.id):
+                    self._rolling.discard(vehicle.id)
                     return 0.0
                 path = self._holdings.path(vehicle.id)
                 if len(path) < 2 or not self._passable(path[0], path[1]):
+                    self._rolling.discard(vehicle.id)
                     return 0.0
                 motion.set_out(path[1])
+                # A vehicle with dynamics of its own has its full pace between two cells before and behind.
+                if self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling):
+                    self._steps[vehicle.id] = (path[1], 0.0)
             before = motion.cell
             pace_s_per_m = self._physics.item(motion.head)
-            if climb is not None:
-                pace_s_per_m *= climb.driven(motion.tail, motion.head)
+            climbing = 1.0 if climb is None else climb.driven(motion.tail, motion.head)
+            pace_s_per_m *= climbing
+            had_s, head, length_m = left_s, motion.head, motion.length_m
             if self._dynamics is None:
                 left_s = motion.advance(left_s, pace_s_per_m)
             else:
                 path = self._holdings.path(vehicle.id)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
+            self._measure(vehicle, head, had_s - left_s, length_m * climbing)
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)
@@ -82,6 +96,21 @@ class Driver:
                 # Even with no time left it has to look before it drives on.
                 return left_s
         return 0.0
+
+    def _measure(self, vehicle: Vehicle, head: int, seconds: float, length_m: float) -> None:
+        """Part of the step to `head` was driven, or its end; as long as one on level ground of `length_m`."""
+        if vehicle.motion.at_rest:
+            self._rolling.add(vehicle.id)
+        step = self._steps.get(vehicle.id)
+        if step is None:
+            return
+        if step[0] != head:  # it has turned back
+            del self._steps[vehicle.id]
+        elif vehicle.motion.at_rest:
+            del self._steps[vehicle.id]
+            self.driven.append((head, (step[1] + seconds) / length_m))
+        else:
+            self._steps[vehicle.id] = (head, step[1] + seconds)
 
     def end_path(self, vehicle: Vehicle) -> None:
         """Give back what lies behind a step that the map does not allow any more."""

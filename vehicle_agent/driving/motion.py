@@ -37,6 +37,11 @@ class Motion:
         return self.done_m / self._length_m if self._length_m else 0.0
 
     @property
+    def length_m(self) -> float:
+        """Metres of the step; 0 at rest."""
+        return self._length_m
+
+    @property
     def left_m(self) -> float:
         """Metres of the step that are not driven yet."""
         return self._length_m - self.done_m

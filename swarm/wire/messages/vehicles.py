@@ -9,6 +9,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from swarm.wire.fields import (
+    MOST_VEHICLES,
     SMALL,
     Cell,
     Column,
@@ -117,7 +118,9 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
     stamp_ns: StampNs
     ids: Annotated[list[VehicleId], SMALL]
     target_ids: Annotated[list[Id], Meta(max_length=MOST_SHARED_TARGETS)]
-    costs_s: Annotated[bytes, Column("<f4", least=0, most=math.inf)]
+    costs_s: Annotated[
+        bytes, Meta(max_length=4 * MOST_VEHICLES * MOST_SHARED_TARGETS), Column("<f4", least=0, most=math.inf)
+    ]
     targets: Annotated[bytes, Column("<u1", per="ids")]
 
     @property

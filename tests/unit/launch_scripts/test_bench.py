@@ -437,3 +437,11 @@ def test_exact_moves_are_those_that_would_have_grown_and_are_counted() -> None:
         assert row["bit_equal"] == 1
         assert row["gave_way"] <= 0.5
         assert row["p50_ms"] > 0
+
+
+def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance() -> None:
+    report = bench("air", "--cells", "24", "--routes", "1000")
+    assert report["clearance_broken"] == 0
+    assert report["lowest_m"] >= report["clearance_m"]
+    assert 1.0 <= report["over_stack_mean"] <= report["over_stack_p95"] < 2
+    assert report["worst_over_scipy"] < 1e-3

@@ -171,7 +171,7 @@ def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> 
     here.watch.see(seen, here.now_ns)  # the same once more: it is as old as it is
     assert here.told == []
     here.tick()
-    assert here.sentences() == ["target t0: no vehicle has seen it for 30.0 s; routes lead to where it was"]
+    assert here.sentences() == ["target t0: no vehicle has seen it for 30.0 s; it is searched for"]
     here.watch.see(msgspec.structs.replace(seen, seq=2), here.now_ns)
     here.tick()
     assert here.told[-1].kind == "tracker-back"

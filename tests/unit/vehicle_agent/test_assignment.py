@@ -65,6 +65,12 @@ def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(
             assert costs_s[other, those].max() <= costs_s[other, vehicle]
 
 
+def test_those_that_have_a_target_keep_it_and_count_for_its_share() -> None:
+    costs_s = np.array([[1.0] * 4, [100.0] * 4])
+    assert spread(costs_s, [-1] * 4, np.array([-1, 0, 0, -1])).tolist() == [1, 0, 0, 1]
+    assert spread(costs_s, [-1] * 4, np.array([0, 0, 0, -1])).tolist() == [0, 0, 0, 1]
+
+
 def test_a_herd_next_to_one_target_sends_most_of_its_vehicles_to_the_others() -> None:
     costs_s = np.array([[1.0] * 10, [100.0] * 10])
     assert np.bincount(spread(costs_s, [0] * 10)).tolist() == [5, 5]

@@ -1,0 +1,124 @@
+"""Ground of what flies: a surface over the terrain, no lower than a clearance and no steeper than can be climbed.
+
+A vehicle of an air class drives on that surface as others do on the ground, by the same trees and routes: pace is
+that of level flight, and a step costs by what it climbs. One surface that follows the terrain comes within a tenth
+to a quarter of the best way through a stack of 64 levels, at a 64th of its cells (`swarm bench air`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Floats
+from shared_map.terrain.step_climb import ENTRIES, Climb
+from swarm.grid import GridSpec
+
+_ROOM = 1.02
+"""How far beyond the grade of a surface the table of factors reaches: rounding makes steps a hair steeper."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flight:
+    """How a class flies.
+
+    speed_mps         over the ground, in level flight
+    clearance_m       least height over the highest ground of a cell and its eight neighbours
+    grade             steepest rise and fall of the surface, metres per metre
+    climb_s_per_m     time that a metre of climb takes in addition to the way
+    descent_s_per_m   the same of a metre of descent
+    """
+
+    speed_mps: float
+    clearance_m: float = 60.0
+    grade: float = 0.15
+    climb_s_per_m: float = 1 / 3
+    descent_s_per_m: float = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class AirGround:
+    """What a tree of an air class is grown over.
+
+    height_m      float32 (rows, cols), above the same zero as the terrain; NaN where nobody flies
+    pace_s_per_m  float32 (rows, cols); inf where nobody flies
+    climb         the factor of a step by its rise
+    """
+
+    height_m: Floats
+    pace_s_per_m: Floats
+    climb: Climb
+
+
+def air_ground(
+    grid: GridSpec, elevation_m: Floats, flight: Flight, closed: NDArray[np.bool_] | None = None
+) -> AirGround:
+    """The ground of an air class.
+
+    Parameters
+    ----------
+    elevation_m : (rows, cols) float32, m; NaN is a void. Nobody flies over a void or beside one, as nobody knows
+        how high it is
+    closed : (rows, cols) bool, no-fly zones; none if not given
+    """
+    lifted = lifted_floor(clearance_floor(elevation_m, flight.clearance_m), flight.grade, grid.resolution_m)
+    unknown = np.isnan(lifted)
+    lethal = unknown if closed is None else unknown | closed
+    pace = np.where(lethal, np.float32(np.inf), np.float32(1.0 / flight.speed_mps))
+    steepest = flight.grade * _ROOM
+    rises = np.linspace(-steepest, steepest, 2 * ENTRIES + 1)
+    metres_s = np.where(rises > 0, rises * flight.climb_s_per_m, -rises * flight.descent_s_per_m)
+    factors = (1.0 + flight.speed_mps * metres_s).astype(np.float32)
+    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest))
+
+
+def clearance_floor(elevation_m: Floats, clearance_m: float) -> NDArray[np.float64]:
+    """The lowest height that keeps the clearance, float64 (rows, cols), m; NaN at voids and beside them.
+
+    It is taken over a cell and its neighbours: so a straight flight between the centres of two neighbours keeps it,
+    too, over any ground that is nowhere higher than the cells around it.
+    """
+    rows, cols = elevation_m.shape
+    padded = np.pad(elevation_m.astype(np.float64), 1, mode="edge")
+    highest = padded[1:-1, 1:-1].copy()
+    for south in range(3):
+        for east in range(3):
+            np.maximum(highest, padded[south : south + rows, east : east + cols], out=highest)  # NaN stays
+    return highest + clearance_m
+
+
+def lifted_floor(floor_m: NDArray[np.float64], grade: float, resolution_m: float) -> Floats:
+    """The lowest surface over a floor that no step of a grid climbs by more than a grade, float32 (rows, cols), m.
+
+    The greatest of `floor - grade x way` over all cells, by the length of the way in steps of eight directions: two
+    passes over the rows (chamfer distance; Borgefors, 1986), as ways bend to one side of a row or the other.
+    Rounded up to float32, so that no rounding takes from the clearance. NaN is no floor, and stays NaN.
+    """
+    void = np.isnan(floor_m)
+    lifted = np.where(void, -np.inf, floor_m)
+    straight_m = grade * resolution_m
+    for rows in (range(len(lifted)), range(len(lifted) - 1, -1, -1)):
+        before: NDArray[np.float64] | None = None
+        for row in rows:
+            here = lifted[row]
+            if before is not None:
+                np.maximum(here, before - straight_m, out=here)
+                np.maximum(here[1:], before[:-1] - math.sqrt(2) * straight_m, out=here[1:])
+                np.maximum(here[:-1], before[1:] - math.sqrt(2) * straight_m, out=here[:-1])
+            _along_the_row(here, straight_m)
+            before = here
+    lifted[void] = np.nan
+    rounded = lifted.astype(np.float32)
+    up: Floats = np.where(rounded < lifted, np.nextafter(rounded, np.float32(np.inf)), rounded)
+    return up
+
+
+def _along_the_row(heights: NDArray[np.float64], step_m: float) -> None:
+    """Lift a row where its own cells need it, to both sides."""
+    fallen = step_m * np.arange(len(heights))
+    for way in (slice(None), slice(None, None, -1)):
+        there = heights[way]
+        np.maximum(there, np.maximum.accumulate(there + fallen) - fallen, out=there)

@@ -1,0 +1,46 @@
+"""A swarm whose prior is wrong about a class of ground learns so, under faults, and all of its maps agree."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import seeded
+from shared_map.cost_map import CostMap
+from shared_map.learning.factors import name_of
+from swarm.config.scenario import Scenario
+
+SECONDS = 20.0
+
+
+def scenario_of(seed: int) -> Scenario:
+    scenario = seeded(seed)
+    hidden = msgspec.structs.replace(scenario.terrain.hidden, class_factor={"grass": 3.0})
+    return msgspec.structs.replace(
+        scenario,
+        terrain=msgspec.structs.replace(scenario.terrain, hidden=hidden),
+        map=msgspec.structs.replace(scenario.map, learning=True),
+    )
+
+
+def maps_of(simulation: Simulation) -> dict[str, CostMap]:
+    services = {name: node.service for name, node in simulation.nodes.items()}
+    return {name: service._cost_map for name, service in services.items() if hasattr(service, "_cost_map")}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", [1])
+def test_the_swarm_learns_what_its_prior_has_wrong_and_all_maps_agree(seed: int) -> None:
+    scenario = scenario_of(seed)
+    simulation = Simulation(scenario, faults=random_plan(seed, nodes_of(scenario), SECONDS))
+    simulation.run_until(SECONDS + 10.0)
+    maps = maps_of(simulation)
+    assert len(maps) >= 4
+    assert len({each.factors.tobytes() for each in maps.values()}) == 1
+    factors = next(iter(maps.values())).factors
+    learned = {name_of(key): float(factors[key]) for key in range(66) if factors[key] != 1}
+    assert any(name.startswith("grass") for name in learned)
+    assert all(2.0 < factor < 4.0 for name, factor in learned.items() if name.startswith("grass"))

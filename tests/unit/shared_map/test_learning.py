@@ -1,0 +1,172 @@
+"""What is learned of kinds of ground: equal at every replica, bounded against lies, and never of lethal ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from shared_map.cost_map import CostMap
+from shared_map.learning.factors import FACTORS, MOST_STEPS, Measured, factors_of, log_steps
+from shared_map.learning.words import MOST, MOST_CELLS, ONE, Said, told
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import beyond_tile
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import MarkKind
+
+SAID = st.builds(Said, st.integers(1, MOST_CELLS), st.integers(-MOST, MOST), st.integers(0, MOST * MOST // ONE))
+WORDS = st.dictionaries(st.integers(0, 255), SAID, max_size=4)
+THRICE = Said(400, round(np.log(3) * ONE), ONE // 10)
+
+
+def _terrain() -> Terrain:
+    pace = np.full((40, 50), 0.5, np.float32)
+    pace[5, 5:20] = np.inf
+    return terrain_of_pace(pace)
+
+
+GROUND = _terrain()
+FEW = settings(max_examples=15, deadline=None)
+
+
+def replica_of(author: str | None, ground: Terrain) -> tuple[MapReplica, CostMap]:
+    cost_map = CostMap(ground, learning=True)
+    return MapReplica(GROUND.grid, cost_map, author=author), cost_map
+
+
+def sets_of(author: str, *said: dict[int, Said]) -> list[MarkSet]:
+    """The sets that an author publishes when it learns these, one after the other."""
+    replica, _ = replica_of(author, GROUND)
+    return [each.mark_set for n, one in enumerate(said) for each in replica.write_learned(one, n * 10**9)]
+
+
+@FEW
+@given(WORDS)
+def test_words_are_read_as_they_were_written(said: dict[int, Said]) -> None:
+    (word,) = sets_of("all.a.1", said)
+    word.check()
+    assert told(word) == said
+
+
+@FEW
+@given(st.data(), st.lists(st.lists(WORDS, min_size=1, max_size=3), min_size=1, max_size=6))
+def test_replicas_have_equal_maps_in_whatever_order_words_come(
+    data: st.DataObject, by_author: list[list[dict[int, Said]]]
+) -> None:
+    sets = [each for n, said in enumerate(by_author) for each in sets_of(f"all.a{n}.1", *said)]
+    maps = []
+    for _ in range(2):
+        order = data.draw(st.permutations(sets + sets[:2]))  # some of them twice
+        cut = data.draw(st.integers(0, len(order)))
+        replica, cost_map = replica_of(None, GROUND)
+        replica.merge(order[:cut])
+        replica.merge(order[cut:])
+        maps.append((replica.held.fingerprint(), cost_map.factors.tobytes(), cost_map.pace_s_per_m.tobytes()))
+    assert maps[0] == maps[1]
+
+
+@given(st.lists(SAID, min_size=4, max_size=8), SAID)
+def test_one_liar_among_five_moves_a_factor_no_further_than_some_honest_author(
+    honest: list[Said], lie: Said
+) -> None:
+    honest = [each._replace(cells=5 + each.cells % 1000) for each in honest]
+    steps = log_steps([*honest, lie._replace(cells=max(lie.cells, 5))])
+    alone = [round(each.mean / 6246) for each in honest]
+    assert min(*alone, 0) - 1 <= steps <= max(*alone, 0) + 1
+
+
+@given(st.lists(st.just(Said(100, 0, ONE // 10)), min_size=2, max_size=3), SAID)
+def test_before_five_a_liar_has_a_bounded_share(honest: list[Said], lie: Said) -> None:
+    share = 2 / (2 + len(honest))
+    assert abs(log_steps([*honest, lie])) * 6246 <= share * MOST + 6246
+
+
+@FEW
+@given(st.dictionaries(st.integers(0, 255), SAID, max_size=30))
+def test_factors_lie_within_a_quarter_and_four(said: dict[int, Said]) -> None:
+    factors = factors_of([said])
+    assert (factors >= 0.25).all()
+    assert (factors <= 4).all()
+
+
+def test_what_is_learned_changes_the_prior_but_neither_marks_nor_lethal_cells() -> None:
+    replica, cost_map = replica_of("all.a.1", GROUND)
+    replica.write([700, 701, 702], [MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR], 0.5, 1)
+    cost_map.take_dirty()
+    replica.write_learned({0: THRICE}, 2)
+    flat = cost_map.pace_s_per_m.reshape(-1)
+    learned = np.float32(0.5) * FACTORS[MOST_STEPS + log_steps([THRICE])]
+    assert flat[700] == 0.5
+    assert flat[701] == np.inf
+    assert flat[702] == learned == flat[0]
+    assert 1.4 < learned < 1.6
+    assert (np.isinf(flat) == np.isinf(GROUND.pace_s_per_m.reshape(-1)) | (np.arange(flat.size) == 701)).all()
+    assert cost_map.take_dirty() == [GROUND.grid.window]
+    replica.retract([700, 701], 3)
+    assert flat[700] == flat[701] == learned
+    replica.write_learned({}, 4)
+    assert (cost_map.pace_s_per_m == GROUND.pace_s_per_m).all()
+
+
+def test_marks_then_learned_equals_learned_then_marks() -> None:
+    rng = np.random.default_rng(3)
+    cells, kinds = rng.integers(0, GROUND.grid.cells, 300), rng.integers(0, 3, 300)
+    marks_of = MapReplica(GROUND.grid, author="all.b.1")
+    marks = [each.mark_set for each in marks_of.write(cells, kinds, 0.7, 1)]
+    words = sets_of("all.a.1", {0: THRICE})
+    one, first = replica_of(None, GROUND)
+    one.merge([*marks, *words])
+    two, second = replica_of(None, GROUND)
+    two.merge(words)
+    for each in marks:
+        two.merge([each])
+    assert (first.pace_s_per_m == second.pace_s_per_m).all()
+
+
+def test_what_is_no_word_changes_nothing() -> None:
+    (word,) = sets_of("all.a.1", {0: THRICE})
+    paces = np.frombuffer(word.paces, "<f4")
+    wrong = [
+        replace(word, paces=np.full(3, 0.5, "<f4").tobytes()),  # a negative number
+        replace(word, paces=np.full(3, 99.0, "<f4").tobytes()),  # more than there can be
+        replace(word, paces=(paces + np.float32(2**-18)).astype("<f4").tobytes()),  # no whole number
+        replace(word, cells=np.array([1, 2, 3], "<u2").tobytes()),
+        replace(word, cells=np.array([900, 901, 902], "<u2").tobytes()),
+        replace(word, kinds=bytes([1, 1, 1])),
+        replace(
+            word, cells=word.cells[:4], kinds=word.kinds[:2], paces=word.paces[:8], stamps_ns=word.stamps_ns[:16]
+        ),
+    ]  # fmt: skip
+    for each in wrong:
+        replica, cost_map = replica_of(None, GROUND)
+        each.check()
+        replica.merge([each])
+        assert told(each) is None
+        assert (cost_map.factors == 1).all()
+    with pytest.raises(ValueError, match="pace"):
+        replace(word, paces=np.full(3, np.nan, "<f4").tobytes()).check()
+
+
+def test_operators_do_not_learn_and_no_set_lies_further_beyond() -> None:
+    (word,) = sets_of("all.a.1", {0: THRICE})
+    replica, cost_map = replica_of(None, GROUND)
+    assert word.tile == beyond_tile(cost_map.grid)
+    replica.merge([replace(word, tile=word.tile + 1), replace(word, author="operator.z1", group="operator")])
+    assert replica.counts["sets_refused"] == 2
+    assert (cost_map.factors == 1).all()
+
+
+def test_a_cell_counts_once_and_what_is_no_pace_not_at_all() -> None:
+    measured = Measured(np.zeros((4, 4), np.uint8))
+    for cell, driven, prior in ((1, 1.5, 0.5), (1, 9.0, 0.5), (2, np.nan, 0.5), (3, 1.0, np.inf), (4, 0.0, 1.0)):
+        measured.add(cell, driven, prior)
+    assert measured.said == {0: Said(1, round(np.log(3) * ONE), 0)}
+
+
+@pytest.mark.parametrize("cells", [4, 5, 20, 400])
+def test_only_what_is_significant_is_learned(cells: int) -> None:
+    assert (log_steps([Said(cells, THRICE.mean, ONE // 10)]) > 8) == (cells >= 5)
+    assert log_steps([Said(cells, ONE // 20, ONE // 10)]) == 0
