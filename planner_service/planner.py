@@ -20,6 +20,7 @@ from planner_service.tree.strides import StrideSearch, StrideShelf
 from planner_service.update import Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
+from swarm.config.classes import GROUND
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
 from swarm.runtime.stats import Counters
@@ -63,6 +64,7 @@ class Planner:
     shelf           where the planners of a machine leave networks of strides for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     time_scale      seconds on the terrain per second: by it a target is taken for teleported
+    vehicle_class   whose routes these are: what the cost map is for
     hidden          of a target that only vehicles see: it is searched for while nobody does
     """
 
@@ -82,8 +84,10 @@ class Planner:
         leads: bool = True,
         time_scale: float = 1.0,
         hidden: Hidden | None = None,
+        vehicle_class: str = GROUND,
     ) -> None:
         self.target = target
+        self.vehicle_class = vehicle_class
         self.leads = leads
         self.tree = tree
         self.counters = counters
@@ -343,6 +347,7 @@ class Planner:
             routes=routes.columns(),
             pose_age_s=self._watch.age_s(now_ns),
             tracker_lost=self._watch.lost(now_ns),
+            vehicle_class=self.vehicle_class,
         )
 
     def _improvable(self, cells: list[int], routes: RouteBatch) -> list[int]:
@@ -391,6 +396,7 @@ class Planner:
             cost_to_go_s=pack_column(costs_s, "<f4"),
             pose_age_s=self._watch.age_s(now_ns),
             tracker_lost=self._watch.lost(now_ns),
+            vehicle_class=self.vehicle_class,
         )
 
     def _cells(self, request: RouteRequest | CostRequest) -> list[int]:

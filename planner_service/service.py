@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
+from planner_service.class_planners import ClassPlanners
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
@@ -14,6 +15,7 @@ from planner_service.search.lookout import hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.strides import StrideSearch
+from shared_map.class_maps import ClassMaps, class_terrains
 from shared_map.cost_map import CostMap
 from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter, readable_for_target
@@ -24,12 +26,14 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.config.classes import GROUND
 from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
@@ -80,37 +84,58 @@ class PlannerService:
         self._sightings = Sightings(filter)
         self._presence = Presence(terrain.grid, _PRESENCE_NS, scenario.vehicles.sense_range_m, filter)
         """Who looks where; nothing is heard of it for a target that has a tracker."""
-        self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
+        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain.grid))
+        self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._faults: list[str] = []
         """What the strategy's plug-in did wrong and nobody has been told yet."""
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
-        tree = TargetTree(
-            terrain.grid,
-            scenario.planner,
-            terrain.climb,
-            all_kernels or (lambda: True),
-            has_worker=True,
-            chosen_by=chosen_by,
-        )
-        if prepared is not None:
-            tree.share(prepared.cell_cost)
-        self._planner = Planner(
-            self._target,
-            setup.incarnation,
-            scenario.planner,
-            tree,
-            self._cost_map,
-            self.counters,
-            route_cells=scenario.vehicles.route_cells,
-            stopwatch=stopwatch,
-            newest_mark_ns=self._replica.take_newest_stamp_ns,
-            shelf=prepared,
-            leads=False,
-            time_scale=scenario.time_scale,
-            hidden=hidden_target(scenario, self._target) if self._untracked else None,
-        )
+
+        def planner_of(name: str, cost_map: CostMap, counters: Counters) -> Planner:
+            tree = TargetTree(
+                terrain.grid,
+                scenario.planner,
+                cost_map.terrain.climb,
+                all_kernels or (lambda: True),
+                has_worker=True,
+                chosen_by=chosen_by,
+            )
+            shelf = prepared if name == GROUND else None
+            if shelf is not None:
+                tree.share(shelf.cell_cost)
+            return Planner(
+                self._target,
+                setup.incarnation,
+                scenario.planner,
+                tree,
+                cost_map,
+                counters,
+                route_cells=scenario.vehicles.route_cells,
+                stopwatch=stopwatch,
+                newest_mark_ns=self._replica.take_newest_stamp_ns if name == GROUND else lambda: None,
+                shelf=shelf,
+                leads=False,
+                time_scale=scenario.time_scale,
+                hidden=hidden_target(scenario, self._target) if self._untracked else None,
+                vehicle_class=name,
+            )
+
+        def make(name: str, now_ns: int) -> Planner:
+            planner = planner_of(name, self._maps.of[name], Counters())  # what the status tells is of "ground"
+            planner.lead(self._planner.leads)
+            self._pace(planner)
+            if self._pose is not None:
+                planner.hear_pose(self._pose, now_ns)
+            for seen in self._sightings.best(now_ns).values():
+                planner.set_pose(pose_of(seen), now_ns)
+            log.info("target %s: a tree for the class %s", self._target, name)
+            return planner
+
+        self._pose: TargetPose | None = None
+        """The newest that a tracker told, for the planner of a class that is made later."""
+        self._planner = planner_of(GROUND, self._cost_map, self.counters)
+        self._planners = ClassPlanners(self._planner, make, self._maps.of)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version = 0
         self._removed = False
@@ -119,9 +144,9 @@ class PlannerService:
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
-        self._search: StrideSearch | None = None
-        """What the worker is looking for, a step at a time; `_searching` while it has a step."""
-        self._searching = False
+        self._searches: dict[str, StrideSearch] = {}
+        """Class -> what the worker is looking for, a step at a time; `_searching` while it has a step."""
+        self._searching: str | None = None
         self.counters.count("marks_merged", 0)
 
     def start(self, now_ns: int) -> None:
@@ -146,40 +171,48 @@ class PlannerService:
             case Heard(message=Sighted() as sighted):
                 if self._sightings.hear(sighted, now_ns):
                     for seen in self._sightings.best(now_ns).values():
-                        self._planner.set_pose(pose_of(seen), now_ns)
+                        for _, planner in self._planners:
+                            planner.set_pose(pose_of(seen), now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
-            case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
-                self._perform(self._planner.adopt(grown, took_ns, now_ns), now_ns)
+            case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag.startswith(_GROW):
+                grows = self._planners.held(_class_of(tag))
+                if grows is not None:
+                    self._perform(grows, grows.adopt(grown, took_ns, now_ns), now_ns)
                 self._answer(now_ns)
-            case WorkDone(tag=tag, result=StrideSearch() as search) if tag == _SEARCH:
-                self._searching = False
-                if search.network is not None:
-                    self._search = None
-                    self._planner.adopt_strides(search)
+            case WorkDone(tag=tag, result=StrideSearch() as search) if tag.startswith(_SEARCH):
+                self._searching = None
+                if search.network is not None and self._searches.pop(_class_of(tag), None) is search:
+                    looks = self._planners.held(_class_of(tag))
+                    if looks is not None:
+                        looks.adopt_strides(search)
             case _:
                 pass
 
     def tick(self, now_ns: int) -> None:
         for heard in self._bus.collected(POSE):
             assert isinstance(heard.message, TargetPose)
-            self._planner.hear_pose(heard.message, now_ns)
+            self._pose = heard.message
+            for _, planner in self._planners:
+                planner.hear_pose(heard.message, now_ns)
         for heard in self._bus.collected(CHASERS):
             assert isinstance(heard.message, Chasers)
-            self._planner.hear_chasers(heard.message, now_ns)
+            name = heard.message.vehicle_class
+            if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
+                self._planners.used(name, now_ns).hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
         self._look(now_ns)
         self._obey()
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
-        self._perform(self._planner.tick(now_ns), now_ns)
+        self._planners.drop_unused(now_ns)
+        for _, planner in self._planners:
+            self._perform(planner, planner.tick(now_ns), now_ns)
         self._now_ns = now_ns
         self._obedience.tick(now_ns)
         self._answer(now_ns)
-        if self._search is not None and not self._searching:
-            self._searching = True
-            self._worker.submit(_SEARCH, self._search.step, self._post, self._planner.tree.times.model_ns)
+        self._look_for_strides()
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]
         if self._planner.tree.ready and not self._served:
@@ -188,28 +221,47 @@ class PlannerService:
         self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
+    def _look_for_strides(self) -> None:
+        for name in list(self._searches):
+            if self._planners.held(name) is None:
+                del self._searches[name]
+        if self._searching is None and self._searches:
+            self._searching, search = next(iter(self._searches.items()))
+            model_ns = self._planner.tree.times.model_ns
+            self._worker.submit(_tag(_SEARCH, self._searching), search.step, self._post, model_ns)
+
     def _look(self, now_ns: int) -> None:
         """Take in where vehicles are, who would see a target that nobody tracks."""
-        lookout = self._planner.lookout
-        if lookout is None:
+        if self._planner.lookout is None:
             return
         for heard in self._bus.collected(FLEET):
             assert isinstance(heard.message, Fleet)
             self._presence.hear(heard.message, now_ns)
         self._presence.expire(now_ns)
         vehicles = self._presence.vehicles
-        lookout.hear_vehicles(vehicles.east_m, vehicles.south_m)
+        for _, planner in self._planners:
+            if planner.lookout is not None:
+                planner.lookout.hear_vehicles(vehicles.east_m, vehicles.south_m)
 
     def _answer(self, now_ns: int) -> None:
         """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""
         while self._held:
             asked_ns, event = self._held[0]
-            waits = self._planner.must_wait and len(self._held) <= _MOST_HELD
+            request = event.request
+            assert isinstance(request, RouteRequest | CostRequest)
+            name = request.vehicle_class
+            fault = self._planners.fault(name)
+            if fault is not None:
+                self._held.popleft()
+                event.refuse(fault)
+                event.end()
+                continue
+            planner = self._planners.used(name, now_ns)
+            waits = self._planners.must_wait(name, now_ns) and len(self._held) <= _MOST_HELD
             if waits and now_ns - asked_ns < _HOLD_NS:
                 return
             self._held.popleft()
-            assert isinstance(event.request, RouteRequest | CostRequest)
-            reply = self._planner.answer(event.request, now_ns)
+            reply = planner.answer(request, now_ns)
             if isinstance(reply, Refusal):
                 event.refuse(reply.reason)
             else:
@@ -228,9 +280,15 @@ class PlannerService:
             if heard != self._heard_groups:
                 self._heard_groups = heard
                 self._replica.hear(heard)
-        if self._planner.lookout is not None:
-            self._planner.lookout.time_scale = book.setting("time_scale", scenario.time_scale)
-        self._planner.set_pace(
+        for _, planner in self._planners:
+            self._pace(planner)
+
+    def _pace(self, planner: Planner) -> None:
+        """Set a planner's pace as it is ordered."""
+        book, scenario = self._obedience.book, self._scenario
+        if planner.lookout is not None:
+            planner.lookout.time_scale = book.setting("time_scale", scenario.time_scale)
+        planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
             book.setting("planner.push_s", scenario.planner.push_s),
         )
@@ -253,7 +311,8 @@ class PlannerService:
         """Serve the target, or leave that to another. A query which comes meanwhile is answered all the same."""
         if leads == self._planner.leads:
             return
-        self._planner.lead(leads)
+        for _, planner in self._planners:
+            planner.lead(leads)
         for topic in (ROUTE, COST):
             if leads:
                 self._bus.serve(topic, self._post, target=self._target)
@@ -261,13 +320,16 @@ class PlannerService:
                 self._bus.unserve(topic, target=self._target)
         self._candidacy.tell(self._member, now_ns)
 
-    def _perform(self, actions: list[Action], now_ns: int) -> None:
+    def _perform(self, planner: Planner, actions: list[Action], now_ns: int) -> None:
+        name = planner.vehicle_class
         for action in actions:
             match action:
                 case GrowTree(job):
-                    self._worker.submit(_GROW, job, self._post, self._planner.tree.times.model_ns)
+                    self._worker.submit(_tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
                 case FindStrides(search):
-                    self._search = search
+                    self._searches[name] = search
+                case PlannerStatus() | Tell() if name != GROUND:
+                    pass  # the planner of "ground" has told the same of the target
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:
@@ -275,3 +337,12 @@ class PlannerService:
                 case Tell(kind, text, cell):
                     log.info("%s: %s", kind, text)
                     self._member.note(now_ns, kind, text, cell)
+
+
+def _tag(work: str, name: str) -> str:
+    """What a piece of work for a class is called."""
+    return f"{work}/{name}"
+
+
+def _class_of(tag: str) -> str:
+    return tag.partition("/")[2]

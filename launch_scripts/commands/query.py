@@ -112,6 +112,9 @@ def route(
     end: Annotated[
         str | None, typer.Option("--to", metavar="PLACE", help="With --terrain: where to, as --from.")
     ] = None,
+    vehicle_class: Annotated[
+        str, typer.Option("--class", help="Which class of the swarm's vehicles drives there.")
+    ] = "ground",
     out: Annotated[
         Path | None, typer.Option(help="Write .geojson, .gpx, .kml or .csv; with --terrain also .png, a picture.")
     ] = None,
@@ -149,7 +152,10 @@ def route(
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
     from launch_scripts.commands.routes import swarm_route
 
-    answer = swarm_route.ask_planner(where.network(tls), where, target, place, cost=cost, steps=steps)
+    network = where.network(tls)
+    answer = swarm_route.ask_planner(
+        network, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
+    )
     if out is not None:
         swarm_route.write(answer, out)
     if as_json:

@@ -36,6 +36,7 @@ from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded
 from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.zones import ZoneFacts, files_of_zone, paint_zones
+from swarm.config.classes import GROUND, of_class
 from swarm.config.ground import CostConfig
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.plugin_names import cost_layers_of
@@ -87,28 +88,30 @@ class Terrain:
         return np.isinf(self.pace_s_per_m)
 
 
-def build_terrain(scenario: Scenario, progress: Progress = no_progress) -> Terrain:
-    """The terrain of a scenario. Raises TerrainError with one sentence."""
+def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_class: str = GROUND) -> Terrain:
+    """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence."""
     from shared_map.terrain.importers.sources import load_source
 
     source = load_source(scenario.terrain, scenario.seed, progress)
     try:
-        return _built(scenario, source, progress)
+        return _built(of_class(scenario, vehicle_class), source, progress, scenario.cost)
     except MemoryError as error:
         raise TerrainError(
             f"terrain {scenario.terrain.source} does not fit into memory; set a larger terrain.resolution_m"
         ) from error
 
 
-def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
+def _built(scenario: Scenario, source: Source, progress: Progress, common: CostConfig) -> Terrain:
+    """common  the cost by which roads are laid: they are the same for every class"""
     grid, classes, cost = source.grid, source.classes, scenario.cost
     notes = list(source.notes)
     ground = _ground(source, classes, cost, progress)
     if scenario.terrain.roads:
-        _check_passable(ground, source.elevation_m, classes, cost, grid)
+        open_ground = ground if cost is common else _ground(source, classes, common, progress)
+        _check_passable(open_ground, source.elevation_m, classes, common, grid)
         from shared_map.terrain.synthetic.roads import lay_roads
 
-        laid = lay_roads(ground, scenario.terrain.roads, grid, scenario.seed)
+        laid = lay_roads(open_ground, scenario.terrain.roads, grid, scenario.seed)
         classes = np.where(laid, np.uint8(TerrainClass.ROAD), classes)
         ground[laid] = np.float32(1 / cost.road_speed_m_per_s)
         notes.append(f"{scenario.terrain.roads} roads laid between seeded places, {int(laid.sum())} cells")

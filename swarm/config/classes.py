@@ -29,15 +29,12 @@ SHARED = ("zones", "layers", "directional")
 class ClassConfig(Section, frozen=True, kw_only=True):
     """A class of vehicles, beside "ground", which is that of `[cost]` and `[vehicles]`.
 
-    name                   what groups and queries call it
-    kind                   ground: it drives
-    cost                   what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
+    name               what groups and queries call it
+    kind               ground: it drives
+    cost               what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
                            and `directional` are those of `[cost]`
-    max_speed_m_per_s      none of the speeds of its cost is more than this: level, on roads, downhill
-    sense_range_m          radius of its simulated sensor; `vehicles.sense_range_m` if not given
-    acceleration_m_per_s2  its speed changes by no more in a second; at once if not given
-    turn_rate_deg_per_s    it turns by no more in a second, and slows where its way asks for more; at once if not
-                           given
+    max_speed_m_per_s  none of the speeds of its cost is more than this: level, on roads, downhill
+    sense_range_m      radius of its simulated sensor; `vehicles.sense_range_m` if not given
     """
 
     name: Name
@@ -45,8 +42,6 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     cost: CostConfig = CostConfig()
     max_speed_m_per_s: Annotated[float, Meta(ge=0.01, le=340)] | None = None
     sense_range_m: Positive | None = None
-    acceleration_m_per_s2: Annotated[float, Meta(ge=0.01, le=1000)] | None = None
-    turn_rate_deg_per_s: Annotated[float, Meta(ge=0.1, le=10_000)] | None = None
 
 
 def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from launch_scripts.commands.run_frame import frame_of_run
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import AskEnded, Replied
 from swarm.bus.zenoh_bus import open_bus
+from swarm.config.classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
@@ -65,14 +66,25 @@ def _leads(route: Route) -> bool:
 
 
 def ask_planner(
-    network: NetworkConfig, where: object, target: str, start: Place, *, cost: bool, steps: int
+    network: NetworkConfig,
+    where: object,
+    target: str,
+    start: Place,
+    *,
+    cost: bool,
+    steps: int,
+    vehicle_class: str = GROUND,
 ) -> Answer:
     """Ask for the route, or with `cost` for its cost only. Raises BusError or ConfigError in one sentence."""
     with open_bus(network) as bus:
         frame = frame_of_run(bus, where)
         cell = cell_of(start, frame, "--from")
         row, col = frame.grid.row_col(cell)
-        request = CostRequest(row=row, col=col) if cost else RouteRequest(row=row, col=col, max_cells=steps)
+        request = (
+            CostRequest(row=row, col=col, vehicle_class=vehicle_class)
+            if cost
+            else RouteRequest(row=row, col=col, max_cells=steps, vehicle_class=vehicle_class)
+        )
         began_s = time.monotonic()
         reply = _ask(bus, request, target, where)
         return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)

@@ -151,6 +151,9 @@ def cost(
     out: Annotated[Path | None, typer.Option(help="Write seconds per metre as GeoTIFF; lethal is -1.")] = None,
     picture: PictureOption = None,
     preset: PresetOption = None,
+    vehicle_class: Annotated[
+        str, typer.Option("--class", help="For which of the scenario's classes of vehicles.")
+    ] = "ground",
 ) -> None:
     """Build the prior cost map of a scenario; write it and a picture of it.
 
@@ -168,7 +171,7 @@ def cost(
     loaded = _scenario(scenario, preset)
     with progress() as tell:
         started = time.perf_counter()
-        terrain = build_terrain(loaded, tell)
+        terrain = build_terrain(loaded, tell, vehicle_class)
         seconds = time.perf_counter() - started
         if out is not None:
             _write_cost(terrain, out, tell)

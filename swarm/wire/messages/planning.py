@@ -27,6 +27,9 @@ from swarm.wire.fields import (
 from swarm.wire.messages.base import Message, schema_of
 from swarm.wire.routes import Route, Routes
 
+GROUND = "ground"
+"""The class of vehicles that a request means which names none."""
+
 
 class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-request")):
     """Asks for routes from cells to the planner's target. A person may give `row` and `col` instead of `cells`.
@@ -34,6 +37,7 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
     vehicles   ids in the order of `cells`; newer routes are pushed to these until they ask another planner
     max_cells  most steps of each route; 0 is the whole route
     force      a route ran out: the planner extends its window to these cells
+    vehicle_class  whose routes: those of another class of vehicles follow another tree
     """
 
     cells: Annotated[list[Cell], LARGE] = []
@@ -42,6 +46,7 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
     force: bool = False
     row: Cell | None = None
     col: Cell | None = None
+    vehicle_class: Id = GROUND
 
     def relate(self) -> None:
         if self.vehicles and len(self.vehicles) != len(self.cells):
@@ -58,6 +63,7 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     tree_age_ms  time since the last full growth
     pose_age_s   time since the pose arrived that the route leads to; None before the first
     tracker_lost  nobody tracks the target now: it was there, and may be anywhere
+    vehicle_class  whose routes these are
     """
 
     target: Id
@@ -70,6 +76,7 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     routes: Routes
     pose_age_s: AgeSeconds | None = None
     tracker_lost: bool = False
+    vehicle_class: Id = GROUND
 
 
 class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-route")):
@@ -84,11 +91,12 @@ class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-rout
 
 
 class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-request")):
-    """Asks what it costs to reach the planner's target from each of these cells."""
+    """Asks what it costs to reach the planner's target from each of these cells, in a vehicle of a class."""
 
     cells: Annotated[list[Cell], LARGE] = []
     row: Cell | None = None
     col: Cell | None = None
+    vehicle_class: Id = GROUND
 
     def relate(self) -> None:
         if (self.row is None) != (self.col is None):
@@ -107,6 +115,7 @@ class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
     cost_to_go_s: Annotated[bytes, Meta(max_length=4 * 100_001), Column("<f4", least=0, most=math.inf)]
     pose_age_s: AgeSeconds | None = None
     tracker_lost: bool = False
+    vehicle_class: Id = GROUND
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):

@@ -98,6 +98,7 @@ class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
     stamp_ns: StampNs
     ids: Annotated[list[VehicleId], SMALL]
     cells: Annotated[bytes, Column("<u4", per="ids")]
+    vehicle_class: Id = "ground"
 
 
 MOST_SHARED_TARGETS = 64

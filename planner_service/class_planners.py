@@ -1,0 +1,66 @@
+"""The planners of one target for the classes of vehicles: one tree each, kept as long as somebody of it asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+
+from planner_service.planner import Planner
+from swarm.clock import NS_PER_S
+from swarm.config.classes import GROUND
+from swarm.config.explain import choice
+
+UNUSED_NS = 60 * NS_PER_S
+"""A tree that nobody has asked for so long is dropped."""
+_BEGINS_NS = NS_PER_S
+"""A query waits so long at most for the first tree of its class."""
+
+
+class ClassPlanners:
+    """The planner of "ground", which is always there, and those of other classes.
+
+    make   makes the planner of a class
+    known  the classes that there are, beside "ground"
+    """
+
+    def __init__(self, ground: Planner, make: Callable[[str, int], Planner], known: Collection[str]) -> None:
+        self._make = make
+        self._known = known
+        self._by_class: dict[str, Planner] = {GROUND: ground}
+        self._used_ns: dict[str, int] = {}
+        self._begun_ns: dict[str, int] = {}
+
+    def __iter__(self) -> Iterator[tuple[str, Planner]]:
+        """(class, planner) of all that there are, "ground" first."""
+        return iter(list(self._by_class.items()))
+
+    def fault(self, name: str) -> str | None:
+        """Why nothing can be asked for a class; None if something can."""
+        if name == GROUND or name in self._known:
+            return None
+        known = [GROUND, *self._known]
+        return f"there is no class {name!r}{choice(name, known, ' there are ')}"
+
+    def held(self, name: str) -> Planner | None:
+        """The planner of a class, if it is there."""
+        return self._by_class.get(name)
+
+    def used(self, name: str, now_ns: int) -> Planner:
+        """The planner of a known class that somebody needs; made if it is not there."""
+        planner = self._by_class.get(name)
+        if planner is None:
+            planner = self._by_class[name] = self._make(name, now_ns)
+            self._begun_ns[name] = now_ns
+        self._used_ns[name] = now_ns
+        return planner
+
+    def must_wait(self, name: str, now_ns: int) -> bool:
+        """Whether a query had better wait: there is nothing to answer from yet, and soon there will be."""
+        planner = self._by_class[name]
+        begins = name in self._begun_ns and now_ns - self._begun_ns[name] < _BEGINS_NS
+        return planner.must_wait or (begins and not planner.tree.ready)
+
+    def drop_unused(self, now_ns: int) -> None:
+        """Forget what nobody has asked for a minute."""
+        for name, used_ns in list(self._used_ns.items()):
+            if name != GROUND and now_ns - used_ns >= UNUSED_NS:
+                del self._by_class[name], self._used_ns[name], self._begun_ns[name]

@@ -1,0 +1,211 @@
+"""One tree per class of vehicles: made when asked for, true to the class's own ground, dropped when unused."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.planner_swarm import TICK, Ear
+from support.swarm_model import SwarmModel
+
+from planner_service import class_planners
+from planner_service.service import PlannerService
+from shared_map.class_maps import ClassMaps, class_terrains, read_by
+from shared_map.cost_map import CostMap
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.bus.scheduler import InlineWorker
+from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.grid import walk
+from swarm.wire.fields import column
+from swarm.wire.messages.planning import CostRequest, RouteRequest
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.routes import RouteStatus
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import COST, POSE, ROUTE
+
+_TEXT = """
+seed = 3
+terrain = { source = "synthetic", rows = 48, cols = 48, relief_m = 500.0, roads = 2 }
+cost = { max_slope_deg = 25.0 }
+planner = { strategy = "full" }
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 1.5
+cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.2, road_speed_m_per_s = 1.4, max_slope_deg = 45.0 }
+[[classes]]
+name = "low"
+cost = { max_slope_deg = 15.0, vehicle_radius_m = 12.0 }
+[[classes]]
+name = "same"
+"""
+
+
+@cache
+def _made() -> tuple[Scenario, Terrain, dict[str, Terrain]]:
+    scenario = parse_scenario(_TEXT)
+    terrain = build_terrain(scenario)
+    return scenario, terrain, class_terrains(scenario, terrain.grid)
+
+
+def test_each_class_has_its_own_ground_on_the_same_roads() -> None:
+    _, terrain, classes = _made()
+    assert classes["same"].digest == terrain.digest
+    assert np.array_equal(classes["same"].pace_s_per_m, terrain.pace_s_per_m)
+    assert classes["walker"].lethal.sum() < terrain.lethal.sum() < classes["low"].lethal.sum()
+    assert all(np.array_equal(each.classes, terrain.classes) for each in classes.values())
+    assert float(classes["walker"].pace_s_per_m.min()) >= np.float32(1 / 1.5)
+
+
+# --- marks ----------------------------------------------------------------------------------------------------
+
+_STATEMENTS = st.lists(
+    st.tuples(
+        st.integers(0, 48 * 48 - 1),
+        st.sampled_from(list(MarkKind)),
+        st.floats(0.015625, 64, width=32),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(first=_STATEMENTS, second=_STATEMENTS)
+def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(
+    first: list[Any], second: list[Any]
+) -> None:
+    _, terrain, classes = _made()
+    in_turn, at_once = (ClassMaps(CostMap(terrain), classes) for _ in range(2))
+    for batch in (first, second):
+        _apply(in_turn, batch)
+    _apply(at_once, list({cell: each for each in first + second for cell in each[:1]}.values()))
+    common = in_turn.common
+    for name, cost_map in in_turn.of.items():
+        own = classes[name]
+        assert np.array_equal(cost_map.pace_s_per_m, at_once.of[name].pace_s_per_m)
+        assert np.isinf(cost_map.pace_s_per_m[np.isinf(own.ground_s_per_m)]).all()
+        closed_by_mark = np.isinf(common.ground_s_per_m) & np.isfinite(terrain.ground_s_per_m)
+        assert np.isinf(cost_map.pace_s_per_m[closed_by_mark]).all()
+        truth = read_by(own.ground_s_per_m.ravel(), terrain.ground_s_per_m.ravel(), common.ground_s_per_m.ravel())
+        unmarked = np.ones(terrain.grid.cells, bool)
+        unmarked[[each[0] for each in first + second]] = False
+        assert np.array_equal(truth[unmarked], own.ground_s_per_m.ravel()[unmarked])
+    same = in_turn.of["same"]
+    open_before = np.isfinite(terrain.pace_s_per_m)
+    assert np.array_equal(same.pace_s_per_m[open_before], common.pace_s_per_m[open_before])
+
+
+def _apply(maps: ClassMaps, batch: list[Any]) -> None:
+    cells = np.array([each[0] for each in batch], np.uint32)
+    kinds = np.array([each[1] for each in batch], np.uint8)
+    maps.apply(cells, kinds, np.array([each[2] for each in batch], np.float32))
+
+
+# --- planners -------------------------------------------------------------------------------------------------
+
+
+class _World(SwarmModel):
+    def __init__(self) -> None:
+        scenario, terrain, _ = _made()
+        super().__init__(terrain=terrain, scenario=scenario)
+        self.ear = Ear(self)
+        setup = self.setup("planner", "t", 1)
+        worker = InlineWorker(self.scheduler)
+        self.service = self.start(
+            "planner-t", lambda bus, post: PlannerService(setup, terrain, bus, post, worker), phase_ns=0
+        )
+        self.target = _open_cell()
+        self._seq = 0
+        self._track()
+
+    def _track(self) -> None:
+        self._seq += 1
+        pose = TargetPose(target="t", incarnation=1, seq=self._seq, stamp_ns=0, cell=self.target, x_m=0, y_m=0)
+        self.ear.bus.publish(POSE, pose, target="t")
+        self.scheduler.after(TICK, self._track)
+
+    def ask(self, request: RouteRequest | CostRequest) -> Any:
+        self.ear.ended.clear()
+        self.ear.ask(ROUTE if isinstance(request, RouteRequest) else COST, request, target="t")
+        while not self.ear.ended:
+            self.run(0.1)
+        return self.ear.replies[0] if self.ear.replies else None
+
+    def trees(self) -> list[str]:
+        return [name for name, _ in self.service._planners]
+
+
+def _open_cell() -> int:
+    _, terrain, classes = _made()
+    for_all = np.isfinite(terrain.pace_s_per_m)
+    for each in classes.values():
+        for_all &= np.isfinite(each.pace_s_per_m)
+    cells = np.flatnonzero(for_all)
+    return int(cells[len(cells) // 2])
+
+
+@pytest.fixture(scope="module")
+def world() -> _World:
+    made = _World()
+    made.run(2.0)
+    return made
+
+
+def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(
+    world: _World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(class_planners, "UNUSED_NS", 5 * NS_PER_S)  # a minute of ticks would show no more
+    assert world.trees() == ["ground"]
+    reply = world.ask(CostRequest(cells=[world.target], vehicle_class="walker"))
+    assert (reply.vehicle_class, world.trees()) == ("walker", ["ground", "walker"])
+    world.run(3)
+    assert world.trees() == ["ground", "walker"]
+    world.run(3)
+    assert world.trees() == ["ground"]
+
+
+def test_a_class_that_says_nothing_has_the_routes_of_ground_to_the_bit(world: _World) -> None:
+    cells = list(range(0, world.terrain.grid.cells, 37))
+    ground, same = (world.ask(RouteRequest(cells=cells, vehicle_class=name)) for name in ("ground", "same"))
+    assert ground.routes == same.routes
+    costs = [world.ask(CostRequest(cells=cells, vehicle_class=name)) for name in ("ground", "same")]
+    assert costs[0].cost_to_go_s == costs[1].cost_to_go_s
+
+
+@pytest.mark.parametrize("name", ["walker", "low"])
+def test_no_route_of_a_class_enters_what_is_lethal_to_it(world: _World, name: str) -> None:
+    own = _made()[2][name].pace_s_per_m.ravel()
+    cells = list(range(0, world.terrain.grid.cells, 11))
+    reply = world.ask(RouteRequest(cells=cells, vehicle_class=name))
+    found = 0
+    for route in reply.routes:
+        if route.status is RouteStatus.OK:
+            found += 1
+            assert np.isfinite(own[walk(world.terrain.grid, route.start, route.directions)]).all()
+            assert route.lower_bound_s <= route.cost_s * (1 + 1e-6)
+        elif np.isinf(own[route.start]):
+            assert route.status is RouteStatus.LETHAL_START
+    assert found > 5
+
+
+def test_what_one_class_reaches_another_may_not(world: _World) -> None:
+    cells = list(range(world.terrain.grid.cells))
+    costs = {
+        name: column(world.ask(CostRequest(cells=cells, vehicle_class=name)).cost_to_go_s, "<f4")
+        for name in ("ground", "walker", "low")
+    }
+    reached = {name: int(np.isfinite(each).sum()) for name, each in costs.items()}
+    assert reached["walker"] > reached["ground"] > reached["low"] > 0
+    both = np.isfinite(costs["walker"]) & np.isfinite(costs["ground"]) & (costs["ground"] > 0)
+    assert (costs["walker"][both] > costs["ground"][both]).mean() > 0.9  # on foot
+
+
+def test_an_unknown_class_is_refused_with_those_there_are(world: _World) -> None:
+    assert world.ask(RouteRequest(cells=[0], vehicle_class="boat")) is None
+    assert "no class 'boat'" in str(world.ear.ended[0].failure)
+    assert world.trees()[0] == "ground"
