@@ -2,12 +2,13 @@
 
 A mark says what the ground of a cell is for the class "ground", as sensors and operators tell it. Another class
 reads it by its own rule: what is lethal by a mark is so for all; a pace that is three times the prior is so for
-that class, too. What a class cannot drive by its own rule no mark opens.
+that class, too, and so is what is learned of a kind of ground. What a class cannot drive by its own rule no mark
+opens.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
+from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
 
 
@@ -64,8 +66,13 @@ class ClassMaps:
 
     def __init__(self, common: CostMap, terrains: Mapping[str, Terrain]) -> None:
         self.common = common
-        self.of = {name: CostMap(terrain) for name, terrain in terrains.items()}
+        self.of = {name: CostMap(terrain, learning=common.keys is not None) for name, terrain in terrains.items()}
         self._prior = common.terrain.ground_s_per_m.reshape(-1)
+
+    def learn(self, words: Sequence[MarkSet]) -> None:
+        """As `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""
+        for cost_map in (self.common, *self.of.values()):
+            cost_map.learn(words)
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
         """As `CostMap.apply`, to each map what the statements are to its class."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -12,7 +12,7 @@ from msgspec import Meta
 from swarm.config.cost_rules import PRESETS, check_cost
 from swarm.config.explain import choice
 from swarm.config.ground import CostConfig
-from swarm.config.values import Name, Positive, Section
+from swarm.config.values import Name, Section
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -27,21 +27,17 @@ SHARED = ("zones", "layers", "directional")
 
 
 class ClassConfig(Section, frozen=True, kw_only=True):
-    """A class of vehicles, beside "ground", which is that of `[cost]` and `[vehicles]`.
+    """A class of vehicles whose routes may be asked for, beside "ground": that of `[cost]` and `[vehicles]`.
 
-    name               what groups and queries call it
-    kind               ground: it drives
+    name               what queries call it
     cost               what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
                            and `directional` are those of `[cost]`
     max_speed_m_per_s  none of the speeds of its cost is more than this: level, on roads, downhill
-    sense_range_m      radius of its simulated sensor; `vehicles.sense_range_m` if not given
     """
 
     name: Name
-    kind: Literal["ground"] = "ground"
     cost: CostConfig = CostConfig()
     max_speed_m_per_s: Annotated[float, Meta(ge=0.01, le=340)] | None = None
-    sense_range_m: Positive | None = None
 
 
 def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
@@ -90,11 +86,6 @@ def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
             check_cost(each.cost, f"{source}: classes[{n}]")
         except ConfigError as error:
             yield str(error)
-    known = [GROUND, *names]
-    for n, group in enumerate(scenario.groups):
-        if group.vehicle_class not in known:
-            there = choice(group.vehicle_class, known, " there are ")
-            yield f"{source}: groups[{n}].vehicle_class is {group.vehicle_class!r}, which is no class{there}"
 
 
 def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
@@ -109,15 +100,12 @@ def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
 
 
 def of_class(scenario: Scenario, name: str) -> Scenario:
-    """The scenario as it is for vehicles of one class: its cost and its sensor are theirs. That of `GROUND` is the
-    scenario itself. Raises ConfigError on an unknown class."""
+    """The scenario as it is for vehicles of one class: its cost is theirs. That of `GROUND` is the scenario itself.
+    Raises ConfigError on an unknown class."""
     own = class_named(scenario, name)
     if own is None:
         return scenario
-    vehicles = scenario.vehicles
-    if own.sense_range_m is not None:
-        vehicles = msgspec.structs.replace(vehicles, sense_range_m=own.sense_range_m)
-    return msgspec.structs.replace(scenario, cost=_limited(own), vehicles=vehicles)
+    return msgspec.structs.replace(scenario, cost=_limited(own))
 
 
 def _limited(own: ClassConfig) -> CostConfig:

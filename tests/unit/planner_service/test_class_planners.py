@@ -16,6 +16,8 @@ from planner_service import class_planners
 from planner_service.service import PlannerService
 from shared_map.class_maps import ClassMaps, class_terrains, read_by
 from shared_map.cost_map import CostMap
+from shared_map.learning.words import ONE, Said
+from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
@@ -209,3 +211,21 @@ def test_an_unknown_class_is_refused_with_those_there_are(world: _World) -> None
     assert world.ask(RouteRequest(cells=[0], vehicle_class="boat")) is None
     assert "no class 'boat'" in str(world.ear.ended[0].failure)
     assert world.trees()[0] == "ground"
+
+
+def test_what_is_learned_of_a_kind_of_ground_holds_for_every_class() -> None:
+    _, terrain, classes = _made()
+    maps = ClassMaps(CostMap(terrain, learning=True), classes)
+    writer = MapReplica(terrain.grid, CostMap(terrain, learning=True), author="all.a0.1")
+    kinds = np.unique(maps.common.keys[np.isfinite(terrain.pace_s_per_m)])  # type: ignore[index]
+    learned = {int(kind): Said(500, round(np.log(3) * ONE), ONE // 10) for kind in kinds}
+    maps.learn([each.mark_set for each in writer.write_learned(learned, 10**9)])
+    assert (maps.common.version, {name: each.version for name, each in maps.of.items()}) == (
+        1,
+        dict.fromkeys(classes, 1),
+    )
+    assert np.array_equal(maps.of["same"].pace_s_per_m, maps.common.pace_s_per_m)
+    for name, cost_map in maps.of.items():
+        free = np.isfinite(classes[name].pace_s_per_m)
+        assert (np.isfinite(cost_map.pace_s_per_m) == free).all()
+        assert np.median(cost_map.pace_s_per_m[free] / classes[name].pace_s_per_m[free]) > 2

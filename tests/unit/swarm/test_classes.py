@@ -15,12 +15,9 @@ from swarm.errors import ConfigError
 
 _TWO = """
 cost = { slope_rule = "table", slope_table = [[-30, 2.0], [0, 1.0], [30, 4.0]], max_slope_deg = 25.0 }
-[[groups]]
-vehicle_class = "walker"
 [[classes]]
 name = "walker"
 max_speed_m_per_s = 0.5
-sense_range_m = 40.0
 cost = { preset = "hiker", class_factor = { rock = 1.25 } }
 [[classes]]
 name = "same"
@@ -33,9 +30,7 @@ def test_a_class_is_what_it_says_over_its_preset_over_the_common_cost() -> None:
     assert (walker.cost.slope_rule, walker.cost.max_slope_deg, walker.cost.slope_table) == ("tobler", 40.0, ())
     speeds = walker.cost.flat_speed_m_per_s, walker.cost.road_speed_m_per_s, walker.cost.top_speed_m_per_s
     assert speeds == (0.5, 0.5, 0.5)
-    assert walker.vehicles.sense_range_m == 40.0
     assert walker.cost.class_factor == {"rock": 1.25}
-    assert scenario.groups[0].vehicle_class == "walker"
 
 
 def test_a_class_that_says_nothing_is_the_scenario_itself() -> None:
@@ -65,9 +60,8 @@ def test_classes_keep_the_preset_of_the_common_cost() -> None:
     [
         ('classes = [{ name = "a" }, { name = "a" }]', "classes: two classes are called 'a'; rename one"),
         ('classes = [{ name = "ground" }]', "classes: 'ground' is the class of [cost] and [vehicles] itself"),
-        ('groups = [{ vehicle_class = "boat" }]', "groups[0].vehicle_class is 'boat', which is no class"),
         ('classes = [{ name = "a", wings = 2 }]', "wings"),
-        ('classes = [{ name = "a", kind = "air" }]', "classes[0].kind"),
+        ('classes = [{ name = "a", kind = "air" }]', "kind"),
         (
             'classes = [{ name = "a", cost = { directional = true } }]',
             "cost.directional is for all classes",
