@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,8 @@ class Ways:
         self._cost: Floats = np.empty(0, np.float32)
         self._parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._root = -1
+        self._depths: Floats | None = None
+        """Heights below zero, padded: those of the way back. None before they are asked for."""
 
     @property
     def grid(self) -> GridSpec:
@@ -45,13 +48,26 @@ class Ways:
         return self._costs.passable(cell)
 
     def grow(self, cell: int) -> None:
-        """Find the cheapest ways between a passable cell and all others."""
+        """Find the cheapest ways from a passable cell to all others."""
         if not self._cost.size:
             self._cost = np.empty(self._costs.size, np.float32)
             self._parent = np.empty(self._costs.size, np.uint8)
         self._parent.fill(NONE)
-        self._costs.grow(self._costs.pad(cell), self._cost, self._parent)
+        self._back.grow(self._costs.pad(cell), self._cost, self._parent)
         self._root = cell
+
+    @property
+    def _back(self) -> CostGrid:
+        """The cell costs as they are now for whoever drives ways backwards: trees lead to their root, and vehicles
+        away from it. What was uphill is downhill."""
+        climbs = self._costs.climbs
+        if climbs is None:
+            return self._costs
+        if self._depths is None:
+            self._depths = -climbs[0]
+        back = copy.copy(self._costs)
+        back.climbs = (self._depths, *climbs[1:])
+        return back
 
     def costs_s(self, cells: NDArray[np.int64]) -> Floats:
         """float32, s: between the cell of the last growth and these; inf where there is no way, or for -1."""
@@ -62,19 +78,11 @@ class Ways:
 
     def way_to(self, goal: int) -> Way:
         """The way from the cell of the last growth to one that is not inf by `costs_s`."""
-        start, costs = self._root, self._costs
-        if costs.climbs is not None:  # downhill is not uphill: the way back is another
-            self.grow(goal)
-            directions = self._walked(goal, start)
-        else:
-            back = self._walked(start, goal)
-            directions = (back[::-1] ^ 4).astype(np.uint8)
-        return Way(tuple(walk(self.grid, start, directions.tobytes())), directions)
-
-    def _walked(self, root: int, start: int) -> NDArray[np.uint8]:
         costs = self._costs
-        starts = np.array([costs.pad(start)], np.int64)
-        return costs.walk(self._parent, costs.pad(root), starts, 0, costs.time_cost).directions
+        starts = np.array([costs.pad(goal)], np.int64)
+        back = costs.walk(self._parent, costs.pad(self._root), starts, 0, costs.time_cost).directions
+        directions = (back[::-1] ^ 4).astype(np.uint8)
+        return Way(tuple(walk(self.grid, self._root, directions.tobytes())), directions)
 
     def route(self, way: Way, at: int, max_cells: int) -> RouteBatch:
         """The rest of a way from the cell with this number, or its next `max_cells` steps (0 is all), as one route

@@ -14,6 +14,8 @@ from planner_service.search.belief import Belief
 from planner_service.search.blocks import blocks_of
 from planner_service.search.searcher import Searcher
 from planner_service.tree.cost_grid import CostGrid
+from shared_map.terrain.step_climb import climb_of
+from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import RouteStatus
@@ -148,3 +150,26 @@ def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_lo
     )
     searcher.tick(60.0, [(col * METRES + x, row * METRES + y) for x in (-100, 0, 100) for y in (-100, 0, 100)])
     assert searcher.wants_place("v")
+
+
+@settings(max_examples=25, deadline=None)
+@given(_SEEDS)
+def test_where_one_can_come_down_and_not_up_nobody_is_sent_to_where_he_stands(seed: int) -> None:
+    heights = np.zeros((12, 30), np.float32)
+    heights[:, 15:] = 30.0  # a step that is too steep to climb, and not to come down
+    grid = GridSpec(12, 30, METRES)
+    climb = climb_of(grid, heights, CostConfig(directional=True, max_climb_deg=20.0, max_descent_deg=89.0))
+    costs = CostGrid(grid, PlannerConfig(), climb)
+    pace = np.full((12, 30), 0.2, np.float32)
+    costs.load(pace)
+    searcher = Searcher(costs, 20.0, 2.0, f"{seed}")
+    searcher.begin(pace, None, 0.0)
+    for n in range(12):
+        for _ in range(80):  # who is told to ask again asks again
+            searcher.tick(0.1, [])
+            route = searcher.route(f"v{n}", 30 * n, 0, 0)[0]
+            if math.isfinite(route.cost_s):
+                break
+        path = walk(grid, route.start, route.directions)
+        assert path[-1] == searcher.goals[f"v{n}"] != 30 * n
+        assert all(cell % 30 < 15 for cell in path)

@@ -76,13 +76,15 @@ def test_a_mark_of_one_group_reaches_whom_it_writes_to_and_nobody_else(network: 
         blue.mark(80)
         eventually(lambda: grey.closed(70) and grey.closed(80) and red.closed(80), within_s=10)
         eventually(lambda: blue.closed(80) and blue.replica.counts["sets_foreign"] > 0, within_s=10)
-        time.sleep(1.0)  # a set that was repeated on its way is here by now
-        refused = blue.replica.counts["sets_foreign"]
-        until_s = time.monotonic() + 2.5
-        while time.monotonic() < until_s:  # digests of red go by, and blue asks for nothing
-            red.closed(70)
-            assert not blue.closed(70)
-            time.sleep(0.05)
+        for _ in range(4):  # on a busy machine a set that was repeated on its way comes late
+            refused = blue.replica.counts["sets_foreign"]
+            until_s = time.monotonic() + 2.5
+            while time.monotonic() < until_s:  # digests of red go by, and blue asks for nothing
+                red.closed(70)
+                assert not blue.closed(70)
+                time.sleep(0.05)
+            if blue.replica.counts["sets_foreign"] == refused:
+                break
         assert blue.replica.counts["sets_foreign"] == refused
     finally:
         for member in (red, blue, grey):

@@ -421,5 +421,5 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
     assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [7.5]
     assert heard[0].request == CostRequest(row=4, col=2)
     wrong = get('{"rwo": 4}').err.payload.to_string()
-    assert wrong == "cost: unknown field 'rwo'; CostRequest has cells, row, col"
+    assert wrong == "cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
     assert a.counts["payloads_dropped"] == 1

@@ -144,6 +144,7 @@ class Vehicle:
         """Every planner has answered, and none knows a route from here."""
         if not self.in_reach and not self.route.left:
             self.state = VehicleState.STRANDED
+            self.searching = False
             self._need = None
         self._settle()
 
@@ -224,6 +225,7 @@ class Vehicle:
                 self._ask_later(now_ns)
             elif not self.route.left:
                 self.state = VehicleState.STRANDED
+                self.searching = False
                 self._need = Reason.ASSIGNED
                 self._ask_due_ns = now_ns + _STRANDED_RETRY_NS
         self._settle()
