@@ -16,9 +16,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    settings.register_profile("commit", max_examples=COMMIT_EXAMPLES)
-    if not config.getoption("--thorough"):
-        settings.load_profile("commit")
+    # No deadline: on a busy machine a test is not to fail for taking long.
+    settings.register_profile("commit", max_examples=COMMIT_EXAMPLES, deadline=None)
+    settings.register_profile("thorough", deadline=None)
+    settings.load_profile("thorough" if config.getoption("--thorough") else "commit")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
