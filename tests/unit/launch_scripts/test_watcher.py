@@ -7,8 +7,9 @@ from support.target_reports import fleet
 
 from launch_scripts.launcher.watcher import Watcher
 from launch_scripts.report.recorder import Recorder
+from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import FLEET, FOLLOWED
+from swarm.wire.topics import FLEET, FOLLOWED, STATS
 
 
 def begun(swarm: SwarmModel) -> tuple[Watcher, list[object]]:
@@ -51,3 +52,17 @@ def test_the_first_route_that_is_begun_says_that_routes_are_served_and_the_other
         watcher.listen(0.0)
     assert watcher.routes_served
     assert sum(isinstance(message, Followed) for message in heard) == 1
+
+
+def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone() -> None:
+    swarm = SwarmModel()
+    watcher, _ = begun(swarm)
+    bus = swarm.bus("monitor")
+    for role, port in (("agent", 8080), ("monitor", 0), ("monitor", 9090)):
+        figures = Stats(
+            role=role, id="0", incarnation=7, stamp_ns=1, counts={}, gauges={}, histograms={}, web_port=port
+        )
+        bus.publish(STATS, figures, role=role, id="0")
+        swarm.run(3)
+        watcher.listen(0.0)
+        assert watcher.web_port == (port if role == "monitor" else 0)
