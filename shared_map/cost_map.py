@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats, private_copy
-from shared_map.learning.factors import factors_of, keys_of
+from shared_map.learning.factors import by_process, factors_of, keys_of
 from shared_map.learning.words import KEYS, told
 from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
@@ -145,7 +145,7 @@ class CostMap:
         of factors is one of the whole map. Lethal cells stay lethal, and marked cells as they are marked."""
         if self.keys is None or self._stated is None:
             return
-        factors = factors_of([said for each in words if (said := told(each))])
+        factors = factors_of(by_process([(each.author, said) for each in words if (said := told(each))]))
         if (factors == self.factors).all():
             return
         self.factors = factors

@@ -33,7 +33,8 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
         terrain, grid = store.terrain, store.grid
         if terrain is None or grid is None:
             raise StoreError(f"the store {path} has not been used by a keeper yet: it knows no terrain")
-        return terrain, grid, list(store.load())
+        # What is learned lies beyond the last tile and is about no cell.
+        return terrain, grid, [each for each in store.load() if each.tile < grid.tiles]
 
 
 @app.command()

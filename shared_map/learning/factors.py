@@ -10,7 +10,7 @@ The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from shared_map.arrays import Bytes, Floats
 from shared_map.learning.words import KEYS, MOST, MOST_CELLS, ONE, Said
 from shared_map.terrain.layers import TerrainClass, slope_deg
+from swarm.wire.messages.marks import owner_of
 
 SLOPE_BINS = 6
 """0-5, 5-10 ... 20-25 degrees, and all that is steeper."""
@@ -84,7 +85,7 @@ def factors_of(words: Sequence[Mapping[int, Said]]) -> Floats:
     """What to multiply the prior pace of each kind of ground by: float32 (KEYS,). A kind that is hardly driven yet
     has the factor of its class.
 
-    words  of each author, key -> what it says
+    words  of each process (`by_process`), key -> what it says
     """
     by_key: dict[int, list[Said]] = {}
     for each in words:
@@ -98,6 +99,26 @@ def factors_of(words: Sequence[Mapping[int, Said]]) -> Floats:
         if sum(each.cells for each in said) >= _FEWEST_CELLS:
             factors[key] = FACTORS[log_steps(said) + MOST_STEPS]
     return factors
+
+
+def by_process(words: Iterable[tuple[str, Mapping[int, Said]]]) -> list[Mapping[int, Said]]:
+    """The words of authors, those of all lives of one process together: it has one voice, however often it was
+    started, or says that it was.
+
+    words  (author, key -> what it says)
+    """
+    lives: dict[str, list[Mapping[int, Said]]] = {}
+    for author, word in words:
+        lives.setdefault(owner_of(author), []).append(word)
+    return [of[0] if len(of) == 1 else _of_lives(of) for of in lives.values()]
+
+
+def _of_lives(words: Sequence[Mapping[int, Said]]) -> dict[int, Said]:
+    parts: dict[int, list[Said]] = {}
+    for word in words:
+        for key, said in word.items():
+            parts.setdefault(key, []).append(said)
+    return {key: _together(of, [each.cells for each in of]) for key, of in parts.items()}
 
 
 def _of_classes(words: Sequence[Mapping[int, Said]]) -> dict[int, list[Said]]:

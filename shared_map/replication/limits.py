@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.marks import MarkSet, owner_of
 from swarm.wire.statements import TILE_AREA
 
 MAX_SETS = 1 << 18
@@ -22,12 +22,6 @@ _MAX_WAITING = 1 << 14
 _BURST_S = 10
 _FORGET_NS = 60 * NS_PER_S
 _SPEAKS_NS = _BURST_S * NS_PER_S
-
-
-def owner_of(author: str) -> str:
-    """The process that an author is a life of. Its certificate lets it write under any number of lives, so what an
-    author may cost is what its process may cost."""
-    return author.rpartition(".")[0] or author
 
 
 class Capacity:

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 
 from shared_map.replication.digest import Held
-from shared_map.replication.limits import Quota, owner_of
+from shared_map.replication.limits import Quota
 from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.pending_digests import PendingDigest, PendingDigests
 from shared_map.replication.replica import MapReplica, Merged, PublishSet
@@ -19,7 +19,7 @@ from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, P
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
 from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest, owner_of
 from swarm.wire.topics import DIGEST, MARKS
 
 log = logging.getLogger(__name__)

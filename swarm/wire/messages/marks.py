@@ -36,6 +36,12 @@ _Paces = Annotated[bytes, Column("<f4", per="kinds", least=PACE_LEAST, most=PACE
 _Stamps = Annotated[bytes, Column("<i8", per="kinds", least=0, most=STAMP_LIMIT_NS - 1, checked=False)]
 
 
+def owner_of(author: str) -> str:
+    """The process that an author is a life of. Its certificate lets it write under any number of lives, so limits
+    and votes are those of processes."""
+    return author.rpartition(".")[0] or author
+
+
 class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
     """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
 

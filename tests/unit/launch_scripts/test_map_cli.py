@@ -16,6 +16,8 @@ from typer.testing import CliRunner
 from launch_scripts.commands.map import app
 from shared_map.keeper.export import from_json, to_bands, to_json
 from shared_map.keeper.store import KeeperStore
+from shared_map.learning.words import Said
+from shared_map.replication.replica import MapReplica
 from swarm.errors import StoreError
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.statements import MarkKind
@@ -130,3 +132,13 @@ def test_a_garbled_export_is_refused_with_the_place(change: dict[str, object], p
     text = json.dumps({**json.loads(to_json("t", GRID, SETS)), **change})
     with pytest.raises(StoreError, match=place):
         from_json(text)
+
+
+def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:
+    author = MapReplica(GRID, author="all.a1.1")
+    words = [each.mark_set for each in author.write_learned({0: Said(400, 72_000, 6_500)}, 1)]
+    store = stored(tmp_path / "map.sqlite", [*SETS, *words])
+    found = json.loads(CliRunner().invoke(app, ["inspect", str(store), "--json"]).stdout)
+    assert (found["sets"], found["marks"], list(found["authors"])) == (3, 3, ["a1.1", "a2.1"])
+    told = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "marks.json")]).stdout
+    assert told.endswith("3 marks in 3 sets\n")

@@ -150,6 +150,14 @@ def test_what_is_no_word_changes_nothing() -> None:
         replace(word, paces=np.full(3, np.nan, "<f4").tobytes()).check()
 
 
+def test_a_process_has_one_voice_however_many_lives_it_writes_under() -> None:
+    right, lie = {0: Said(400, 0, ONE // 10)}, {0: THRICE}
+    honest = [each for n in range(5) for each in sets_of(f"all.a{n}.1", right)]
+    replica, cost_map = replica_of(None, GROUND)
+    replica.merge([*honest, *(each for n in range(9) for each in sets_of(f"all.liar.{n}", lie))])
+    assert (cost_map.factors == 1).all()
+
+
 def test_operators_do_not_learn_and_no_set_lies_further_beyond() -> None:
     (word,) = sets_of("all.a.1", {0: THRICE})
     replica, cost_map = replica_of(None, GROUND)
