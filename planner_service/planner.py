@@ -12,8 +12,8 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.search.lookout import Hidden, Lookout, is_place
 from planner_service.search.searcher import Searcher
+from planner_service.search.target_search import Hidden, TargetSearch, is_place
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
@@ -122,12 +122,12 @@ class Planner:
         self._growth_ms = 0.0
         self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
         self._status_due_ns = 0
-        self.lookout: Lookout | None = None
+        self.target_search: TargetSearch | None = None
         """None for a target that has a tracker."""
         if hidden is not None:
             seed = f"{hidden.seed}/{incarnation}"
             searcher = Searcher(tree.cost_grid, hidden.sense_range_m, hidden.slowness, seed)
-            self.lookout = Lookout(hidden, searcher, time_scale)
+            self.target_search = TargetSearch(hidden, searcher, time_scale)
         for name in COUNTS if hidden is None else COUNTS + SEARCH_COUNTS:
             counters.count(name, 0)
 
@@ -168,7 +168,7 @@ class Planner:
     def tick(self, now_ns: int) -> list[Action]:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
         actions = self._keep_up(now_ns)
-        self._look_out(now_ns)
+        self._search(now_ns)
         if self.tree.ready and self.tree.wants_strides:
             actions.append(FindStrides(self.tree.stride_job(self._shelf)))
         self.followers.drop_silent(now_ns)
@@ -228,7 +228,7 @@ class Planner:
         """Take in the newest pose and all map changes since the last time, if there are any."""
         pose = self._watch.pose
         if pose is None:
-            if self._is_searching and self.tree.map_version != self._cost_map.version:
+            if self._under_way is not None and self.tree.map_version != self._cost_map.version:
                 self._learn_map()
             return []  # the first growth takes the map as it is then, whatever changed before
         now_known = (pose.cell, self._cost_map.version)
@@ -240,21 +240,22 @@ class Planner:
         return []
 
     @property
-    def _is_searching(self) -> bool:
-        return self.lookout is not None and self.lookout.active
+    def _under_way(self) -> TargetSearch | None:
+        """The search for the target, while nobody sees it."""
+        return self.target_search if self.target_search is not None and self.target_search.active else None
 
-    def _look_out(self, now_ns: int) -> None:
+    def _search(self, now_ns: int) -> None:
         """Search for the target while nobody sees it."""
-        lookout, pose, grid = self.lookout, self._watch.pose, self._grid
-        if lookout is None:
+        search, pose, grid = self.target_search, self._watch.pose, self._grid
+        if search is None:
             return
         if self.tree.map_version < 0:
             self._learn_map()
         place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
         age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
-        lookout.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
-        self.counters.counts["searches"] = lookout.searches
-        self.counters.counts["search_places"] = lookout.searcher.decisions
+        search.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
+        self.counters.counts["searches"] = search.searches
+        self.counters.counts["search_places"] = search.searcher.decisions
 
     def _learn_map(self) -> None:
         """Take in the map without a target to lead to."""
@@ -326,8 +327,8 @@ class Planner:
         cells = self._cells(request)
         most = MOST_STEPS // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
-        if self.lookout is not None and self.lookout.active:
-            routes = self.lookout.routes(cells, request.vehicles, max_cells, self.tree.map_version)
+        if (search := self._under_way) is not None:
+            routes = search.routes(cells, request.vehicles, max_cells, self.tree.map_version)
         else:
             routes = self.tree.routes(cells, max_cells)
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
@@ -384,9 +385,9 @@ class Planner:
         cells = self._cells(request)
         self.counters.count("costs_served", len(cells))
         costs_s = self.tree.cost_to_go_at(cells)
-        if self.lookout is not None and self.lookout.active:
+        if (search := self._under_way) is not None:
             on_map = [0 <= cell < self._grid.cells and self.tree.cost_grid.passable(cell) for cell in cells]
-            costs_s = self.lookout.costs_s(costs_s, np.array(on_map, np.bool_))
+            costs_s = search.costs_s(costs_s, np.array(on_map, np.bool_))
         return CostReply(
             target=self.target,
             incarnation=self._incarnation,
@@ -413,8 +414,8 @@ class Planner:
 
     def _pushes(self, now_ns: int) -> list[Action]:
         """Newer routes for followers which a change concerns and which have not had one for a while."""
-        if self._is_searching:
-            return self._places_to_push(now_ns)
+        if (search := self._under_way) is not None:
+            return self._places_to_push(search.searcher, now_ns)
         target_cell = self.tree.target_cell
         if not self.tree.ready or target_cell is None:
             return []
@@ -434,11 +435,10 @@ class Planner:
         self.counters.count("pushes", len(pushes))
         return pushes
 
-    def _places_to_push(self, now_ns: int) -> list[Action]:
+    def _places_to_push(self, searcher: Searcher, now_ns: int) -> list[Action]:
         """Other places for vehicles whose own is not worth the way any more, and for those which still follow a
         route to where the target was."""
-        assert self.lookout is not None
-        searcher, pushes = self.lookout.searcher, list[Action]()
+        pushes: list[Action] = []
         searcher.forget_all_but(self.followers.ids())
         for id, follower in self.followers.all_items():
             if not searcher.may_decide:

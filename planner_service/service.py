@@ -11,7 +11,7 @@ from planner_service.class_planners import ClassPlanners
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
-from planner_service.search.lookout import hidden_target
+from planner_service.search.target_search import hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.strides import StrideSearch
@@ -232,7 +232,7 @@ class PlannerService:
 
     def _look(self, now_ns: int) -> None:
         """Take in where vehicles are, who would see a target that nobody tracks."""
-        if self._planner.lookout is None:
+        if self._planner.target_search is None:
             return
         for heard in self._bus.collected(FLEET):
             assert isinstance(heard.message, Fleet)
@@ -240,8 +240,8 @@ class PlannerService:
         self._presence.expire(now_ns)
         vehicles = self._presence.vehicles
         for _, planner in self._planners:
-            if planner.lookout is not None:
-                planner.lookout.hear_vehicles(vehicles.east_m, vehicles.south_m)
+            if planner.target_search is not None:
+                planner.target_search.hear_vehicles(vehicles.east_m, vehicles.south_m)
 
     def _answer(self, now_ns: int) -> None:
         """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""
@@ -286,8 +286,8 @@ class PlannerService:
     def _pace(self, planner: Planner) -> None:
         """Set a planner's pace as it is ordered."""
         book, scenario = self._obedience.book, self._scenario
-        if planner.lookout is not None:
-            planner.lookout.time_scale = book.setting("time_scale", scenario.time_scale)
+        if planner.target_search is not None:
+            planner.target_search.time_scale = book.setting("time_scale", scenario.time_scale)
         planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
             book.setting("planner.push_s", scenario.planner.push_s),

@@ -104,12 +104,18 @@ def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones
             assert route.status is RouteStatus.UNREACHABLE
 
 
-def test_vehicles_look_at_places_apart_from_each_other() -> None:
-    pace = np.full((200, 200), 0.2, np.float32)
-    costs = CostGrid(GridSpec(200, 200, METRES), PlannerConfig())
+def searching_flat_ground(side: int) -> Searcher:
+    """One that looks for a target which nobody ever saw, with sensors of 50 m."""
+    pace = np.full((side, side), 0.2, np.float32)
+    costs = CostGrid(GridSpec(side, side, METRES), PlannerConfig())
     costs.load(pace)
     searcher = Searcher(costs, 50.0, 2.0, "s")
     searcher.begin(pace, None, 0.0)
+    return searcher
+
+
+def test_vehicles_look_at_places_apart_from_each_other() -> None:
+    searcher = searching_flat_ground(200)
     for n in range(8):
         assert searcher.route(f"v{n}", 100 * 200 + 100 + n, 0, 0)[0].status is RouteStatus.SEARCHING
     cells = np.array(list(searcher.goals.values()))
@@ -119,11 +125,7 @@ def test_vehicles_look_at_places_apart_from_each_other() -> None:
 
 
 def test_a_vehicle_that_comes_late_in_a_tick_is_told_to_ask_again_and_is_told_a_place_in_the_next() -> None:
-    pace = np.full((40, 40), 0.2, np.float32)
-    costs = CostGrid(GridSpec(40, 40, METRES), PlannerConfig())
-    costs.load(pace)
-    searcher = Searcher(costs, 50.0, 2.0, "s")
-    searcher.begin(pace, None, 0.0)
+    searcher = searching_flat_ground(40)
     statuses = [searcher.route(f"v{n}", n, 0, 0)[0] for n in range(20)]
     late = [route for route in statuses if math.isinf(route.cost_s)]
     assert late

@@ -49,10 +49,10 @@ def test_a_target_that_was_never_seen_is_searched_for_captured_and_searched_for_
             if isinstance(node.service, AgentService):
                 states.update(vehicle.state for vehicle in node.service.agent.vehicles.values())
             if isinstance(node.service, PlannerService):
-                lookout = node.service._planner.lookout
-                assert lookout is not None
-                apart |= len(set(lookout.searcher.goals.values())) == 3
-                searches = lookout.searches if simulation.recorder.observed.counts_by("captures_of") else 0
+                target_search = node.service._planner.target_search
+                assert target_search is not None
+                apart |= len(set(target_search.searcher.goals.values())) == 3
+                searches = target_search.searches if simulation.recorder.observed.counts_by("captures_of") else 0
     assert searches >= 2, "it was not captured, or nobody searched for it after that"
     assert apart, "several vehicles look at one place"
     assert states[VehicleState.SEARCHING] > 10

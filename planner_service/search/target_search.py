@@ -42,7 +42,7 @@ class Hidden:
     seed: str
 
 
-class Lookout:
+class TargetSearch:
     """Begins the search when nobody sees the target, and ends it with a sighting.
 
     time_scale  seconds on the terrain per second
