@@ -42,7 +42,7 @@ from swarm.wire.topics import CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, S
 
 log = logging.getLogger(__name__)
 
-_GROW, _SEARCH = "grow-tree", "find-strides"
+_GROW, _STRIDES = "grow-tree", "find-strides"
 _PRESENCE_NS = 5 * NS_PER_S
 """A vehicle of which nothing was heard for so long sees nothing."""
 _HOLD_NS, _MOST_HELD = NS_PER_S, 256
@@ -121,21 +121,11 @@ class PlannerService:
                 vehicle_class=name,
             )
 
-        def make(name: str, now_ns: int) -> Planner:
-            planner = planner_of(name, self._maps.of[name], Counters())  # what the status tells is of "ground"
-            planner.lead(self._planner.leads)
-            self._pace(planner)
-            if self._pose is not None:
-                planner.hear_pose(self._pose, now_ns)
-            for seen in self._sightings.best(now_ns).values():
-                planner.set_pose(pose_of(seen), now_ns)
-            log.info("target %s: a tree for the class %s", self._target, name)
-            return planner
-
         self._pose: TargetPose | None = None
         """The newest that a tracker told, for the planner of a class that is made later."""
+        self._planner_of = planner_of
         self._planner = planner_of(GROUND, self._cost_map, self.counters)
-        self._planners = ClassPlanners(self._planner, make, self._maps.of)
+        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version = 0
         self._removed = False
@@ -144,10 +134,22 @@ class PlannerService:
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
-        self._searches: dict[str, StrideSearch] = {}
-        """Class -> what the worker is looking for, a step at a time; `_searching` while it has a step."""
-        self._searching: str | None = None
+        self._stride_searches: dict[str, StrideSearch] = {}
+        """Class -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
+        self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
+
+    def _begin_class(self, name: str, now_ns: int) -> Planner:
+        """The planner of a class that somebody asks for."""
+        planner = self._planner_of(name, self._maps.of[name], Counters())  # the status tells of "ground" alone
+        planner.lead(self._planner.leads)
+        self._pace(planner)
+        if self._pose is not None:
+            planner.hear_pose(self._pose, now_ns)
+        for seen in self._sightings.best(now_ns).values():
+            planner.set_pose(pose_of(seen), now_ns)
+        log.info("target %s: a tree for the class %s", self._target, name)
+        return planner
 
     def start(self, now_ns: int) -> None:
         self._member.join()
@@ -181,9 +183,10 @@ class PlannerService:
                 if grows is not None:
                     self._perform(grows, grows.adopt(grown, took_ns, now_ns), now_ns)
                 self._answer(now_ns)
-            case WorkDone(tag=tag, result=StrideSearch() as search) if tag.startswith(_SEARCH):
-                self._searching = None
-                if search.network is not None and self._searches.pop(_class_of(tag), None) is search:
+            case WorkDone(tag=tag, result=StrideSearch() as search) if tag.startswith(_STRIDES):
+                self._finding_strides = None
+                if search.network is not None and self._stride_searches.get(_class_of(tag)) is search:
+                    del self._stride_searches[_class_of(tag)]
                     looks = self._planners.held(_class_of(tag))
                     if looks is not None:
                         looks.adopt_strides(search)
@@ -222,13 +225,13 @@ class PlannerService:
         self._member.tick(now_ns)
 
     def _look_for_strides(self) -> None:
-        for name in list(self._searches):
+        for name in list(self._stride_searches):
             if self._planners.held(name) is None:
-                del self._searches[name]
-        if self._searching is None and self._searches:
-            self._searching, search = next(iter(self._searches.items()))
+                del self._stride_searches[name]
+        if self._finding_strides is None and self._stride_searches:
+            self._finding_strides, search = next(iter(self._stride_searches.items()))
             model_ns = self._planner.tree.times.model_ns
-            self._worker.submit(_tag(_SEARCH, self._searching), search.step, self._post, model_ns)
+            self._worker.submit(_tag(_STRIDES, self._finding_strides), search.step, self._post, model_ns)
 
     def _look(self, now_ns: int) -> None:
         """Take in where vehicles are, who would see a target that nobody tracks."""
@@ -327,7 +330,7 @@ class PlannerService:
                 case GrowTree(job):
                     self._worker.submit(_tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
                 case FindStrides(search):
-                    self._searches[name] = search
+                    self._stride_searches[name] = search
                 case PlannerStatus() | Tell() if name != GROUND:
                     pass  # the planner of "ground" has told the same of the target
                 case PushedRoute(vehicle=vehicle) as pushed:
