@@ -44,6 +44,10 @@ class ClassPlanners:
         """The planner of a class, if it is there."""
         return self._by_class.get(name)
 
+    def begun_ns(self, name: str) -> int:
+        """When the planner of a class was made, which tells it from one that was dropped; 0 of "ground"."""
+        return self._begun_ns.get(name, 0)
+
     def used(self, name: str, now_ns: int) -> Planner:
         """The planner of a known class that somebody needs; made if it is not there."""
         planner = self._by_class.get(name)

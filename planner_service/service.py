@@ -135,7 +135,7 @@ class PlannerService:
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
         self._stride_searches: dict[str, StrideSearch] = {}
-        """Class -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
+        """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
         self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
 
@@ -179,17 +179,16 @@ class PlannerService:
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag.startswith(_GROW):
-                grows = self._planners.held(_class_of(tag))
+                grows = self._asked_by(tag)
                 if grows is not None:
                     self._perform(grows, grows.adopt(grown, took_ns, now_ns), now_ns)
                 self._answer(now_ns)
             case WorkDone(tag=tag, result=StrideSearch() as search) if tag.startswith(_STRIDES):
                 self._finding_strides = None
-                if search.network is not None and self._stride_searches.get(_class_of(tag)) is search:
-                    del self._stride_searches[_class_of(tag)]
-                    looks = self._planners.held(_class_of(tag))
-                    if looks is not None:
-                        looks.adopt_strides(search)
+                looks = self._asked_by(tag)
+                if search.network is not None and looks is not None:
+                    del self._stride_searches[tag]
+                    looks.adopt_strides(search)
             case _:
                 pass
 
@@ -225,13 +224,23 @@ class PlannerService:
         self._member.tick(now_ns)
 
     def _look_for_strides(self) -> None:
-        for name in list(self._stride_searches):
-            if self._planners.held(name) is None:
-                del self._stride_searches[name]
+        for tag in list(self._stride_searches):
+            if self._asked_by(tag) is None:
+                del self._stride_searches[tag]
         if self._finding_strides is None and self._stride_searches:
             self._finding_strides, search = next(iter(self._stride_searches.items()))
             model_ns = self._planner.tree.times.model_ns
-            self._worker.submit(_tag(_STRIDES, self._finding_strides), search.step, self._post, model_ns)
+            self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
+
+    def _tag(self, work: str, name: str) -> str:
+        """What a piece of work for the planner of a class is called."""
+        return f"{work}/{name}/{self._planners.begun_ns(name)}"
+
+    def _asked_by(self, tag: str) -> Planner | None:
+        """The planner that asked for a piece of work; None if it was dropped since: another one of its class has
+        begun with the map as it was later."""
+        work, name, _ = tag.split("/")
+        return self._planners.held(name) if tag == self._tag(work, name) else None
 
     def _look(self, now_ns: int) -> None:
         """Take in where vehicles are, who would see a target that nobody tracks."""
@@ -328,9 +337,9 @@ class PlannerService:
         for action in actions:
             match action:
                 case GrowTree(job):
-                    self._worker.submit(_tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
+                    self._worker.submit(self._tag(_GROW, name), job, self._post, planner.tree.times.model_ns)
                 case FindStrides(search):
-                    self._stride_searches[name] = search
+                    self._stride_searches[self._tag(_STRIDES, name)] = search
                 case PlannerStatus() | Tell() if name != GROUND:
                     pass  # the planner of "ground" has told the same of the target
                 case PushedRoute(vehicle=vehicle) as pushed:
@@ -340,12 +349,3 @@ class PlannerService:
                 case Tell(kind, text, cell):
                     log.info("%s: %s", kind, text)
                     self._member.note(now_ns, kind, text, cell)
-
-
-def _tag(work: str, name: str) -> str:
-    """What a piece of work for a class is called."""
-    return f"{work}/{name}"
-
-
-def _class_of(tag: str) -> str:
-    return tag.partition("/")[2]

@@ -171,6 +171,20 @@ def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(
     assert world.trees() == ["ground"]
 
 
+def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(
+    world: _World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(class_planners, "UNUSED_NS", NS_PER_S)
+    tags = []
+    for _ in range(2):
+        world.ask(CostRequest(cells=[world.target], vehicle_class="low"))
+        tags.append(world.service._tag("grow-tree", "low"))
+        assert [world.service._asked_by(tag) is not None for tag in tags] == [False] * (len(tags) - 1) + [True]
+        world.run(2)
+        assert world.trees() == ["ground"]
+    assert world.service._asked_by(world.service._tag("grow-tree", "ground")) is not None
+
+
 def test_a_class_that_says_nothing_has_the_routes_of_ground_to_the_bit(world: _World) -> None:
     cells = list(range(0, world.terrain.grid.cells, 37))
     ground, same = (world.ask(RouteRequest(cells=cells, vehicle_class=name)) for name in ("ground", "same"))
