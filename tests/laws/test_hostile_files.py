@@ -117,8 +117,9 @@ def test_endless_and_huge_files_are_refused_by_a_look(tmp_path: Path) -> None:
     (tmp_path / "zero.toml").symlink_to("/dev/zero")
     for path in (tmp_path / "zero.toml", sparse(tmp_path / "huge.toml")):
         code, said, peak_mb = run("up", path, "--runs", tmp_path)
-        assert (code, said.count("\n")) == (2, 1), said
-        assert f"swarm: cannot read scenario {path}: it " in said
+        sentences = [line for line in said.splitlines() if not line.startswith("loading, ")]  # on a busy machine
+        assert (code, len(sentences)) == (2, 1), said
+        assert f"swarm: cannot read scenario {path}: it " in sentences[0]
         assert peak_mb < MOST_MB
 
 
