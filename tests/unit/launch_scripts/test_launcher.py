@@ -24,7 +24,11 @@ from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetCo
 from swarm.errors import ConfigError
 from swarm.runtime.role import RoleSetup
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+# Of the network, as those: its tests wait for processes.
+pytestmark = [
+    pytest.mark.network,
+    pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
