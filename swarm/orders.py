@@ -9,8 +9,9 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from swarm.bus.bus import AskEnded, Bus, Replied
+from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Replied
 from swarm.errors import BusError, ConfigError
+from swarm.liveness import Roster
 from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Message, Nothing
@@ -23,6 +24,7 @@ _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
 _FIND_S = 3.0
 _ORDER_S = 5.0
 _OBEY_S = 3.0
+_LEAVE_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,8 @@ class Acknowledged:
     """What became of an order.
 
     obeyed  processes that obey, as role-id, and how many seconds after the order each said so
-    silent  those which it concerns and that have not said so in time: they will obey once they hear a keeper
+    silent  those which it concerns and that have not said so in time: they will obey once they hear a keeper.
+            Who has left since is not among them
     """
 
     obeyed: dict[str, float] = field(default_factory=dict)
@@ -46,6 +49,10 @@ class Operator:
     def __init__(self, bus: Bus, patience_s: float = _OBEY_S) -> None:
         self._bus = bus
         self._patience_s = patience_s
+        self._tokens: Inbox | None = None
+        self._roster = Roster()
+        self._left: set[str] = set()
+        """Those of which no token is up any more, as role-id."""
 
     def zones(self) -> Zones:
         """The zones that stand. Raises BusError without a keeper."""
@@ -87,6 +94,9 @@ class Operator:
     # --- asking ---------------------------------------------------------------------------------------------
 
     def _members(self) -> list[RunInfo]:
+        if self._tokens is None:  # before anybody is asked, so that no answer is of one whose end we missed
+            self._tokens = Inbox()
+            self._bus.watch_alive(self._tokens.post)
         found = self._ask(RUN, Nothing(), _FIND_S)[0]
         return [each for each in found if isinstance(each, RunInfo) and each.run_id]
 
@@ -120,14 +130,27 @@ class Operator:
         obeyed: dict[str, float] = {}
         self._bus.ask(OBEYED, order, inbox.post, tag="obey", timeout_s=self._patience_s)
         while time.monotonic() < deadline_s:
-            match inbox.take(0.5):
+            match inbox.take(0.1):
                 case Replied(message=Obeyed() as who):
                     obeyed.setdefault(f"{who.role}-{who.id}", time.monotonic() - began_s)
-                case AskEnded():
-                    break
+                case AskEnded():  # also where who has not answered yet leaves: its token falls just then
+                    deadline_s = min(deadline_s, time.monotonic() + _LEAVE_S)
+            concerned -= self._who_left() - obeyed.keys()
             if concerned <= obeyed.keys():
                 break
         return Acknowledged(obeyed, sorted(concerned - obeyed.keys()))
+
+    def _who_left(self) -> set[str]:
+        while self._tokens is not None and (event := self._tokens.take(0.0)) is not None:
+            match event:
+                case Appeared(peer):
+                    self._roster.appeared(peer)
+                    self._left.discard(f"{peer.role}-{peer.id}")
+                case Disappeared(peer):
+                    self._roster.gone(peer)
+                    if not self._roster.is_alive(peer.role, peer.id):
+                        self._left.add(f"{peer.role}-{peer.id}")
+        return self._left if self._roster.up() else set()  # if all are gone, it is our link that is lost
 
     def _ask(
         self, topic: Topic, request: Message, timeout_s: float, **fields: str | int

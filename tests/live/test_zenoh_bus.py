@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+import msgspec
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
@@ -26,6 +27,7 @@ from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError
 from swarm.liveness import Peer
+from swarm.orders import Operator
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
@@ -33,9 +35,10 @@ from swarm.wire.authentication import Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim
-from swarm.wire.topics import COST, POSE, RUN, STORED, TABLE, Topic
+from swarm.wire.topics import COST, GIVE_ORDER, OBEYED, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
 
@@ -423,3 +426,25 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
     wrong = get('{"rwo": 4}').err.payload.to_string()
     assert wrong == "cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
     assert a.counts["payloads_dropped"] == 1
+
+
+def test_who_leaves_before_it_obeys_is_not_called_silent_and_who_hangs_is(world: ZenohWorld) -> None:
+    """A planner whose target was just removed still answers who is there."""
+    members = {role: world.bus(role) for role in ("keeper", "planner", "agent", "targets")}
+    for role, bus in members.items():
+        bus.declare_alive(Peer(role, "x", 1))
+        info = msgspec.structs.replace(run_info("x"), role=role)
+        bus.serve(RUN, answering((info, {"role": role, "id": "x"})), role=role, id="x")
+    given = Order(subject="pause", name="", stamp_ns=1)
+    book = (Orders(role="keeper", id="x", orders=[given], given=given), {"keeper": "x"})
+    members["keeper"].serve(GIVE_ORDER, answering(book), keeper="x")
+    obeys = (Obeyed(role="agent", id="x", incarnation=1), {"role": "agent", "id": "x"})
+    members["agent"].serve(OBEYED, answering(obeys), role="agent", id="x")
+    leaving = threading.Timer(0.5, members["planner"].close)  # while it is waited for
+    asked = Box()
+    members["planner"].serve(OBEYED, lambda event: (asked(event), leaving.start()), role="planner", id="x")
+    world.settle()
+    acknowledged = Operator(world.bus("operator"), patience_s=2.0).give(GiveOrder(subject="pause"))[1]
+    assert asked
+    assert list(acknowledged.obeyed) == ["agent-x"]
+    assert acknowledged.silent == ["targets-x"]

@@ -15,7 +15,8 @@ from support.swarm_model import SwarmModel
 
 from planner_service import class_planners
 from planner_service.service import PlannerService
-from shared_map.class_maps import ClassMaps, class_terrains, read_by
+from shared_map.class_grounds import class_terrains
+from shared_map.class_maps import ClassMaps, read_by
 from shared_map.cost_map import CostMap
 from shared_map.learning.words import ONE, Said
 from shared_map.replication.replica import MapReplica
@@ -53,7 +54,7 @@ name = "same"
 def _made() -> tuple[Scenario, Terrain, dict[str, Terrain]]:
     scenario = parse_scenario(_TEXT)
     terrain = build_terrain(scenario)
-    return scenario, terrain, class_terrains(scenario, terrain.grid)
+    return scenario, terrain, class_terrains(scenario, terrain)
 
 
 def test_each_class_has_its_own_ground_on_the_same_roads() -> None:
