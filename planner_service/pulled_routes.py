@@ -33,14 +33,16 @@ class Pulled:
 class Puller:
     """Pulls routes over neighbours straight.
 
-    pace    (rows, cols) float32, s/m; inf is lethal. It is read at each call
-    config  which corners a segment may pass: where a diagonal step may
+    pace          (rows, cols) float32, s/m; inf is lethal. It is read at each call
+    resolution_m  side of a cell
+    config        which corners a segment may pass: where a diagonal step may
     """
 
-    def __init__(self, pace: Floats, config: PlannerConfig) -> None:
+    def __init__(self, pace: Floats, resolution_m: float, config: PlannerConfig) -> None:
         # Compiled only for those who pull: nobody else waits for it at a first start.
         from planner_service.kernels.pull import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 
+        self._metres = resolution_m
         self._pace, self._cols = pace.reshape(-1), pace.shape[1]
         self._corners = ALL_CORNERS if config.corner_cutting else OPEN_CORNERS
         if config.neighbours == 4:
@@ -51,7 +53,7 @@ class Puller:
         self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
     ) -> tuple[Pulled, NDArray[np.float64]]:
         """Routes as in `RouteBatch` -> those pulled, and (3, n) float64: the integral of the pace along each one,
-        along the route that it was, both in s where a cell is a metre long, and its length in cells.
+        and along the route that it was, s; its length, m.
 
         The integral is inf of a route that meets what is shut by now: each of its steps is a segment then.
         """
@@ -62,17 +64,18 @@ class Puller:
         legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
         prices = np.empty((3, many))
         self._kernel(
-            self._pace, self._cols, self._corners, (starts, directions, ends), scratch, (*out, legs, turned), prices
+            self._metres = resolution_m
+        self._pace, self._cols, self._corners, (starts, directions, ends), scratch, (*out, legs, turned), prices
         )
         done = int(out[1][-1]) if many else 0
-        return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices
+        return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
 
-    def pull_batch(self, routes: RouteBatch, resolution_m: float) -> RouteBatch:
+    def pull_batch(self, routes: RouteBatch) -> RouteBatch:
         """The same routes along their segments. Costs and bounds stay those of the routes over neighbours."""
         if not routes.directions.size:
             return routes
         pulled, prices = self.pull(routes.starts, np.ascontiguousarray(routes.directions), routes.ends)
-        length_m = np.where(np.isfinite(prices[0]), prices[2] * resolution_m, routes.length_m)
+        length_m = np.where(np.isfinite(prices[0]), prices[2], routes.length_m)
         return replace(
             routes,
             directions=pulled.directions, ends=pulled.ends, legs=pulled.legs, length_m=length_m

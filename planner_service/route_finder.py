@@ -147,7 +147,7 @@ class RouteFinder:
             raise ValueError(
                 f"route is {route.status.value!r}, expected 'ok': only a route to the target is pulled"
             )
-        puller = Puller(self._pace, self._config)
+        puller = Puller(self._pace, self.grid.resolution_m, self._config)
         start = self.grid.cell(*route.cells[0].tolist())
         codes = DIRECTION_OF[tuple(np.diff(route.cells, axis=0).T + 1)]
         pulled, prices = puller.pull(np.array([start]), codes, np.array([codes.size]))
@@ -156,7 +156,7 @@ class RouteFinder:
         cells = walk(self.grid, start, pulled.directions.tobytes())
         at = np.concatenate(((0,), np.cumsum(pulled.legs, dtype=np.int64)))
         turns = np.stack(np.divmod(np.array(cells)[at], self.grid.cols), axis=1)
-        cost_s, grid_cost_s, length_m = (prices[:, 0] * self.grid.resolution_m).tolist()
+        cost_s, grid_cost_s, length_m = prices[:, 0].tolist()
         return PulledRoute(turns, cost_s, grid_cost_s, length_m)
 
     def cost_to_go_s(self) -> NDArray[np.float32]:

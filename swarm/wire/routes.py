@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from swarm.lazy_numpy import np, numpy_loaded
-from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Length, check_column, column, pack_column
+from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Legs, Length, check_column, column, pack_column
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,9 +39,6 @@ STATUSES = tuple(RouteStatus)
 OK, UNREACHABLE, OUTSIDE, LETHAL_START, NO_TARGET, SEARCHING = range(len(STATUSES))
 
 
-_Legs = Annotated[bytes, Meta(max_length=4 << 20), Column("<u4", least=1, most=4 << 20)]
-
-
 class Route(Bounded, frozen=True, kw_only=True):
     """One route. `directions` holds one code 0..7 per step, clockwise from north. Its numbers are finite if the
     status is OK.
@@ -62,13 +59,18 @@ class Route(Bounded, frozen=True, kw_only=True):
     lower_bound_s: Cost = 0.0
     length_m: Length = 0.0
     remaining_s: Cost = 0.0
-    legs: _Legs = b""
+    legs: Legs = b""
 
     def relate(self) -> None:
-        _check_legs([len(self.directions)], _listed(self.legs, "I"))
+        check_legs([len(self.directions)], self.legs)
         total = self.cost_s + self.lower_bound_s + self.length_m + self.remaining_s
         if self.status is RouteStatus.OK and not math.isfinite(total):
             raise ValueError("a route whose status is ok has a number that is not finite")
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """Of a pulled route the indices of the cells in which it turns, its first and last included; else empty."""
+        return tuple(accumulate(_listed(self.legs, "I"), initial=0)) if self.legs else ()
 
     @property
     def gap(self) -> float:
@@ -194,14 +196,14 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     lower_bound_s: _Numbers
     length_m: _Numbers
     remaining_s: _Numbers
-    legs: _Legs = b""
+    legs: Legs = b""
 
     def relate(self) -> None:
         if not numpy_loaded():
             listed = _listed(self.steps, "I")
             steps = sum(listed)
             check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
-            _check_legs(listed, _listed(self.legs, "I"))
+            check_legs(listed, self.legs)
             for name in _NUMBERS:
                 numbers = _listed(getattr(self, name), "d")
                 if any(status == OK and math.isinf(n) for status, n in zip(self.statuses, numbers, strict=True)):
@@ -266,8 +268,9 @@ _NUMBERS = ("cost_s", "lower_bound_s", "length_m", "remaining_s")
 _LEGS_FAULT = "legs do not end where the steps of their routes do"
 
 
-def _check_legs(steps: Sequence[int], legs: Sequence[int]) -> None:
+def check_legs(steps: Sequence[int], packed: bytes) -> None:
     """Raise ValueError unless there are no legs at all, or those of each route go over all of its steps."""
+    legs = _listed(packed, "I") if packed else ()
     if legs and (sum(legs) != sum(steps) or not {*accumulate(steps)} <= {0, *accumulate(legs)}):
         raise ValueError(_LEGS_FAULT)
 
