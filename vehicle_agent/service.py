@@ -269,8 +269,7 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
-        driven = agent.take_driven()
-        if self._learning is not None and (said := self._learning.tick(driven, now_ns)):
+        if self._learning is not None and (said := self._learning.tick(agent.take_driven(), now_ns)):
             self._sync.publish(self._replica.write_learned(said, now_ns))
         columns = Places(self._cost_map.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)

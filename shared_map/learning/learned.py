@@ -1,0 +1,60 @@
+"""What has been learned of each kind of ground, for people: a table of the words that a store or a run holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from shared_map.learning.factors import SLOPE_BINS, by_process, estimate, factors_of, name_of
+from shared_map.learning.words import ONE, Said, told
+from shared_map.terrain.layers import TerrainClass
+from swarm.wire.messages.marks import MarkSet
+
+
+class LearnedKind(NamedTuple):
+    """What is known of one kind of ground.
+
+    kind            its class and its slopes in degrees, such as `forest 10-15`
+    cells           driven cells, as all authors say together
+    authors         processes that have driven there
+    measured        driven over prior pace, geometric mean of what counts
+    standard_error  of ln(measured)
+    factor          what the prior pace is multiplied by
+    """
+
+    kind: str
+    cells: int
+    authors: int
+    measured: float
+    standard_error: float
+    factor: float
+
+
+def learned_kinds(words: Iterable[MarkSet]) -> list[LearnedKind]:
+    """Each kind of ground that was driven, in order of class and slope.
+
+    words  sets about the tile beyond the map; what is no word is left out
+    """
+    voices = by_process([(each.author, said) for each in words if (said := told(each))])
+    factors = factors_of(voices)
+    known = range(SLOPE_BINS * (max(TerrainClass) + 1))
+    by_key: dict[int, list[Said]] = {}
+    for voice in voices:
+        for key, said in voice.items():
+            if key in known:
+                by_key.setdefault(key, []).append(said)
+    rows = []
+    for key, said in sorted(by_key.items()):
+        together = estimate(said)
+        rows.append(
+            LearnedKind(
+                name_of(key),
+                sum(each.cells for each in said),
+                len(said),
+                math.exp(together.mean / ONE),
+                math.sqrt(together.variance / ONE / together.cells),
+                float(factors[key]),
+            )
+        )
+    return rows
