@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats, private_copy
-from shared_map.learning.factors import by_process, factors_of, keys_of
-from shared_map.learning.words import KEYS, told
+from shared_map.learning.factors import keys_of
+from shared_map.learning.learned import factors_in
+from shared_map.learning.words import KEYS
 from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
@@ -146,7 +147,7 @@ class CostMap:
         Returns whether the factors changed."""
         if self.keys is None or self._stated is None:
             return False
-        factors = factors_of(by_process([(each.author, said) for each in words if (said := told(each))]))
+        factors = factors_in(words)
         if (factors == self.factors).all():
             return False
         self.factors = factors

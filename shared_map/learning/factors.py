@@ -51,10 +51,10 @@ def keys_of(classes: Bytes, elevation_m: Floats, resolution_m: float) -> Bytes:
 
 def name_of(key: int) -> str:
     """A kind of ground for people, such as `forest 10-15`."""
-    kind, low = key // SLOPE_BINS, key % SLOPE_BINS * SLOPE_BIN_DEG
-    if kind not in tuple(TerrainClass):
+    number, low = key // SLOPE_BINS, key % SLOPE_BINS * SLOPE_BIN_DEG
+    if number not in tuple(TerrainClass):
         return f"unknown {key}"
-    kind = TerrainClass(kind).name.lower()
+    kind = TerrainClass(number).name.lower()
     return f"{kind} {low}-{low + SLOPE_BIN_DEG}" if key % SLOPE_BINS < SLOPE_BINS - 1 else f"{kind} {low}+"
 
 
@@ -72,9 +72,9 @@ def estimate(said: Sequence[Said]) -> Said:
     cell. No cells if nobody says anything.
 
     No author's mean counts for more than the largest factor there is. Five authors or more that know five cells
-    each count by their median: less than half of them cannot move it beyond what an honest one says. Of fewer none has a
-    weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1) of the
-    largest factor at most where all know as many cells.
+    each count by their median: less than half of them cannot move it beyond what an honest one says. Of fewer none
+    has a weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1) of
+    the largest factor at most where all know as many cells.
     """
     words = sorted(each for each in said if each.cells > 0)
     knowing = [each for each in words if each.cells >= _FEWEST_CELLS]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from shared_map.arrays import Floats
 from shared_map.learning.factors import SLOPE_BINS, by_process, estimate, factors_of, name_of
 from shared_map.learning.words import ONE, Said, told
 from shared_map.terrain.layers import TerrainClass
@@ -31,12 +32,24 @@ class LearnedKind(NamedTuple):
     factor: float
 
 
+def factors_in(words: Iterable[MarkSet]) -> Floats:
+    """What to multiply the prior pace of each kind of ground by: float32 (KEYS,).
+
+    words  as of `learned_kinds`
+    """
+    return factors_of(_voices(words))
+
+
+def _voices(words: Iterable[MarkSet]) -> list[Mapping[int, Said]]:
+    return by_process([(each.author, said) for each in words if (said := told(each))])
+
+
 def learned_kinds(words: Iterable[MarkSet]) -> list[LearnedKind]:
     """Each kind of ground that was driven, in order of class and slope.
 
     words  sets about the tile beyond the map; what is no word is left out
     """
-    voices = by_process([(each.author, said) for each in words if (said := told(each))])
+    voices = _voices(words)
     factors = factors_of(voices)
     known = range(SLOPE_BINS * (max(TerrainClass) + 1))
     by_key: dict[int, list[Said]] = {}
@@ -45,13 +58,13 @@ def learned_kinds(words: Iterable[MarkSet]) -> list[LearnedKind]:
             if key in known:
                 by_key.setdefault(key, []).append(said)
     rows = []
-    for key, said in sorted(by_key.items()):
-        together = estimate(said)
+    for key, parts in sorted(by_key.items()):
+        together = estimate(parts)
         rows.append(
             LearnedKind(
                 name_of(key),
-                sum(each.cells for each in said),
-                len(said),
+                sum(each.cells for each in parts),
+                len(parts),
                 math.exp(together.mean / ONE),
                 math.sqrt(together.variance / ONE / together.cells),
                 float(factors[key]),
