@@ -15,7 +15,8 @@ from planner_service.search.target_search import hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.strides import StrideSearch
-from shared_map.class_maps import ClassMaps, class_terrains
+from shared_map.class_grounds import class_terrains
+from shared_map.class_maps import ClassMaps
 from shared_map.cost_map import CostMap
 from shared_map.learning.gauges import LearnedGauges
 from shared_map.presence import Presence
@@ -85,7 +86,7 @@ class PlannerService:
         self._sightings = Sightings(filter)
         self._presence = Presence(terrain.grid, _PRESENCE_NS, scenario.vehicles.sense_range_m, filter)
         """Who looks where; nothing is heard of it for a target that has a tracker."""
-        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain.grid))
+        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain))
         self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._faults: list[str] = []

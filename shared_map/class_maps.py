@@ -9,41 +9,27 @@ opens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from shared_map.cost_map import CostMap
-from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.scenario import Scenario
-from swarm.errors import TerrainError
-from swarm.grid import GridSpec
+from shared_map.terrain.terrain import Terrain
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
 
 
-def class_terrains(scenario: Scenario, grid: GridSpec) -> dict[str, Terrain]:
-    """Class -> the terrain by its own rule, of all classes beside "ground". Raises TerrainError in one sentence."""
-    terrains = {}
-    for each in scenario.classes:
-        try:
-            terrain = build_terrain(scenario, vehicle_class=each.name)
-        except TerrainError as error:
-            raise TerrainError(f"class {each.name}: {error}") from error
-        if terrain.grid != grid:
-            raise TerrainError(f"class {each.name}: its terrain is {terrain.grid}, that of the run {grid}")
-        terrains[each.name] = terrain
-    return terrains
-
-
-def read_by(own_prior: Floats, prior: Floats, paces: Floats) -> Floats:
+def read_by(own_prior: Floats, prior: Floats, paces: Floats, least: float = PACE_LEAST) -> Floats:
     """What paces of the class "ground" are to another class, s/m.
 
     Parameters
     ----------
     own_prior, prior, paces : (n,) float32, s/m
         The prior ground of that class and of "ground", and what a mark or the truth gives; inf is lethal.
+    least : float, s/m
+        No vehicle of that class is quicker.
 
     Returns
     -------
@@ -52,9 +38,26 @@ def read_by(own_prior: Floats, prior: Floats, paces: Floats) -> Floats:
     """
     with np.errstate(invalid="ignore", over="ignore"):
         scaled = np.clip(own_prior.astype(np.float64) * paces / prior, PACE_LEAST, PACE_MOST).astype(np.float32)
-    read = np.where(np.isinf(prior) | (paces == prior), own_prior, np.where(own_prior == prior, paces, scaled))
+    marked = np.maximum(np.where(own_prior == prior, paces, scaled), np.float32(least))
+    read = np.where(np.isinf(prior) | (paces == prior), own_prior, marked)
     lethal = np.isinf(own_prior) | (np.isinf(paces) & np.isfinite(prior))
     return np.where(lethal, np.float32(np.inf), read).astype(np.float32)
+
+
+def read_marks(
+    own: Terrain, common: Terrain, cells: NDArray[Any], kinds: NDArray[np.uint8], paces: NDArray[np.float32]
+) -> tuple[NDArray[np.uint8], Floats]:
+    """What statements about the ground for "ground" are to another class: kinds and paces.
+
+    own, common  the terrain of that class, and of "ground"
+    """
+    where = np.asarray(cells, np.int64)
+    own_prior = own.ground_s_per_m.reshape(-1)[where]
+    prior = common.ground_s_per_m.reshape(-1)[where]
+    stated = np.where(kinds == MarkKind.PACE, paces, prior).astype(np.float32)
+    closed = np.isinf(own_prior) | np.isinf(prior)  # no pace is read here: it is as it was before any mark
+    own_kinds = np.where((kinds == MarkKind.PACE) & closed, np.uint8(MarkKind.CLEAR), kinds).astype(np.uint8)
+    return own_kinds, read_by(own_prior, prior, stated, own.least_s_per_m)
 
 
 class ClassMaps:
@@ -67,7 +70,6 @@ class ClassMaps:
     def __init__(self, common: CostMap, terrains: Mapping[str, Terrain]) -> None:
         self.common = common
         self.of = {name: CostMap(terrain, learning=common.keys is not None) for name, terrain in terrains.items()}
-        self._prior = common.terrain.ground_s_per_m.reshape(-1)
 
     def learn(self, words: Sequence[MarkSet]) -> bool:
         """As `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""
@@ -78,11 +80,5 @@ class ClassMaps:
         self.common.apply(cells, kinds, paces)
         if not self.of:
             return
-        where, prior = np.asarray(cells, np.int64), self._prior[np.asarray(cells, np.int64)]
         for cost_map in self.of.values():
-            own = cost_map.terrain.ground_s_per_m.reshape(-1)[where]
-            stated = np.where(kinds == MarkKind.PACE, paces, prior).astype(np.float32)
-            read = read_by(own, prior, stated)
-            closed = np.isinf(own) | np.isinf(prior)  # no pace is read here: it is as it was before any mark
-            own_kinds = np.where((kinds == MarkKind.PACE) & closed, np.uint8(MarkKind.CLEAR), kinds)
-            cost_map.apply(cells, own_kinds.astype(np.uint8), read)
+            cost_map.apply(cells, *read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces))

@@ -22,7 +22,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.statements import PACE_MOST, MarkKind
 
 MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""
@@ -153,7 +153,9 @@ class CostMap:
         self.factors = factors
         known = np.asarray(self.terrain.ground_s_per_m)
         by = factors[self.keys]
-        fresh = np.where(np.isinf(known) | (by == 1), known, np.clip(known * by, PACE_LEAST, PACE_MOST))
+        fresh = np.where(
+            np.isinf(known) | (by == 1), known, np.clip(known * by, self.terrain.least_s_per_m, PACE_MOST)
+        )
         np.copyto(self.prior_s_per_m, fresh)
         pace, ground, free = self.pace_s_per_m, self.ground_s_per_m, ~self._stated.reshape(known.shape)
         changed = free & (ground != fresh)

@@ -224,7 +224,7 @@ class Agent:
         self._driver.entered = {}
         if ways_out := self._steering.ways_out:
             # In a zone all is lethal by the map, so it cannot say which cells are so in truth.
-            lethal = set(sight.cells[np.isinf(sight.paces)].tolist())
+            lethal = set(self._map.lethal(sight.cells, sight.paces).tolist())
             if seen := lethal.intersection(ways_out):
                 self.seen_lethal |= seen
                 self._go_out(ways_out)

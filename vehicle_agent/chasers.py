@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
+from swarm.config.classes import GROUND
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import Chasers
 
@@ -29,8 +30,9 @@ class ChasersReport:
     the cell: seldom for one that is slow on a map of large cells, and never for one that waits.
     """
 
-    def __init__(self, author: str) -> None:
+    def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
+        self._vehicle_class = vehicle_class
         self._told: dict[str, _Told] = {}
         """Target -> what its planner knows, for all targets that have chasers among the vehicles."""
 
@@ -59,6 +61,7 @@ class ChasersReport:
                 stamp_ns=now_ns,
                 ids=list(cells),
                 cells=pack_column(list(cells.values()), "<u4"),
+                vehicle_class=self._vehicle_class,
             )
 
 

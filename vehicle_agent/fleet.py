@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm.config.classes import GROUND
 from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet
 from vehicle_agent.driving.places import Places
@@ -17,12 +18,13 @@ _MOST_TARGETS = NO_TARGET
 class FleetReport:
     """Makes the messages of one author. A region that its vehicles have left gets one empty message.
 
-    author, group  stand in each message; seq grows by one with each call of `reports`
+    author, group, vehicle_class  stand in each message; seq grows by one with each call of `reports`
     """
 
-    def __init__(self, author: str, group: str) -> None:
+    def __init__(self, author: str, group: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._group = group
+        self._vehicle_class = vehicle_class
         self._seq = 0
         self._regions: list[int] = []
 
@@ -59,6 +61,7 @@ class FleetReport:
             heading_rad=places.heading_rad[at].astype("<f4").tobytes(),
             states=bytes([vehicle.state for vehicle in vehicles]),
             targets=bytes(chased),
+            vehicle_class=self._vehicle_class,
         )
 
 

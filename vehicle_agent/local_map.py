@@ -16,11 +16,12 @@ from swarm.grid import GridSpec, Window
 class LocalMap:
     """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
 
-    pace     cost of a cell, with marks and inflation
-    ground   as pace, before inflation
-    prior    as ground, without marks
-    physics  the pace at which vehicles really drive
-    climb    factor of a step's cost by its slope; None if steps cost the same both ways
+    pace       cost of a cell to its vehicles' class, with marks and inflation
+    ground     what the map says of cells to the class "ground", before inflation: what is found is compared with it
+    prior      as ground, without marks
+    physics    the pace at which vehicles really drive
+    climb      factor of a step's cost by its slope; None if steps cost the same both ways
+    own_prior  the ground to its vehicles' class, without marks; None if that is "ground"
     """
 
     grid: GridSpec
@@ -29,6 +30,14 @@ class LocalMap:
     prior: NDArray[np.float32]
     physics: NDArray[np.float32]
     climb: Climb | None = None
+    own_prior: NDArray[np.float32] | None = None
+
+    def lethal(self, cells: NDArray[np.int64], paces: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Which of these cells are lethal to the vehicles' class, if these are their paces for "ground"."""
+        if self.own_prior is None:
+            return cells[np.isinf(paces)]
+        found = np.isinf(paces) & np.isfinite(self.prior.reshape(-1)[cells])
+        return cells[found | np.isinf(self.own_prior.reshape(-1)[cells])]
 
 
 def meet(boxes: NDArray[np.int64], windows: Sequence[Window], margin: int) -> NDArray[np.bool_]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import CellsOf, private_copy
-from shared_map.terrain.homes import homes_of
+from shared_map.class_grounds import ClassGround
 from shared_map.terrain.places import MapFrame
 from swarm.config.agents import AddedAgent, plan_agents
 from swarm.config.scenario import GroupConfig, Scenario
@@ -23,35 +24,33 @@ _TRIES = 64
 
 
 def spawn_cells(
-    scenario: Scenario,
-    grid: GridSpec,
-    prior: NDArray[np.float32],
-    truth: NDArray[np.float32],
-    homes: NDArray[np.bool_] | None = None,
+    scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGround]
 ) -> dict[str, dict[str, int]]:
-    """agent -> vehicle -> cell, of the whole run. All cells differ and lie in the largest connected passable part,
-    except those that the scenario names.
+    """agent -> vehicle -> cell, of the whole run. All cells differ, and each lies in the largest connected part
+    which the vehicle's class can drive, except those that the scenario names.
 
-    prior, truth  float32 (rows, cols), s/m; inf is lethal
-    homes         bool (rows, cols), `homes_of` these two, if that is known; not changed
+    grounds  of every class that vehicles belong to
 
     Raises ConfigError for a cell outside the terrain, lethal or given twice, and if there are too few passable
     cells.
     """
-    free = (homes_of(prior, truth) if homes is None else private_copy(homes)).reshape(-1)
-    explicit = {group.name: _explicit_cells(group, grid, prior, truth) for group in scenario.groups}
+    free = {name: private_copy(ground.homes).reshape(-1) for name, ground in grounds.items()}
+    explicit = {group.name: _explicit_cells(group, grid, grounds[group.vehicle_class]) for group in scenario.groups}
     taken: dict[int, str] = {}
     for name, cells in explicit.items():
         for cell in cells:
             if cell in taken:
                 raise ConfigError(f"groups: {name}: cell {list(grid.row_col(cell))} is given twice")
             taken[cell] = name
-    free[list(taken)] = False
+    for homes in free.values():
+        homes[list(taken)] = False
     placed: dict[str, list[int]] = {}
     for group in scenario.groups:
         chosen = explicit[group.name]
-        chosen += _choose(group, group.vehicles - len(chosen), grid, free, scenario.seed)
-        free[chosen] = False
+        own = free[group.vehicle_class]
+        chosen += _choose(group, group.vehicles - len(chosen), grid, own, scenario.seed)
+        for homes in free.values():
+            homes[chosen] = False
         placed[group.name] = chosen
     return {
         plan.id: dict(zip(plan.vehicle_ids, placed[plan.group.name][plan.first :], strict=False))
@@ -85,9 +84,8 @@ def _along_a_curve(grid: GridSpec, cells: NDArray[np.int64]) -> NDArray[np.int64
     return place
 
 
-def _explicit_cells(
-    group: GroupConfig, grid: GridSpec, prior: NDArray[np.float32], truth: NDArray[np.float32]
-) -> list[int]:
+def _explicit_cells(group: GroupConfig, grid: GridSpec, ground: ClassGround) -> list[int]:
+    prior, truth = ground.terrain.pace_s_per_m, ground.truth
     if len(group.cells) > group.vehicles:
         raise ConfigError(f"groups: {group.name}: {len(group.cells)} cells for {group.vehicles} vehicles")
     cells = []

@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.cost_map import CostMap
-from shared_map.learning.factors import Measured
+from shared_map.class_grounds import class_grounds
 from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
@@ -19,6 +18,7 @@ from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
+from swarm.config.classes import GROUND, of_class
 from swarm.config.plugin_names import assignment_key
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -50,6 +50,7 @@ from swarm.wire.topics import (
     TRUE_POSE,
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes
+from vehicle_agent.agent_maps import AgentMaps
 from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
@@ -59,8 +60,6 @@ from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.group_costs import GroupCosts
-from vehicle_agent.learning import Learning
-from vehicle_agent.local_map import LocalMap
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
@@ -94,8 +93,10 @@ class AgentService:
         scenario = setup.scenario
         plan = _plan_of(setup) if setup.added is None else setup.added.plan
         grid = terrain.grid
-        homes = load_homes(setup, terrain, truth)
-        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, homes)
+        self._class = plan.group.vehicle_class
+        grounds = class_grounds(scenario, terrain, truth, load_homes(setup, terrain, truth))
+        common, own = grounds[GROUND], grounds[self._class]
+        spawns = spawn_cells(scenario, grid, grounds)
         self._member = Member(setup.info(grid, terrain.digest), bus, post, setup.before)
         self.counters = self._member.counters
         for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):
@@ -103,22 +104,18 @@ class AgentService:
         self._bus = bus
         self._post = post
         self._setup = setup
-        self._cost_map = CostMap(terrain, learning=scenario.map.learning)
-        keys = self._cost_map.keys
-        self._learning = None if keys is None else Learning(Measured(keys), terrain.ground_s_per_m)
+        self._maps = AgentMaps(common, own, learning=scenario.map.learning)
         group = plan.group.name
         self._author = author_of(group, setup.author)
         self._replica = MapReplica(
             grid,
-            self._cost_map,
+            self._maps.sink,
             author=self._author,
             group=group,
             filter=MarkFilter(grid, readable_groups(scenario, group)),
         )
         near = scenario.map.interest == "near"
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
-        pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
-        local = LocalMap(grid, pace, ground, self._cost_map.prior_s_per_m, truth, terrain.climb)
         self._faults: list[str] = []
         """What plug-ins did wrong and nobody has been told yet."""
         world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
@@ -134,7 +131,7 @@ class AgentService:
         self._right_of_way = RightOfWaySync(
             setup, grid, spawns, store, bus, post, self._place, self._warn, plan.vehicle_ids
         )
-        bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
+        bodies = Bodies(grid, of_class(scenario, self._class).cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)
         assigned = AssignmentWorld(setup.id, group, targets, scenario.seed, plan.group.pursuers)
         named = named_plugin(scenario, assignment_key(scenario, group))
@@ -145,7 +142,7 @@ class AgentService:
         self._agent = Agent(
             plan,
             scenario,
-            local,
+            self._maps.local,
             sensor,
             self._right_of_way.core.holdings,
             bodies,
@@ -156,7 +153,7 @@ class AgentService:
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
-        self._zones = ZonesAround(self._replica, self._cost_map)
+        self._zones = ZonesAround(self._replica, self._maps.own, self._maps.read)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._obeyed_version = 0
@@ -168,10 +165,10 @@ class AgentService:
         """Vehicles that an operator has let leave."""
         self._entering: Entering | None = None
         if setup.added is not None:
-            cells = entry_cells(setup.added, grid, homes, setup.incarnation)
+            cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
             self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings, self._agent.is_open)
-        self._fleet = FleetReport(self._author, group)
-        self._chasers = ChasersReport(self._author)
+        self._fleet = FleetReport(self._author, group, self._class)
+        self._chasers = ChasersReport(self._author, self._class)
 
     @property
     def agent(self) -> Agent:
@@ -259,7 +256,7 @@ class AgentService:
         self._zones.update(places, now_ns, agent.bodies.standing | agent.seen_lethal)
         agent.set_ways_out(self._zones.ways_out)
         self._obey(now_ns)
-        agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
+        agent.map_changed(self._maps.take_dirty(), now_ns, look=True)
         if places:
             self._sync.enter(self._near_marks.update(places))
         self._hear_bodies(now_ns)
@@ -268,10 +265,11 @@ class AgentService:
             if len(findings := self._zones.without(found)):
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
-                agent.map_changed(self._cost_map.take_dirty(), now_ns)
-        if self._learning is not None and (said := self._learning.tick(agent.take_driven(), now_ns)):
+                agent.map_changed(self._maps.take_dirty(), now_ns)
+        learning = self._maps.learning
+        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
             self._sync.publish(self._replica.write_learned(said, now_ns))
-        columns = Places(self._cost_map.grid, agent.vehicles.values())
+        columns = Places(self._replica.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
@@ -414,10 +412,11 @@ class AgentService:
                         vehicles=list(vehicles),
                         max_cells=self._setup.scenario.vehicles.route_cells,
                         force=force,
+                        vehicle_class=self._class,
                     )
                     self._bus.ask(ROUTE, asking, self._post, tag=f"route-{request}", target=target)
                 case AskCosts(request, _, cells):
-                    costs = CostRequest(cells=list(cells))
+                    costs = CostRequest(cells=list(cells), vehicle_class=self._class)
                     self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
@@ -437,7 +436,7 @@ class AgentService:
                 vehicle=route.vehicle,
                 target=route.target,
                 start=route.cells[0],
-                directions=directions_of(route.cells, self._cost_map.grid.cols),
+                directions=directions_of(route.cells, self._replica.grid.cols),
                 cost_s=route.cost_s,
                 lower_bound_s=route.lower_bound_s,
             )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from swarm.clock import NS_PER_S
 from swarm.wire.statements import MarkKind
 from vehicle_agent.sensing.sensor import Findings
 
+Read = Callable[
+    [NDArray[Any], NDArray[np.uint8], NDArray[np.float32]], tuple[NDArray[np.uint8], NDArray[np.float32]]
+]
 _AGAIN_NS = NS_PER_S
 """Ways out are looked for again so often while somebody needs one: what is around the zone changes, too."""
 
@@ -23,13 +27,16 @@ _AGAIN_NS = NS_PER_S
 class ZonesAround:
     """The zones in an agent's map.
 
+    read      what statements about the ground are to the map's class of vehicles
+
     ways_out  cell that only a zone closes -> straight steps from there to the nearest open cell
     """
 
-    def __init__(self, replica: MapReplica, cost_map: CostMap) -> None:
+    def __init__(self, replica: MapReplica, cost_map: CostMap, read: Read) -> None:
         self.ways_out: Mapping[int, int] = {}
         self._replica = replica
         self._cost_map = cost_map
+        self._read = read
         self._version = 0
         """Of the zones that `_cells` are the cells of, sorted."""
         self._cells: NDArray[np.int64] = np.empty(0, np.int64)
@@ -109,7 +116,9 @@ class ZonesAround:
             said = winners(others, replica.now_ns)
             stated = said.kinds != MarkKind.CLEAR
             cells = grid_cells(replica.grid, corner, said.cells[stated])
-            flat[cells] = np.where(said.kinds[stated] == MarkKind.LETHAL, np.inf, said.paces[stated])
+            kinds, paces = self._read(cells, said.kinds[stated], said.paces[stated])
+            marked = kinds != MarkKind.CLEAR
+            flat[cells[marked]] = np.where(kinds == MarkKind.LETHAL, np.inf, paces)[marked]
         for tile in tiles:
             window = cost_map.padded(replica.grid.tile_window(tile))
             pace = cost_map.inflated(ground, window)

@@ -21,6 +21,7 @@ from launch_scripts.launcher.run_processes import Usage, has_ended, processes, u
 from launch_scripts.launcher.up_process import UpProcess
 from launch_scripts.process_table import processes_of
 from launch_scripts.world.referee import Collision, Referee
+from shared_map.class_grounds import class_truths
 from shared_map.terrain.terrain import build_terrain, build_truth
 from swarm.bus.endpoints import listening
 from swarm.config.agents import plan_agents
@@ -79,7 +80,7 @@ class Siege:
         scenario = with_port(find_scenario(options.scenario), 0)
         self._scenario: Scenario = scenario
         terrain = build_terrain(scenario)
-        self._referee = Referee(build_truth(scenario, terrain), terrain.grid)
+        self._referee = Referee(class_truths(scenario, terrain, build_truth(scenario, terrain)), terrain.grid)
         vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
         self._recovery = Recovery(vehicles)
         self._names = [spec.name for spec in processes_of(scenario)]

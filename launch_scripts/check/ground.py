@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from launch_scripts.check.findings import Finding, failure, warning
 from shared_map.arrays import Bools, Floats
-from shared_map.terrain.homes import homes_of
+from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
+from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
+from swarm.grid import GridSpec
 from swarm.places import cell_of
+from vehicle_agent.placement import spawn_cells
 
 
 def check_places(scenario: Scenario, terrain: Terrain, truth: Floats) -> None:
@@ -29,9 +32,9 @@ def places(scenario: Scenario, terrain: Terrain, truth: Floats) -> Iterator[Find
 
     truth  float32 (rows, cols), s/m; inf is lethal
     """
-    homes = homes_of(terrain.pace_s_per_m, truth)
-    yield from _targets(scenario, terrain, truth, homes)
-    yield from _vehicles(scenario, terrain, truth, homes)
+    grounds = class_grounds(scenario, terrain, truth)
+    yield from _targets(scenario, terrain, truth, grounds[GROUND].homes)
+    yield from _vehicles(scenario, terrain.grid, grounds)
 
 
 def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:
@@ -59,38 +62,37 @@ def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) 
             yield failure(key, f"no way leads to {shown} from {part}, where vehicles start{_near(~homes, place)}")
 
 
-def _vehicles(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:
-    grid, frame = terrain.grid, MapFrame(terrain.grid)
-    closed = np.isinf(truth) | terrain.lethal
-    taken: dict[int, str] = {}
-    left = int(homes.sum())
+def _vehicles(scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGround]) -> Iterator[Finding]:
+    frame, taken = MapFrame(grid), dict[int, str]()
+    refused = False
     for n, group in enumerate(scenario.groups):
-        key = f"groups[{n}].cells"
+        key, own = f"groups[{n}].cells", grounds[group.vehicle_class]
+        closed, homes = np.isinf(own.truth) | own.terrain.lethal, own.homes
         for given in group.cells:
             try:
                 cell = cell_of(given, frame, key)
             except ConfigError as error:
+                refused = True
                 yield failure("", str(error))
                 continue
             place = grid.row_col(cell)
             shown = _shown(given, place)
             if cell in taken:
+                refused = True
                 yield failure(key, f"{shown} is given twice, here and in {taken[cell]}")
             elif closed[place]:
-                yield failure(key, f"{shown} is lethal{_near(closed, place)}")
+                refused = True
+                whom = "" if group.vehicle_class == GROUND else f" to the class {group.vehicle_class}"
+                yield failure(key, f"{shown} is lethal{whom}{_near(closed, place)}")
             elif not homes[place]:
                 yield warning(key, f"{shown} is cut off from the largest part that can be driven")
-            else:
-                left -= 1
             taken[cell] = key
-        left -= group.vehicles - len(group.cells)
-        if left < 0:
-            there = int(homes.sum())
-            yield failure(
-                f"groups[{n}].vehicles",
-                f"found {group.vehicles}, but only {there} cells are passable and connected, one for each vehicle",
-            )
-            return
+    if refused:
+        return
+    try:
+        spawn_cells(scenario, grid, grounds)
+    except ConfigError as error:
+        yield failure("", str(error))
 
 
 def _shown(given: object, place: tuple[int, int]) -> str:

@@ -104,10 +104,11 @@ def _section(path: str, section: Section) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     hints, said = hints_of(section), _meanings(section)
     for field in msgspec.structs.fields(section):
-        if path == "" and section_in(hints[field.name]) is not None:
+        if path == "" and section_in(hints[field.encode_name]) is not None:
             continue
-        cells = (said[field.name], _unit(field.name), _allowed(hints[field.name]), _default(field))
-        yield f"| `{field.name}` | " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        key = field.encode_name
+        cells = (said[key], _unit(key), _allowed(hints[key]), _default(field))
+        yield f"| `{key}` | " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
+from shared_map.class_grounds import class_grounds
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Event, Heard
 from swarm.config.agents import plan_agents
@@ -45,7 +46,7 @@ class Laws:
     """Looks at everything in a simulation that no process could see.
 
     collisions    (when, vehicle, vehicle, cell), by where vehicles truly are; those of a dead process stay put
-    lethal        (when, vehicle, cell), of cells that are lethal in truth
+    lethal        (when, vehicle, cell), of cells that are lethal in truth to the vehicle's class
     acknowledged  the newest of each set that a keeper ever said it had committed
     """
 
@@ -54,16 +55,16 @@ class Laws:
         self.collisions: list[tuple[float, str, str, int]] = []
         self.lethal: list[tuple[float, str, int]] = []
         self.acknowledged: Sets = {}
-        spawns = spawn_cells(
-            simulation.scenario, simulation.terrain.grid, simulation.terrain.pace_s_per_m, simulation.truth
-        )
+        grounds = class_grounds(simulation.scenario, simulation.terrain, simulation.truth)
+        spawns = spawn_cells(simulation.scenario, simulation.terrain.grid, grounds)
         self._unmoved = {id: cell for each in spawns.values() for id, cell in each.items()}
         """Vehicle -> cell, of those that no process has placed yet."""
         self._bodies: dict[str, dict[str, int]] = {}
         """Node -> vehicle -> cell. A body stands where it is when its process dies."""
         self._last: dict[str, Node] = {}
         """Agent -> the node on which its newest life began."""
-        self._passable = np.isfinite(simulation.truth).ravel()
+        self._passable = {name: np.isfinite(each.truth).ravel() for name, each in grounds.items()}
+        """Class of vehicles -> the cells that it may enter, in truth."""
         simulation.after_tick.append(self._look)
         simulation.after_boot.append(self._began)
         bus = simulation.network.bus(OBSERVER, simulation.scenario.network.namespace)
@@ -80,8 +81,9 @@ class Laws:
         now_s = self.simulation.now_s
         agent = node.service.agent
         bodies = self._bodies.setdefault(node.name, {})
+        passable = self._passable[agent.plan.group.vehicle_class]
         for id, vehicle in agent.vehicles.items():
-            if bodies.get(id) != vehicle.cell and not self._passable[vehicle.cell]:
+            if bodies.get(id) != vehicle.cell and not passable[vehicle.cell]:
                 self.lethal.append((now_s, id, vehicle.cell))
             bodies[id] = vehicle.cell
             self._unmoved.pop(id, None)

@@ -7,7 +7,7 @@ A report of a vehicle holds from its stamp until the vehicle's next report. Wher
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from launch_scripts.world.body_referee import BodyHit as BodyHit
 from launch_scripts.world.body_referee import BodyReferee, Stay
 from swarm.clock import NS_PER_S
+from swarm.config.classes import GROUND
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
@@ -39,7 +40,7 @@ class Collision:
 
 @dataclass(frozen=True, slots=True)
 class LethalEntry:
-    """A vehicle entered a cell which is lethal in truth."""
+    """A vehicle entered a cell which is lethal in truth to its class."""
 
     vehicle: str
     cell: int
@@ -60,11 +61,12 @@ class _Vehicle:
 class Referee:
     """Turns reports into broken laws. Repeated and late reports change nothing.
 
-    truth_s_per_m  float32 (rows, cols); inf is lethal
+    truths  class of vehicles -> float32 (rows, cols), s/m; inf is lethal. One that is not there is as "ground"
     """
 
-    def __init__(self, truth_s_per_m: NDArray[np.float32], grid: GridSpec) -> None:
-        self._truth_s_per_m = truth_s_per_m.reshape(-1)
+    def __init__(self, truths: Mapping[str, NDArray[np.float32]], grid: GridSpec) -> None:
+        self._truths = {name: truth.reshape(-1) for name, truth in truths.items()}
+        self._cells = grid.cells
         self._vehicles: dict[str, _Vehicle] = {}
         self._stays: dict[int, list[Stay]] = {}
         self._encounters: dict[tuple[str, str], int] = {}
@@ -84,7 +86,7 @@ class Referee:
         """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
         broken: list[Broken] = []
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
-            if cell < len(self._truth_s_per_m):
+            if cell < self._cells:
                 self._report(id, cell, fleet, broken)
         if fleet.stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(fleet.stamp_ns)
@@ -113,7 +115,8 @@ class Referee:
             self._vehicles[id] = _Vehicle(entered, fleet.author, fleet.seq, stamp_ns)
         else:
             known.stay = entered
-        if not self._truth_s_per_m.item(cell) < math.inf:
+        truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
+        if not truth.item(cell) < math.inf:
             broken.append(LethalEntry(id, cell, stamp_ns))
 
     def _meetings(self, stay: Stay) -> Iterator[Collision | BodyHit]:

@@ -16,6 +16,7 @@ from launch_scripts.world.referee import BodyHit, Collision, LethalEntry, Refere
 from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.walks import Budget, TrueTerrain, Walker, WalkWorld, far_place, slowness_of, walk_of
 from shared_map.arrays import Floats, private_copy
+from shared_map.class_grounds import class_truths
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
@@ -112,7 +113,7 @@ class TargetWorld:
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace, terrain.climb)
-        self._referee = Referee(truth_s_per_m, terrain.grid)
+        self._referee = Referee(class_truths(scenario, terrain, truth_s_per_m), terrain.grid)
         self._target_bodies = TargetBodies(scenario, terrain.grid)
         self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation

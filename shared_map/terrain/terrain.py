@@ -45,7 +45,7 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
 from swarm.runtime.role import RoleSetup
-from swarm.wire.statements import PACE_MOST
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
     from shared_map.terrain.importers.sources import Source
@@ -67,6 +67,7 @@ class Terrain:
     classes           uint8    TerrainClass
     digest            16 hex digits of grid, prior pace and cost rules (and heights, where steps cost by them)
     climb             what a step costs for what it climbs; None if it costs the same both ways
+    least_s_per_m     no vehicle is quicker, whatever is marked or learned
     notes             sentences about where it came from and what was done to it
     zones             what each zone did to it; empty of a prepared one
     """
@@ -80,6 +81,7 @@ class Terrain:
     ground_s_per_m: Floats
     vehicle_radius_m: float = 0.0
     climb: Climb | None = None
+    least_s_per_m: float = PACE_LEAST
     notes: tuple[str, ...] = field(default=())
     zones: tuple[ZoneFacts, ...] = field(default=())
 

@@ -27,9 +27,9 @@ SHARED = ("zones", "layers", "directional")
 
 
 class ClassConfig(Section, frozen=True, kw_only=True):
-    """A class of vehicles whose routes may be asked for, beside "ground": that of `[cost]` and `[vehicles]`.
+    """A class of vehicles beside "ground", that of `[cost]` and `[vehicles]`: groups name theirs, and queries may.
 
-    name               what queries call it
+    name               what groups and queries call it
     cost               what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
                            and `directional` are those of `[cost]`
     max_speed_m_per_s  none of the speeds of its cost is more than this: level, on roads, downhill
@@ -86,6 +86,16 @@ def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
             check_cost(each.cost, f"{source}: classes[{n}]")
         except ConfigError as error:
             yield str(error)
+    for group in scenario.groups:
+        if group.vehicle_class not in (GROUND, *names):
+            known = choice(group.vehicle_class, [GROUND, *names], " there are ")
+            yield f"{source}: groups: {group.name}: class is {group.vehicle_class!r}, which is no class{known}"
+
+
+def driven_classes(scenario: Scenario) -> list[str]:
+    """The classes beside `GROUND` that vehicles of the scenario belong to, in the order of `scenario.classes`."""
+    driven = {group.vehicle_class for group in scenario.groups}
+    return [each.name for each in scenario.classes if each.name in driven]
 
 
 def class_named(scenario: Scenario, name: str) -> ClassConfig | None:

@@ -26,7 +26,7 @@ def commented(settings: Mapping[str, Any], head: str) -> str:
 
 def _section(settings: Mapping[str, Any], section: Any, path: tuple[str, ...]) -> Iterator[str]:
     said, hints = meanings(section), hints_of(section)
-    defaults = {field.name: field.default for field in msgspec.structs.fields(section)}
+    defaults = {field.encode_name: field.default for field in msgspec.structs.fields(section)}
     for key, value in settings.items():
         if section_in(hints[key]) is None:
             yield ""

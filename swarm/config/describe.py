@@ -38,8 +38,11 @@ def meanings(section: type[msgspec.Struct]) -> dict[str, str]:
 
 @cache
 def hints_of(section: Any) -> Mapping[str, Any]:
-    """Setting -> its type, with its bounds."""
-    return typing.get_type_hints(section, include_extras=True)
+    """Setting, as a file names it -> its type, with its bounds."""
+    hints = typing.get_type_hints(section, include_extras=True)
+    if not is_section(section):
+        return hints
+    return {each.encode_name: hints[each.name] for each in msgspec.structs.fields(section)}
 
 
 def expected(hint: Any) -> str:

@@ -117,7 +117,7 @@ def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
 
 
 def _unknown(key: str, name: str, section: Any, root: type) -> str:
-    allowed = list(getattr(section, "__struct_fields__", ()))
+    allowed = list(getattr(section, "__struct_encode_fields__", ()))
     if not key.isprintable():  # it might steer the terminal
         key = repr(key)
     where = f"{name}.{key}" if name else key

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from swarm.config.classes import MOST_CLASSES, ClassConfig
+from swarm.config.classes import GROUND, MOST_CLASSES, ClassConfig
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.values import (
     MOST_TARGETS,
@@ -100,6 +100,7 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     assignment  which vehicle goes for which target: as `vehicles.assignment`, which counts if this is not given; a
                 plug-in takes `vehicles.assignment_options`
     pursuers    balanced: so many vehicles each target gets first, those which together are the quickest there
+    class       the class of its vehicles: one of `classes`, or "ground", that of `cost` and `vehicles`
     """
 
     name: Name = "all"
@@ -111,6 +112,7 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     writes: tuple[GroupName, ...] = ("*",)
     assignment: Annotated[str, plugin_name(Assigner)] | None = None
     pursuers: Annotated[int, Meta(ge=1, le=16)] = 1
+    vehicle_class: Name = msgspec.field(name="class", default=GROUND)
 
 
 class VehicleConfig(Section, frozen=True, kw_only=True):

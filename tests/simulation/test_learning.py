@@ -28,7 +28,7 @@ def scenario_of(seed: int) -> Scenario:
 
 def maps_of(simulation: Simulation) -> dict[str, CostMap]:
     services = {name: node.service for name, node in simulation.nodes.items()}
-    return {name: service._cost_map for name, service in services.items() if hasattr(service, "_cost_map")}
+    return {name: service._maps.common for name, service in services.items() if hasattr(service, "_maps")}
 
 
 @pytest.mark.thorough

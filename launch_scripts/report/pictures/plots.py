@@ -33,6 +33,7 @@ _SHOWN_PERCENT = 0.005
 """What is smaller is 0.00% wherever gaps are shown."""
 _WIDE = 1.7
 _HALF = 0.5
+_TITLE_PT = 10.5
 
 
 @dataclass(frozen=True)
@@ -305,9 +306,16 @@ def show_percent(axes: Axes, most: float) -> None:
 
 
 def legend_above(axes: Axes, handles: Iterable[Any]) -> None:
+    """A legend beside the title, in letters so small that both have room."""
+    entries = list(handles)
+    ems = sum(0.52 * len(entry.get_label()) + 2.6 for entry in entries)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    wide_pt = axes.get_position().width * figure.get_figwidth() * 72
+    room_pt = wide_pt - 0.62 * _TITLE_PT * len(axes.get_title("left")) - _TITLE_PT
     axes.legend(
-        handles=list(handles), loc="lower right", bbox_to_anchor=(1.0, 0.985), ncol=6, handlelength=1.2,
-        handletextpad=0.4, columnspacing=1.0, borderaxespad=0.2, fontsize=8.5,
+        handles=entries, loc="lower right", bbox_to_anchor=(1.0, 0.985), ncol=6, handlelength=1.2,
+        handletextpad=0.4, columnspacing=1.0, borderaxespad=0.2, fontsize=min(8.5, room_pt / max(ems, 1.0)),
     )  # fmt: skip
 
 

@@ -81,6 +81,7 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     heading_rad: Annotated[bytes, Column("<f4", per="ids", least=-2 * math.tau, most=2 * math.tau)]
     states: Annotated[bytes, Column("<u1", per="ids", least=0, most=int(max(VehicleState)))]
     targets: Annotated[bytes, Column("<u1", per="ids")]
+    vehicle_class: Id = "ground"
 
     def relate(self) -> None:
         if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):

@@ -27,7 +27,7 @@ def vehicle(at_ms: int, col: int, row: int = 5) -> tuple[int, Fleet]:
 
 
 def judged(*reports: tuple[int, Body | Fleet]) -> list[BodyHit]:
-    referee = Referee(np.ones(100, np.float32), GRID)
+    referee = Referee({"ground": np.ones(100, np.float32)}, GRID)
     hits = []
     for at_ms, report in sorted(reports, key=lambda each: each[0]):
         if isinstance(report, Body):

@@ -20,6 +20,7 @@ from launch_scripts.check import needs
 from launch_scripts.check.ground import places
 from launch_scripts.cli import main
 from launch_scripts.commands.new import Choices, _asked
+from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.commented import commented
 from swarm.config.describe import expected, meanings
@@ -263,7 +264,7 @@ def test_check_refuses_a_placement_exactly_if_the_agents_would(
     scenario = Scenario(groups=(group,), vehicles=msgspec.structs.replace(Scenario().vehicles, per_agent=100))
     found = [each for each in places(scenario, terrain, terrain.ground_s_per_m) if each.level == "failure"]
     try:
-        spawn_cells(scenario, terrain.grid, terrain.pace_s_per_m, terrain.ground_s_per_m)
+        spawn_cells(scenario, terrain.grid, class_grounds(scenario, terrain, terrain.ground_s_per_m))
         refused = False
     except ConfigError:
         refused = True

@@ -17,7 +17,7 @@ from swarm.wire.messages.vehicles import Fleet
 
 
 def judged(*reports: Fleet, truth: NDArray[np.float32] | None = None) -> list[Collision | LethalEntry]:
-    referee = Referee(np.ones(100, np.float32) if truth is None else truth, GridSpec(10, 10, 10.0))
+    referee = Referee({"ground": np.ones(100, np.float32) if truth is None else truth}, GridSpec(10, 10, 10.0))
     return [broken for report in reports for broken in referee.hear(report)]
 
 

@@ -67,7 +67,8 @@ def test_every_key_of_every_section_is_on_the_page():
     for path, section in scenario_page._sections(Scenario):
         assert f"## `{path}`" in page or path == ""
         for field in msgspec.structs.fields(section):
-            assert f"| `{field.name}` |" in page or f".{field.name}]" in page or f"[{field.name}]" in page
+            key = field.encode_name
+            assert f"| `{key}` |" in page or f".{key}]" in page or f"[{key}]" in page
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,24 @@ def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
             assert not any(box.overlaps(other) for other in head[:n]), figure.texts[n].get_text()
 
 
+@pytest.mark.parametrize("states", [2, len(plots.STATE_COLOURS)])
+def test_the_legend_of_states_leaves_the_title_its_room(states: int) -> None:
+    series: dict[str, Any] = {"t_s": [0.0, 1.0]}
+    series |= {state.name.lower(): [n < states] * 2 for n, state in enumerate(plots.STATE_COLOURS)}
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(picture.WIDTH_IN, picture.HEIGHT_IN), dpi=picture.DPI)
+        axes = figure.add_axes((0.655, 0.6, 0.297, 0.1))
+        plots.draw_plot(axes, next(plot for plot in plots.PLOTS if plot.name == "states"), {"series": series})
+        FigureCanvasAgg(figure).draw()
+        legend = axes.get_legend()
+        assert legend is not None
+        assert len(legend.get_texts()) == states
+        title = next(
+            text for text in axes.findobj(Text) if text.get_text() and text.get_text() == axes.get_title("left")
+        )
+        assert title.get_window_extent().x1 < legend.get_window_extent().x0
+
+
 def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenario, tmp_path: Path) -> None:
     terrain = terrain_of_pace(np.ones((1, 1), np.float32))
     recorder = Recorder(scenario, GridSpec(1, 1, 10.0))

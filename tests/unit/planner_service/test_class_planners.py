@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.planner_swarm import TICK, Ear
 from support.swarm_model import SwarmModel
 
 from planner_service import class_planners
 from planner_service.service import PlannerService
-from shared_map.class_maps import ClassMaps, class_terrains, read_by
+from shared_map.class_grounds import class_terrains
+from shared_map.class_maps import ClassMaps, read_by
 from shared_map.cost_map import CostMap
 from shared_map.learning.words import ONE, Said
 from shared_map.replication.replica import MapReplica
@@ -52,7 +54,7 @@ name = "same"
 def _made() -> tuple[Scenario, Terrain, dict[str, Terrain]]:
     scenario = parse_scenario(_TEXT)
     terrain = build_terrain(scenario)
-    return scenario, terrain, class_terrains(scenario, terrain.grid)
+    return scenario, terrain, class_terrains(scenario, terrain)
 
 
 def test_each_class_has_its_own_ground_on_the_same_roads() -> None:
@@ -76,7 +78,7 @@ _STATEMENTS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 @given(first=_STATEMENTS, second=_STATEMENTS)
 def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(
     first: list[Any], second: list[Any]

@@ -170,7 +170,7 @@ def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str])
     world.start_all()
     world.run(5.0)
     closed = np.isinf(pace_of(TRUTH)) & ~np.isinf(pace_of(PRIOR))
-    red, blue = (service._cost_map.ground_s_per_m[closed] for service in world.agents.values())
+    red, blue = (service._maps.common.ground_s_per_m[closed] for service in world.agents.values())
     assert np.isinf(red).all()
     assert np.isinf(blue).all() == bool(writes)
     refused = world.agents["a1"].counters.counts["sets_foreign"]

@@ -162,7 +162,7 @@ def sections_of(kind: type) -> set[type[Section]]:
 
 @pytest.mark.parametrize("section", sorted(sections_of(Scenario), key=str), ids=lambda section: section.__name__)
 def test_every_setting_has_its_row_and_every_row_its_setting(section):
-    assert list(meanings(section)) == list(section.__struct_fields__)
+    assert list(meanings(section)) == list(section.__struct_encode_fields__)
     assert all(meaning.strip() for meaning in meanings(section).values())
 
 

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from shared_map.class_grounds import class_grounds
+from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -246,6 +249,11 @@ def test_no_way_is_certain_only_when_all_live_planners_have_said_so() -> None:
 # --- where they start ---------------------------------------------------------------------------------------
 
 
+def spawns_of(text: str, prior: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, dict[str, int]]:
+    scenario = parse_scenario(text)
+    return spawn_cells(scenario, GRID, class_grounds(scenario, terrain_of_pace(prior), truth))
+
+
 @settings(deadline=None)  # the first one imports scipy
 @given(st.integers(0, 1000), st.sampled_from(["spread", "cluster"]), st.integers(0, 25))
 def test_all_vehicles_start_on_different_passable_cells_of_one_part(seed: int, start: str, walls: int) -> None:
@@ -253,7 +261,7 @@ def test_all_vehicles_start_on_different_passable_cells_of_one_part(seed: int, s
     prior = LEVEL.copy()
     prior.reshape(-1)[chance.sample(range(144), walls)] = np.inf
     text = f'seed = {seed}\n[[groups]]\nvehicles = 30\nstart = "{start}"\n[vehicles]\nper_agent = 7\n'
-    spawns = spawn_cells(parse_scenario(text), GRID, prior, prior)
+    spawns = spawns_of(text, prior, prior)
     cells = [cell for vehicles in spawns.values() for cell in vehicles.values()]
     assert len(set(cells)) == 30
     assert np.isfinite(prior.reshape(-1)[cells]).all()
@@ -265,14 +273,13 @@ def test_nobody_starts_on_an_island_or_on_what_is_lethal_in_truth() -> None:
     prior[:, 3] = np.inf  # three columns of 36 cells are cut off
     truth[:, 8] = np.inf
     text = "[[groups]]\nvehicles = 40\n"
-    spawns = spawn_cells(parse_scenario(text), GRID, prior, truth)
+    spawns = spawns_of(text, prior, truth)
     columns = {cell % 12 for vehicles in spawns.values() for cell in vehicles.values()}
     assert columns <= {4, 5, 6, 7}
 
 
 def test_explicit_places_come_first_and_are_left_free_by_all_others() -> None:
-    scenario = parse_scenario(TEXT)
-    spawns = spawn_cells(scenario, GRID, LEVEL, LEVEL)
+    spawns = spawns_of(TEXT, LEVEL, LEVEL)
     assert spawns["a0"] == {"a0-00": GRID.cell(5, 5), "a0-01": GRID.cell(5, 7)}
     assert not set(spawns["a1"].values()) & set(spawns["a0"].values())
 

@@ -8,6 +8,7 @@ import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from support.swarm_model import LossyLinks
 
+from shared_map.class_grounds import class_grounds
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.placement import spawn_cells
 
@@ -123,4 +124,6 @@ def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
 
 
 def spawn_cells_of(world: AgentWorld) -> dict[str, dict[str, int]]:
-    return spawn_cells(world.scenario, world.terrain.grid, world.terrain.pace_s_per_m, world.truth)
+    return spawn_cells(
+        world.scenario, world.terrain.grid, class_grounds(world.scenario, world.terrain, world.truth)
+    )

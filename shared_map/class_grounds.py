@@ -1,0 +1,98 @@
+"""The ground of each class of vehicles: the terrain by its own rule of cost, what that is in truth, and where its
+vehicles may start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
+
+import msgspec
+
+from shared_map.arrays import Bools, Floats
+from shared_map.class_maps import read_by
+from shared_map.terrain.homes import homes_of
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.config.classes import GROUND, class_named, driven_classes
+from swarm.config.scenario import Scenario
+from swarm.errors import TerrainError
+from swarm.wire.statements import PACE_LEAST
+
+_MADE: WeakKeyDictionary[Terrain, dict[bytes, Terrain]] = WeakKeyDictionary()
+"""What was made beside a terrain, so that the processes of a simulation make it once."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClassGround:
+    """The ground as vehicles of one class find it.
+
+    truth  float32 (rows, cols), s/m: the pace at which they really drive, without inflation; inf is lethal
+    homes  bool (rows, cols): where they may start (`homes_of`)
+    """
+
+    terrain: Terrain
+    truth: Floats
+    homes: Bools
+
+
+def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | None = None) -> dict[str, Terrain]:
+    """Class -> the terrain by its own rule, of these classes; of all beside "ground" if none are named. Raises
+    TerrainError in one sentence.
+
+    common  the terrain of the run, for the class "ground"
+    """
+    wanted = [each.name for each in scenario.classes] if names is None else list(names)
+    return {name: _terrain(scenario, common, name) for name in wanted}
+
+
+def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
+    own = class_named(scenario, name)
+    if own is None:
+        return common
+    made = _MADE.setdefault(common, {})
+    key = msgspec.json.encode([scenario.seed, scenario.terrain, scenario.cost, own])
+    if key not in made:
+        try:
+            terrain = build_terrain(scenario, vehicle_class=name)
+        except TerrainError as error:
+            raise TerrainError(f"class {name}: {error}") from error
+        if terrain.grid != common.grid:
+            raise TerrainError(f"class {name}: its terrain is {terrain.grid}, that of the run {common.grid}")
+        limit = PACE_LEAST if own.max_speed_m_per_s is None else 1 / own.max_speed_m_per_s
+        # The same ground is looked at: what a class has of its own is what it costs.
+        made[key] = replace(
+            terrain, elevation_m=common.elevation_m, photo=common.photo, classes=common.classes, least_s_per_m=limit
+        )
+    return made[key]
+
+
+def class_truth(own: Terrain, common: Terrain, truth: Floats) -> Floats:
+    """What the truth for "ground" is to another class, float32 (rows, cols)."""
+    own_prior, prior = own.ground_s_per_m.reshape(-1), common.ground_s_per_m.reshape(-1)
+    read: Floats = read_by(own_prior, prior, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
+    return read
+
+
+def class_truths(scenario: Scenario, common: Terrain, truth: Floats) -> dict[str, Floats]:
+    """Class -> the truth for it, of "ground" and of every class that vehicles of the scenario belong to."""
+    terrains = class_terrains(scenario, common, driven_classes(scenario))
+    return {GROUND: truth} | {name: class_truth(own, common, truth) for name, own in terrains.items()}
+
+
+def class_grounds(
+    scenario: Scenario, common: Terrain, truth: Floats, homes: Bools | None = None
+) -> dict[str, ClassGround]:
+    """Class -> its ground, of "ground" and of every class that vehicles of the scenario belong to.
+
+    common, truth, homes  those of "ground"; `homes_of` the other two, if that is known
+    """
+    terrains = class_terrains(scenario, common, driven_classes(scenario))
+    known = homes_of(common.pace_s_per_m, truth) if homes is None else homes
+    grounds = {GROUND: ClassGround(common, truth, known)}
+    for name, own in terrains.items():
+        own_truth = class_truth(own, common, truth)
+        homes = homes_of(own.pace_s_per_m, own_truth)
+        if not homes.any():
+            raise TerrainError(f"class {name}: no cell that it can drive by the map is so in truth")
+        grounds[name] = ClassGround(own, own_truth, homes)
+    return grounds

@@ -1,0 +1,119 @@
+"""Vehicles of several classes in one swarm: each drives by its own map, and all share what they find."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import cache
+
+import msgspec
+import numpy as np
+
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import Trial
+from launch_scripts.world.service import TargetsService
+from shared_map.class_grounds import ClassGround, class_grounds
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.config.agents import agent_of, plan_agents
+from swarm.config.classes import ClassConfig
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.runtime.stats import CAPTURES_BY
+from vehicle_agent.service import AgentService
+
+SECONDS = 12.0
+_TEXT = """
+name = "mixed"
+seed = 3
+time_scale = 60.0
+terrain = { source = "synthetic", rows = 64, cols = 64, relief_m = 500.0, hidden = { rubble_fields = 6 } }
+cost = { max_slope_deg = 22.0 }
+[[targets]]
+count = 2
+[[groups]]
+name = "rovers"
+vehicles = 8
+[[groups]]
+name = "walkers"
+class = "walker"
+vehicles = 8
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 2.0
+cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.8, road_speed_m_per_s = 2.0, max_slope_deg = 38.0 }
+[vehicles]
+per_agent = 4
+sense_range_m = 60.0
+capture_range_m = 30.0
+"""
+
+
+@cache
+def made() -> tuple[Scenario, Terrain]:
+    scenario = parse_scenario(_TEXT)
+    return scenario, build_terrain(scenario)
+
+
+class Driven:
+    """Where vehicles were, by class."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.cells: dict[str, set[int]] = {}
+        simulation.after_tick.append(lambda node: self._look(node.service))
+
+    def _look(self, service: object) -> None:
+        if isinstance(service, AgentService):
+            cells = self.cells.setdefault(service.agent.plan.group.vehicle_class, set())
+            cells.update(vehicle.cell for vehicle in service.agent.vehicles.values())
+
+
+def captures_by_class(simulation: Simulation) -> Counter[str]:
+    targets = simulation.nodes["targets-0"].service
+    assert isinstance(targets, TargetsService)
+    classes = {plan.id: plan.group.vehicle_class for plan in plan_agents(simulation.scenario)}
+    counts: Counter[str] = Counter()
+    for vehicle, captures in targets.counters.counts_by[CAPTURES_BY].items():
+        counts[classes[agent_of(vehicle)]] += captures
+    return counts
+
+
+def grounds_of(simulation: Simulation) -> dict[str, ClassGround]:
+    return class_grounds(simulation.scenario, simulation.terrain, simulation.truth)
+
+
+def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_own() -> None:
+    scenario, terrain = made()
+    simulation = Simulation(scenario, terrain=terrain)
+    trial, driven = Trial(simulation), Driven(simulation)
+    assert trial.run(SECONDS) == []
+    report = simulation.report(SECONDS)
+    assert report["lethal_entries"] == report["collisions"] == 0
+    captures = captures_by_class(simulation)
+    assert min(captures["ground"], captures["walker"]) > 0
+    grounds = grounds_of(simulation)
+    for name, cells in driven.cells.items():
+        assert np.isfinite(grounds[name].truth.ravel()[sorted(cells)]).all()
+    closed_to_rovers = np.isinf(grounds["ground"].terrain.ground_s_per_m).ravel()
+    assert closed_to_rovers[sorted(driven.cells["walker"])].any(), "a walker goes where no rover could"
+
+
+def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None:
+    scenario, terrain = made()
+    rovers, walkers = scenario.groups
+    tracks = []
+    for name in ("ground", "same"):
+        same = ClassConfig(name="same", cost=scenario.cost)
+        own = msgspec.structs.replace(walkers, vehicle_class=name)
+        given = msgspec.structs.replace(scenario, classes=(same,), groups=(rovers, own))
+        simulation = Simulation(given, terrain=terrain)
+        places: list[tuple[str, int, float]] = []
+        simulation.after_tick.append(lambda node, places=places: places.extend(places_of(node.service)))  # type: ignore[misc]
+        simulation.run_until(6.0)
+        tracks.append(places)
+    assert tracks[0] == tracks[1]
+    assert len({cell for _, cell, _ in tracks[0]}) > 100
+
+
+def places_of(service: object) -> list[tuple[str, int, float]]:
+    if not isinstance(service, AgentService):
+        return []
+    return [(id, each.cell, each.motion.share) for id, each in service.agent.vehicles.items()]
