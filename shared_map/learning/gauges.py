@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared_map.cost_map import CostMap
+from shared_map.arrays import Bytes, Floats
 from shared_map.learning.factors import SLOPE_BINS
 from shared_map.learning.words import KEYS
 from shared_map.terrain.layers import TerrainClass
@@ -13,17 +13,21 @@ from swarm.runtime.stats import LEARNED, Counters
 
 class LearnedGauges:
     """Tells by what the prior pace of each class is multiplied: the mean over its cells, of all slopes. A class
-    whose prior stands has no gauge."""
+    whose prior stands has no gauge.
 
-    def __init__(self, cost_map: CostMap, counters: Counters) -> None:
-        self._cost_map, self._counters = cost_map, counters
-        self._told = cost_map.factors
-        keys = cost_map.keys
+    keys  the kind of ground of each cell; None if nothing is learned
+    """
+
+    def __init__(self, keys: Bytes | None, counters: Counters) -> None:
+        self._counters = counters
+        self._told: Floats | None = None
         self._cells = None if keys is None else np.bincount(keys.reshape(-1), minlength=KEYS)
 
-    def tick(self) -> None:
-        """Tell what is new."""
-        factors = self._cost_map.factors
+    def tick(self, factors: Floats) -> None:
+        """Tell what is new.
+
+        factors  float32 (KEYS,)  another array whenever they have changed
+        """
         if self._cells is None or factors is self._told:
             return
         self._told = factors

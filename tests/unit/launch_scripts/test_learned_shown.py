@@ -80,15 +80,15 @@ def test_the_picture_of_a_report_shows_factors_but_on_lethal_ground() -> None:
 
 def test_a_planner_tells_the_mean_factor_of_a_class_until_its_prior_stands_again() -> None:
     cost_map, sets = learned(flat=3.0, steep=3.0)
-    gauges, counters = LearnedGauges(CostMap(GROUND, learning=True), Counters()), Counters()
-    gauges.tick()
-    teller = CostMap(GROUND, learning=True)
-    told = LearnedGauges(teller, counters)
+    counters, teller = Counters(), CostMap(GROUND, learning=True)
+    told = LearnedGauges(teller.keys, counters)
+    told.tick(teller.factors)
+    assert counters.gauges == {}
     teller.learn(sets)
-    told.tick()
+    told.tick(teller.factors)
     assert 2.5 < counters.gauges["learned.unknown"] <= float(cost_map.factors.max()) + 1e-3
     teller.learn([])
-    told.tick()
+    told.tick(teller.factors)
     assert counters.gauges == {}
 
 
