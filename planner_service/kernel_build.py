@@ -1,10 +1,10 @@
 """Compiling kernels: what a first route needs before the rest, by several processes, into numba's cache on disk.
 
-    python -m planner_service.kernel_build [--directed]
+    python -m planner_service.kernel_build [--directed | --all]
 
-is one builder, for maps where uphill is not downhill or, without the option, for the others. Any number of them,
-started by whomever, share the work: each claims a kernel by a lock on a file beside numba's, compiles it and writes
-it there, where planners find it. A builder that dies leaves its claim.
+is one builder, for maps where uphill is not downhill or, without the option, for the others; or for both. Any
+number of them, started by whomever, share the work: each claims a kernel by a lock on a file beside numba's,
+compiles it and writes it there, where planners find it. A builder that dies leaves its claim.
 """
 
 from __future__ import annotations
@@ -241,10 +241,12 @@ class KernelLoader:
 
 
 def main() -> None:
-    """Compile all kernels for one kind of map, those of a first route before the others."""
+    """Compile all kernels for one kind of map, or for both, those of a first route before the others."""
     os.nice(5)
     directed = "--directed" in sys.argv[1:]
-    build([each for each in (*first_kernels(directed), *later_kernels(directed)) if not is_loaded(each)])
+    every = all_kernels() if "--all" in sys.argv[1:] else [*first_kernels(directed), *later_kernels(directed)]
+    if can_build():
+        build([each for each in every if not is_loaded(each)])
 
 
 if __name__ == "__main__":

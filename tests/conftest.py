@@ -1,39 +1,58 @@
-"""Order of the tests: those of the network last. `--seeds` lets tests that replay seeded histories run others;
-`--thorough` adds those of which the others show enough for each commit."""
+"""Order of the tests: those of the network last; `--network` leaves these out, or all others. `--seeds` lets tests
+that replay seeded histories run others; `--thorough` adds those of which the others show enough for each commit."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import settings
+from support.effort import few, try_all
 
-COMMIT_EXAMPLES = 40
-"""Examples of a property for each commit, where it names no number of its own; with `--thorough` there are 100."""
+EXAMPLES = 100
+"""Of a property that names no number of its own, with `--thorough`; each commit tries a share (support.effort)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--seeds", metavar="A:B", help="these histories instead of the ones that tests name")
+    parser.addoption("--network", choices=("none", "only"), help="no test of the network, or nothing else")
     parser.addoption("--thorough", action="store_true", help="also the tests marked thorough")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     # No deadline: on a busy machine a test is not to fail for taking long.
-    settings.register_profile("commit", max_examples=COMMIT_EXAMPLES, deadline=None)
-    settings.register_profile("thorough", deadline=None)
-    settings.load_profile("thorough" if config.getoption("--thorough") else "commit")
+    if config.getoption("--thorough"):
+        try_all()
+    settings.register_profile("ours", max_examples=few(EXAMPLES), deadline=None)
+    settings.load_profile("ours")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     marker = metafunc.definition.get_closest_marker("seeds")
     if marker is not None:
         named = metafunc.config.getoption("--seeds")
-        first, _, end = (named or f"0:{marker.args[0]}").partition(":")
+        first, _, end = (named or f"0:{few(marker.args[0])}").partition(":")
         if not (first.isdecimal() and end.isdecimal() and int(first) < int(end)):
             raise pytest.UsageError(f"--seeds {named}: expected two numbers A:B with A < B, as in 0:2000")
         metafunc.parametrize("seed", range(int(first), int(end)))
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Importing all files takes seconds, and most have no test of the network."""
+    if config.getoption("--network") != "only" or collection_path.suffix != ".py":
+        return None
+    return "mark.network" not in collection_path.read_text(encoding="utf-8") or None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    left = [] if config.getoption("--thorough") else [each for each in items if each.get_closest_marker("thorough")]
+    thorough, network = config.getoption("--thorough"), config.getoption("--network")
+
+    def is_left(item: pytest.Item) -> bool:
+        if item.get_closest_marker("thorough") and not thorough:
+            return True
+        return network is not None and (item.get_closest_marker("network") is None) == (network == "only")
+
+    left = [item for item in items if is_left(item)]
     if left:
         config.hook.pytest_deselected(items=left)
         items[:] = [each for each in items if each not in set(left)]

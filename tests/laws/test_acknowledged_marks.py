@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.map_strategies import GRID, held_winners, naive_winners
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
@@ -172,7 +173,7 @@ TAKES_BACK_UNHEARD_BY_KEEPERS: list[Step] = [
 @example(OVERRULED_BY_A_LIVING_AUTHOR + KEEPERS_START_AGAIN + TAKES_BACK)
 @example(OVERRULED_BY_A_LIVING_AUTHOR + KEEPERS_START_AGAIN + TAKES_BACK + DIES)
 @example(OVERRULED_BY_A_LIVING_AUTHOR + TAKES_BACK_UNHEARD_BY_KEEPERS)
-@settings(max_examples=30, suppress_health_check=list(HealthCheck))
+@settings(max_examples=few(30), suppress_health_check=list(HealthCheck))
 @given(st.lists(steps(), min_size=4, max_size=30))
 def test_what_was_acknowledged_and_not_taken_back_is_on_all_replicas_in_the_end(taken: list[Step]) -> None:
     check(taken)

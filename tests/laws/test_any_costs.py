@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
+from support.effort import few
 from support.planner_strategies import RULES, STRATEGIES
 
 from launch_scripts.bench.planning.any_costs import paces_of_any_ratio
@@ -23,7 +24,7 @@ from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 
-EXAMPLES = 60
+EXAMPLES = few(60)
 TINY, HUGE = float(np.float32(1e-45)), float(np.finfo(np.float32).max)
 PACES = st.one_of(
     st.sampled_from([TINY, 1e-38, 1e-6, 1 / 340, 1.0, 100.0, 1e7, 1e30, HUGE, float("inf")]),
@@ -96,10 +97,10 @@ def cost_by_heap(cost: np.ndarray, target: int, neighbours: int, edge: str, corn
 
 @pytest.mark.parametrize("field", ["terrain", "maze"])
 def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> None:
-    pace = make_field(field, 80)
+    pace = make_field(field, 64)
     for number, (_, paces) in enumerate(paces_of_any_ratio(pace, np.random.default_rng(1))):
         rules = RULES[number % len(RULES)]
-        ground = CostGrid(GridSpec(80, 80, 1.0), PlannerConfig(**rules))
+        ground = CostGrid(GridSpec(64, 64, 1.0), PlannerConfig(**rules))
         ground.load(paces)
         tree = CostToGoTree(ground)
         target = int(np.flatnonzero(np.isfinite(paces))[1500])

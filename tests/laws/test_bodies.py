@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from support.effort import few
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
@@ -132,7 +133,7 @@ reports = st.builds(
 pauses = st.sampled_from([TICK_NS, TICK_NS, TICK_NS, 2 * TICK_NS, 30 * TICK_NS])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 @given(st.lists(st.tuples(st.lists(reports, max_size=2), pauses), min_size=1, max_size=12))
 def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(steps) -> None:
     bodies, twin, now_ns = Bodies(GRID, MARGIN_M), Twin(), 10**18
@@ -166,7 +167,7 @@ def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(ste
             assert closed <= twin.may()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=few(100), deadline=None)
 @given(places_x, places_y, st.none() | st.floats(-12.5, 12.5), st.floats(0, 60), st.floats(0, 20))
 @example(GRID.west_m, GRID.north_m, 0.0, 10.0, 0.0)
 @example(GRID.west_m + 10.0, GRID.north_m - 10.0, math.pi / 4, 30.0, 0.0)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import (
     RULES,
@@ -63,7 +64,7 @@ def climbs(draw: st.DrawFn, shape: tuple[int, int]) -> Climb:
 
 
 @given(paces(), planner_configs(), happenings(), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
     pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job], data: st.DataObject
 ) -> None:
@@ -120,7 +121,7 @@ class Ground:
         assert self.tree.reach >= fresh.cost[np.isfinite(fresh.cost)].max()
 
 
-@pytest.mark.parametrize("seed", range(15))
+@pytest.mark.seeds(15)
 def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent(seed: int) -> None:
     ground = Ground(seed, RULES[seed % 5])
     mended = 0
@@ -135,7 +136,7 @@ def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent
     assert mended > 3
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.seeds(10)
 def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(seed: int) -> None:
     ground = Ground(seed, RULES[seed % 5])
     windows = [ground.change(factor, 6) for factor in (0.5, 0.25, 0.9)]
@@ -148,7 +149,7 @@ def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(seed: int) ->
     np.testing.assert_array_equal(ground.tree.inner(heuristic), ground.tree.inner(ground.tree.cost))
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.seeds(30)
 def test_growth_equals_scipys(seed: int) -> None:
     ground = Ground(seed, RULES[seed % 5], 23, 31)
     tree = ground.tree
@@ -158,7 +159,7 @@ def test_growth_equals_scipys(seed: int) -> None:
     assert np.isinf(best[np.isfinite(ground.pace)]).any() or seed % 3 < 2
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
     ground = Ground(seed, RULES[seed])
     tree, costs = ground.tree, ground.costs
@@ -177,7 +178,7 @@ def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
     np.testing.assert_allclose(tree.cost[starts], driven, rtol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
     ground = Ground(seed, RULES[seed], 64, 64)
     tree, costs = ground.tree, ground.costs
@@ -231,7 +232,7 @@ class Extremes(Play):
         return window
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.seeds(10)
 def test_marks_as_dear_and_as_cheap_as_can_be_come_and_go_and_the_laws_hold(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows, cols = 13 + seed, 22 - seed

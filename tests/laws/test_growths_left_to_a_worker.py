@@ -8,6 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, happenings, paces, planner_configs, random_pace
 from support.planner_swarm import GRID, Swarm, flat
@@ -25,7 +26,7 @@ LARGE = mock.patch.object(growth_times, "INLINE_NS", 100)
 
 
 @given(paces(), planner_configs(), happenings())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=few(200), deadline=None)
 def test_whatever_happens_answers_keep_the_laws_and_a_worker_catches_up(
     pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job]
 ) -> None:

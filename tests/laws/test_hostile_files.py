@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.effort import few
 
 from shared_map.keeper.export import from_json
 from shared_map.terrain.importers.grids.array_files import read_npy
@@ -151,9 +152,9 @@ def test_a_terrain_that_explodes_is_refused_in_a_sentence(tmp_path: Path, make: 
     assert peak_mb < MOST_MB
 
 
-def test_members_that_nobody_asked_for_are_not_unpacked(tmp_path: Path) -> None:
+def test_a_member_that_nobody_asked_for_is_not_unpacked(tmp_path: Path) -> None:
     small = npy((8, 8), body=bytes(256))
-    path = archive(tmp_path / "a.npz", elevation=small, x=700, y=700)
+    path = archive(tmp_path / "a.npz", elevation=small, x=700)
     code, said, peak_mb = run("terrain", "info", path, "--resolution-m", 10)
     assert code == 0, said
     assert peak_mb < MOST_MB
@@ -254,7 +255,7 @@ def _read(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SEEDS)
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=few(150), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_flipped_cut_and_mixed_files_are_read_or_refused_in_one_line(
     tmp_path: Path, name: str, data: st.DataObject
@@ -281,7 +282,7 @@ def test_flipped_cut_and_mixed_files_are_read_or_refused_in_one_line(
     assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10) - before_mb < MOST_MB
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=few(300), deadline=None)
 @given(
     st.lists(
         st.sampled_from(['"', "'", '"""', "'''", "\\", "[", "]", "{", "}", ".", "a", "=", "#", "\n", " ", ","])

@@ -92,7 +92,7 @@ def lied_to(simulation: Simulation, seconds: float, chance: random.Random) -> in
     return len(lies)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(3)
 def test_vehicles_go_on_once_the_lies_end(seed: int) -> None:
     simulation = Simulation(seeded(seed))
     simulation.run_until(5)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
@@ -169,7 +170,7 @@ MANY = st.lists(
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(WAYS_TO_PRICE), MANY)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=few(40), deadline=None)
 def test_under_exact_every_update_leaves_the_tree_that_would_have_grown(
     seed: int, priced: dict[str, Any], events: list[Move | Marks | Job]
 ) -> None:

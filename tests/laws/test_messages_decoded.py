@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
@@ -45,7 +46,7 @@ def test_every_message_of_every_topic_has_an_example_and_a_strategy():
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
 def test_a_message_comes_out_as_it_went_in_and_msgpack_would_write_the_same_bytes(kind):
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=few(60), deadline=None)
     @given(MESSAGES[kind])
     def round_trip(message):
         payload = encode(message)
@@ -124,7 +125,7 @@ def test_a_hundred_thousand_mutations_raise_nothing_but_protocol_errors():
     assert 0 < accepted < 50_000
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=few(300), deadline=None)
 @given(st.binary(max_size=200), st.sampled_from(TYPES))
 def test_random_bytes_are_no_message(payload, kind):
     assert not _attempt(payload, kind)
@@ -137,7 +138,7 @@ values = st.recursive(
 )
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=few(500), deadline=None)
 @given(st.data(), st.sampled_from(TYPES))
 def test_any_value_in_any_field_parses_or_is_refused(data, kind):
     fields = msgpack.unpackb(encode(BY_TYPE[kind]), strict_map_key=False)

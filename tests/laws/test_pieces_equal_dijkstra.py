@@ -10,6 +10,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from support import slow_twins as naive
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import RULES, random_pace
 
@@ -126,7 +127,7 @@ def chases(seeds: range, most: int, happenings: int) -> int:
 
 
 def test_random_chases() -> None:
-    assert chases(range(10), 140, 6) < 20
+    assert chases(range(few(10)), 140, 6) < 20
 
 
 @pytest.mark.thorough

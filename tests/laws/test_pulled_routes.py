@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.effort import few
 
 from planner_service.route_finder import RouteFinder
 
@@ -53,7 +54,7 @@ def twin_cost_s(pace: NDArray[np.float32], start: Cell, end: Cell, corner_cuttin
     return float(exact) * math.dist(start, end)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=few(120), deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(2, 24),

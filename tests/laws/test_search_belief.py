@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.effort import few
 
 from planner_service.search.belief import Belief
 from planner_service.search.blocks import blocks_of
@@ -35,7 +36,7 @@ def _pace(rows: int, cols: int, seed: int) -> NDArray[np.float32]:
     return pace
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=few(80), deadline=None)
 @given(_SIDES, _SIDES, _SEEDS, st.floats(1, 8) | st.just(math.inf), st.lists(st.tuples(st.floats(0, 400), _PLACES)))
 def test_a_belief_sums_to_one_and_lies_where_the_target_can_be(
     rows: int, cols: int, seed: int, slowness: float, story: list[tuple[float, list[tuple[float, float]]]]
@@ -55,7 +56,7 @@ def test_a_belief_sums_to_one_and_lies_where_the_target_can_be(
         assert not belief.total[~blocks.open].any()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=few(40), deadline=None)
 @given(_SIDES, _SIDES, _SEEDS)
 def test_what_moves_is_neither_lost_nor_made(rows: int, cols: int, seed: int) -> None:
     blocks = blocks_of(GridSpec(rows, cols, METRES), _pace(rows, cols, seed), 20.0)
@@ -66,7 +67,7 @@ def test_what_moves_is_neither_lost_nor_made(rows: int, cols: int, seed: int) ->
     assert not belief.total[~blocks.open].any()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=few(40), deadline=None)
 @given(st.integers(2, 26), st.integers(2, 26), _SEEDS, st.booleans(), _PLACES)
 def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones_again(
     rows: int, cols: int, seed: int, known: bool, places: list[tuple[float, float]]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import (
     RULES,
@@ -26,7 +27,7 @@ from swarm.grid import GridSpec, Window
 
 
 @given(paces(), planner_configs(), happenings())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=few(300), deadline=None)
 def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
     pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job]
 ) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import STRATEGIES, Job, Marks, Move, happenings, paces, planner_configs, random_pace
 
@@ -45,7 +46,7 @@ def guarded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @given(paces(), planner_configs(), happenings(), st.integers(0, 10))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=few(150), deadline=None)
 def test_whatever_happens_before_and_after_the_last_kernel_is_there_keeps_the_laws(
     pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job], opens: int
 ) -> None:

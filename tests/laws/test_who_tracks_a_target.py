@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -55,7 +56,7 @@ def owner_of(tracking: Tracking, now_ns: int) -> tuple[str | None, int] | None:
 offsets = st.one_of(st.sampled_from([0, HOUR_NS, -HOUR_NS]), st.integers(-HOUR_NS, HOUR_NS))
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=few(150))
 @given(st.data())
 def test_receivers_agree_on_the_oldest_tracker_that_lives_whatever_each_has_heard_before(
     data: st.DataObject,

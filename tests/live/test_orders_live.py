@@ -20,6 +20,8 @@ from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import column
 from swarm.wire.topics import FLEET
 
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:

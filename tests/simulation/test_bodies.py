@@ -35,7 +35,7 @@ def driven(kind: str, seed: int, seconds: float, faults: bool) -> tuple[BodyLaw,
     return law, dict(service.counters.counts)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_no_vehicle_drives_into_a_rover_that_looks_out_for_nobody(seed) -> None:
     law, counts = driven(CROWDS[seed], seed, 8.0, faults=False)
     assert law.broken == law.met == []
@@ -44,7 +44,7 @@ def test_no_vehicle_drives_into_a_rover_that_looks_out_for_nobody(seed) -> None:
     assert counts["captures"] > 0
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_no_vehicle_drives_into_a_rover_that_was_reported_in_time_though_messages_are_lost(seed) -> None:
     law, _ = driven("open", seed, 8.0, faults=True)
     assert law.broken == []

@@ -28,7 +28,7 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
     assert simulation.report(SECONDS)["captures"] > 5
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(3)
 def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
     """As the dense runs did in which two vehicles met."""
     scenario, terrain = crowd("open", seed, vehicles=24, per_agent=3, side=16)
@@ -39,7 +39,7 @@ def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
     assert laws.collisions == laws.lethal == []
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_of_two_lives_of_one_agent_the_older_stops_until_the_younger_is_gone_and_nobody_is_met(seed):
     """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""
     plan = FaultPlan(partitions=(Partition(5, 9, ("agent-a1",)),), twins=(Twin(8, "agent-a1"),))

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.wire_strategies import EXAMPLES, MESSAGES
 
 from launch_scripts.simulation.laws import Laws
@@ -64,7 +65,7 @@ def test_any_valid_message_on_its_key_raises_nowhere(topic):
     chance = random.Random(2)
 
     @settings(
-        max_examples=60, deadline=None, derandomize=True, phases=[Phase.generate],
+        max_examples=few(60), deadline=None, derandomize=True, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(MESSAGES[topic.message], st.booleans())
@@ -89,7 +90,7 @@ def test_any_valid_question_is_answered_or_refused(topic):
     assert topic.request is not None
 
     @settings(
-        max_examples=60, deadline=None, derandomize=True, phases=[Phase.generate],
+        max_examples=few(60), deadline=None, derandomize=True, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(MESSAGES[topic.request], st.booleans())

@@ -153,7 +153,7 @@ def _open(terrain: Terrain) -> int:
     return int(passable[len(passable) // 2])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_every_process_that_starts_after_an_acknowledged_pause_obeys_it(seed: int, terrain: Terrain) -> None:
     chance = random.Random(seed)
     # Where a target is, only its planner knows when the process that moves it dies: not both are killed at once.
@@ -214,7 +214,7 @@ def random_orders(seed: int, terrain: Terrain, until_s: float) -> list[tuple[flo
     return orders + [(until_s, order) for order in ends]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(3)
 def test_no_law_breaks_whatever_is_ordered_and_whatever_goes_wrong(seed: int, terrain: Terrain) -> None:
     plan = random_plan(seed, nodes_of(SMALL), 30.0)
     simulation = simulated(terrain, plan, seed)

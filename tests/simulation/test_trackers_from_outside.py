@@ -197,7 +197,7 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
     assert laws.collisions == laws.lethal == []
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(3)
 @pytest.mark.parametrize("clock_off_s", [0.0, -HOUR_S])
 def test_a_second_tracker_is_refused_by_everybody_until_the_first_is_dead(seed: int, clock_off_s: float) -> None:
     simulation = Simulation(seeded(seed, EXTERNAL), faults=LOSSY)

@@ -23,18 +23,21 @@ StopWhen = Callable[[], None] | None
 
 def quiet(setup: RoleSetup, stop_when: StopWhen) -> None:
     """Runs until SIGTERM, and writes down when it began and ended."""
-    assert setup.run_dir is not None
     ended: list[int] = []  # an Event would deadlock if the signal came in the middle of its wait
     signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
     if stop_when is not None:
         end_with(stop_when, lambda: ended.append(0))
-    with (setup.run_dir / "order.txt").open("a") as order:
-        order.write(f"+{setup.role}-{setup.id}\n")
+    _write(setup, "+")
     sys.stdout.write(f"hello from {setup.id}\n")
     while not ended:
         time.sleep(0.05)
+    _write(setup, "-")
+
+
+def _write(setup: RoleSetup, sign: str) -> None:
+    assert setup.run_dir is not None
     with (setup.run_dir / "order.txt").open("a") as order:
-        order.write(f"-{setup.role}-{setup.id}\n")
+        order.write(f"{sign}{setup.role}-{setup.id}\n")
 
 
 def crash_twice(setup: RoleSetup, stop_when: StopWhen) -> None:
@@ -78,8 +81,9 @@ def refuse(setup: RoleSetup, stop_when: StopWhen) -> None:
 
 
 def stubborn(setup: RoleSetup, stop_when: StopWhen) -> None:
-    """Neither SIGTERM nor the end of the launcher moves it."""
+    """Neither SIGTERM nor the end of the launcher moves it, from when it has written down that it began."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    _write(setup, "+")
     time.sleep(1000)
 
 

@@ -24,7 +24,11 @@ from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetCo
 from swarm.errors import ConfigError
 from swarm.runtime.role import RoleSetup
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+# Of the network, as those: its tests wait for processes.
+pytestmark = [
+    pytest.mark.network,
+    pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -227,8 +231,8 @@ def test_who_does_not_end_when_asked_is_killed_and_named(
     monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 0.5)
     swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
     swarm.start()
-    wait_for_line(tmp_path / "order.txt", "+router-0")
-    time.sleep(0.3)
+    for line in ("+agent-a0", "+router-0"):
+        wait_for_line(tmp_path / "order.txt", line)
     assert "agent-a0 did not end within 0.5 s and was killed" in swarm.stop(lambda: time.sleep(0.02))
 
 
@@ -239,9 +243,8 @@ def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed
     rows = [("agent", "a0", "stubborn"), ("keeper", "0", "quiet"), ("router", "0", "quiet")]
     swarm = swarm_of(swarms, tmp_path, *rows)
     swarm.start()
-    for line in ("+keeper-0", "+router-0"):
+    for line in ("+agent-a0", "+keeper-0", "+router-0"):
         wait_for_line(tmp_path / "order.txt", line)
-    time.sleep(0.3)
     began_s = time.monotonic()
     failures = swarm.stop(lambda: time.sleep(0.02), force=lambda: time.monotonic() > began_s + 0.1)
     assert failures == []

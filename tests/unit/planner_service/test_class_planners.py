@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.planner_swarm import TICK, Ear
 from support.swarm_model import SwarmModel
 
@@ -77,7 +78,7 @@ _STATEMENTS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 @given(first=_STATEMENTS, second=_STATEMENTS)
 def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(
     first: list[Any], second: list[Any]

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
+from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
@@ -105,7 +106,7 @@ def test_networks_are_found_anew_once_cells_have_changed_all_over_the_map() -> N
 
 
 @given(st.integers(0, 2**31), st.integers(1, 60))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_wide(seed: int, steps: int) -> None:
     grid = GridSpec(256, 256, 1.0)
     schedule = WindowSchedule(grid, 8)

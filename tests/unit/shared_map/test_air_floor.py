@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.effort import few
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -72,7 +73,7 @@ def test_a_lifted_floor_is_that_of_its_slow_twin_and_no_step_is_steeper(
 
 
 @given(ground(), st.integers(0, 2**32), st.sampled_from([5.0, 60.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 def test_along_every_route_of_an_air_class_the_clearance_is_kept_between_centres_too(
     heights: NDArray[np.float32], seed: int, clearance_m: float
 ) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.map_strategies import (
     AUTHORS,
     GRID,
@@ -189,7 +190,7 @@ class Disk:
         return []
 
 
-@settings(max_examples=60)
+@settings(max_examples=few(60))
 @given(st.lists(mark_sets(), min_size=2, max_size=14), st.integers(0, 10_000))
 def test_two_keepers_that_compact_with_different_knowledge_lose_no_winner(sets: list[MarkSet], seed: int) -> None:
     """Each set reaches both keepers in the end, in any order, between compactions of whom each takes for dead."""

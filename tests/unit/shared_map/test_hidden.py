@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from support.effort import few
 
 from shared_map.terrain import hidden
 from shared_map.terrain.layers import TerrainClass
@@ -85,7 +86,7 @@ def test_a_hidden_zone_is_painted_on_the_truth_only(terrain: Terrain) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.35, 0.45, 0.6]), st.sampled_from([0.3, 0.7, 0.95]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=few(150), deadline=None)
 def test_closing_a_block_is_decided_as_if_all_parts_were_found_again(seed: int, walls: float, share: float) -> None:
     rng = np.random.default_rng(seed)
     rows, cols = int(rng.integers(3, 50)), int(rng.integers(3, 50))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 
 from shared_map.terrain.importers.sources import load_source
 from shared_map.terrain.layers import (
@@ -141,7 +142,7 @@ def test_uphill_is_not_downhill(rule: str) -> None:
 
 
 @given(grade=st.floats(0, 100, width=32), factor=st.floats(0.125, 1e6, width=32), rule=st.sampled_from(RULES))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=few(200), deadline=None)
 def test_costly_is_not_lethal(grade: float, factor: float, rule: str) -> None:
     cost = ruled(rule, max_slope_deg=90, class_factor={"rock": factor})
     pace = terrain_pace(np.array([[grade]], np.float32), np.array([[TerrainClass.ROCK]], np.uint8), cost)

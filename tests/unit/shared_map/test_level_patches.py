@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from support.effort import few
 
 from shared_map.terrain.importers.water import level_patches as module
 from shared_map.terrain.importers.water.level_patches import level_patches
@@ -40,7 +41,7 @@ def searched(heights: np.ndarray, least_cells: int) -> np.ndarray:
     return labels
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=few(40), deadline=None, derandomize=True)
 @given(st.integers(0, 10_000), st.integers(1, 40), st.integers(1, 40), st.floats(2, 15))
 def test_patches_are_those_of_a_search_height_by_height(seed: int, rows: int, cols: int, steps: float) -> None:
     heights = stairs(seed, rows, cols, steps)

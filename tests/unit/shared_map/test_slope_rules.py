@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 
 from shared_map.terrain.layers import along_slope_of_padded, terrain_pace
 from shared_map.terrain.slope_rules import (
@@ -159,7 +160,7 @@ def test_no_factor_leaves_the_bounds_that_are_told_of_its_rule(rule: str, cross_
     grade=st.floats(0, 1e4, width=32),
     factor=st.sampled_from([1e-9, 1.0, 1e9]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 def test_no_pace_leaves_the_bounds_of_marks(rule: str, flat: float, grade: float, factor: float) -> None:
     cost = ruled(rule, max_slope_deg=90, flat_speed_m_per_s=flat, class_factor={"rock": factor})
     pace = terrain_pace(np.array([[grade, np.nan]], np.float32), np.array([[3, 3]], np.uint8), cost)

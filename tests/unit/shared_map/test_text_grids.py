@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
+from support.effort import few
 from support.height_models import load, written
 
 from shared_map.terrain.importers.grids.text_grids import read_text_grid
@@ -66,7 +67,7 @@ def test_every_layout_gives_the_same_heights(tmp_path: Path, name: str, text: st
     assert (plain.west, plain.north, plain.step, plain.degrees) == (WEST, NORTH, (STEP, STEP), False)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=few(40), deadline=None)
 @given(order=st.randoms(use_true_random=False), missing=st.sets(st.integers(0, len(POINTS) - 1), max_size=60))
 def test_points_in_any_order_and_with_any_gaps_lie_where_they_say(
     tmp_path_factory: pytest.TempPathFactory, order: Any, missing: set[int]

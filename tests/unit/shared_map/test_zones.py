@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 from support.map_strategies import held_winners, set_of
 from support.swarm_model import SwarmModel
 
@@ -267,7 +268,7 @@ def _meet(p: Any, q: Any, r: Any, s: Any) -> bool:
     return 0 <= t <= 1 and 0 <= u <= 1
 
 
-@settings(max_examples=200)
+@settings(max_examples=few(200))
 @given(corners)
 def test_edges_that_meet_are_found_as_fractions_find_them(polygon: list[tuple[int, int]]) -> None:
     number = len(polygon)

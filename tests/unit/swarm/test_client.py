@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.client_rig import Program, run_info
+from support.effort import few
 from support.map_strategies import GRID as MAP_GRID
 from support.map_strategies import Composite
 from support.planner_swarm import GRID, Swarm, driven_s, rough
@@ -360,7 +361,7 @@ stated = st.tuples(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=few(200), deadline=None)
 @given(st.lists(stated, max_size=12), st.integers(0, 50))
 def test_what_an_observer_shows_as_marked_is_what_a_replica_holds(words: Any, now_ns: int) -> None:
     authors = {name: OwnMarks(name, "all", MAP_GRID) for name in ("all.a.1", "all.b.2", "all.c.3")}
@@ -544,7 +545,7 @@ def test_a_callback_that_fails_ends_nothing_and_one_that_would_wait_for_ever_is_
 # --- values -------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=few(200), deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 10.0, 90.0]), st.data())
 def test_the_middle_of_every_cell_is_in_that_cell(rows: int, cols: int, resolution_m: float, data: Any) -> None:
     frame = Frame(GridSpec(rows, cols, resolution_m, 432_100.5, 5_400_000.25, "EPSG:32632"))
@@ -557,7 +558,7 @@ def test_the_middle_of_every_cell_is_in_that_cell(rows: int, cols: int, resoluti
     assert frame.cells_within(x_m, y_m, radius_m) == near
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=few(100), deadline=None)
 @given(st.lists(st.tuples(st.floats(-30, 230), st.floats(-230, 30)), min_size=3, max_size=7))
 def test_the_cells_of_a_polygon_are_those_whose_middle_a_ray_leaves_an_odd_number_of_times(corners: Any) -> None:
     frame = Frame(GridSpec(20, 20, 10.0))

@@ -11,6 +11,7 @@ import rasterio
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
+from support.effort import few
 
 from shared_map.terrain.places import MapFrame, latitudes_of
 from shared_map.terrain.terrain import build_terrain
@@ -38,7 +39,7 @@ PLACED = {
 SITE = MapFrame(GridSpec(60, 80, 20.0))
 
 
-@settings(max_examples=150)
+@settings(max_examples=few(150))
 @given(st.sampled_from(sorted(PLACED)), st.floats(0, 1, exclude_max=True))
 @example("around a pole", 0.49)
 def test_every_way_to_write_a_cell_leads_back_to_it(name: str, where: float) -> None:

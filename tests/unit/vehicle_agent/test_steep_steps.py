@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.effort import few
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb, climb_of
@@ -38,7 +39,7 @@ def steering_on(climb: Climb, pace: np.ndarray = LEVEL) -> Steering:
 
 
 @given(st.integers(0, 1 << 32), st.floats(0.0, 0.3))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=few(30), deadline=None)
 def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(seed: int, share: float) -> None:
     chance = random.Random(seed)
     heights = np.array([chance.gauss(0, 2) for _ in range(GRID.cells)]).reshape(8, 8)
@@ -103,7 +104,7 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
 
 
 @given(st.integers(0, 1 << 32), st.sampled_from([0.5, 1.5, 3.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, relief_m: float) -> None:
     """Up a steep slope a route winds beside cells of its own that are too steep, or too dear, to go to at once."""
     rng = np.random.default_rng(seed)
@@ -132,7 +133,7 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
 
 
 @given(st.integers(0, 1 << 32), st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=few(60), deadline=None)
 def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int, near: bool) -> None:
     rng = np.random.default_rng(seed)
     climb = climb_on(rng.normal(0, 2.0, (8, 8)))
