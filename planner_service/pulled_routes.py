@@ -64,8 +64,7 @@ class Puller:
         legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
         prices = np.empty((3, many))
         self._kernel(
-            self._metres = resolution_m
-        self._pace, self._cols, self._corners, (starts, directions, ends), scratch, (*out, legs, turned), prices
+            self._pace, self._cols, self._corners, (starts, directions, ends), scratch, (*out, legs, turned), prices
         )
         done = int(out[1][-1]) if many else 0
         return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres

@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from swarm.lazy_numpy import np, numpy_loaded
-from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Legs, Length, check_column, column, pack_column
+from swarm.wire.fields import (
+    Bounded,
+    Cell,
+    Column,
+    Cost,
+    Directions,
+    Legs,
+    Length,
+    check_column,
+    column,
+    pack_column,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -120,7 +131,7 @@ class RouteBatch:
             np.frombuffer(b"".join(route.directions for route in routes), np.uint8),
             ends,
             *(np.array([getattr(route, name) for route in routes], np.float64) for name in _NUMBERS),
-            np.frombuffer(b"".join(_own_legs(routes)), "<u4"),
+            legs=np.frombuffer(b"".join(_own_legs(routes)), "<u4"),
         )
 
     def __len__(self) -> int:
@@ -231,7 +242,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
             unpack_directions(self.directions, many),
             ends,
             *(column(getattr(self, name), "<f8") for name in _NUMBERS),
-            column(self.legs, "<u4"),
+            legs=column(self.legs, "<u4"),
         )
 
     @cached_property

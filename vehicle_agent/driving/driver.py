@@ -16,8 +16,12 @@ class Driver:
 
     passable  whether the step between two neighbours is allowed now
     dynamics  how fast vehicles drive; as the ground allows if not given
+<<<<<<< HEAD
     pulled    whether routes are pulled: a step takes what each of both cells takes, as their segments are priced,
               and not what the cell that it enters does
+=======
+    measures  whether to note how fast they drove
+>>>>>>> main
 
     driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs taken out:
               what vehicles measure; the owner empties it
@@ -30,12 +34,18 @@ class Driver:
         holdings: Holdings,
         passable: Callable[[int, int], bool],
         dynamics: PluginDynamics | None,
+<<<<<<< HEAD
         pulled: bool = False,
+=======
+        *,
+        measures: bool = False,
+>>>>>>> main
     ) -> None:
         self.entered: dict[int, None] = {}
         self.driven: list[tuple[int, float]] = []
         self._steps: dict[str, tuple[int, float]] = {}
         """Vehicle -> (head of its step, seconds that it has driven of it), of steps that are measured."""
+        self._measures = measures
         self._climb = local_map.climb
         self._physics = local_map.physics.reshape(-1)
         self._holdings = holdings
@@ -80,7 +90,8 @@ class Driver:
                     return 0.0
                 motion.set_out(path[1], vehicle.route.point(path[1], self._cols) if self._pulled else None)
                 # A vehicle with dynamics of its own has its full pace between two cells before and behind.
-                if self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling):
+                freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
+                if self._measures and freely:
                     self._steps[vehicle.id] = (path[1], 0.0)
             before = motion.cell
             pace_s_per_m = self._physics.item(before if self._pulled else motion.head)
@@ -94,8 +105,14 @@ class Driver:
             else:
                 path = self._holdings.path(vehicle.id)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
+<<<<<<< HEAD
             measured_s = had_s - left_s if before == head or not self._pulled else 0.0
             self._measure(vehicle, head, measured_s, length_m * climbing)
+=======
+                if self._dynamics.slowed:  # by itself, not by the ground
+                    self._steps.pop(vehicle.id, None)
+            self._measure(vehicle, head, had_s - left_s, length_m * climbing)
+>>>>>>> main
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)

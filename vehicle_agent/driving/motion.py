@@ -11,8 +11,8 @@ Point = tuple[float, float]
 
 
 class Motion:
-    """A step from a point of cell `tail` to a point of cell `head`, which are their middles but on a pulled route; at
-    rest both are the same cell.
+    """A step from a point of cell `tail` to a point of cell `head`: their middles, but on a pulled route. At rest
+    both are the same cell.
 
     The vehicle is a point. It occupies `tail` up to their border, or the corner that they share, and `head` from
     there on.
@@ -125,8 +125,8 @@ class Motion:
 
 
 def _via(begin: Point, end: Point, shared: Point, rows: int, cols: int) -> Point:
-    """Where a step passes from its cell into the next: on the edge that they share, of which `shared` is the middle,
-    or at their corner, which it is then."""
+    """Where a step passes from its cell into the next: on the edge that they share, of which `shared` is the
+    middle, or at their corner, which it is then."""
     if rows and cols:
         return shared
     if rows:

@@ -36,4 +36,3 @@ class Places:
         row, col = np.divmod(self.cells, grid.cols)
         self.heading_rad: NDArray[np.float64] = np.array([motion.heading_rad for motion in motions], np.float64)
         self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS
-

@@ -81,8 +81,8 @@ class Follower:
         return self._cells[first : first + max(count, 0)]
 
     def point(self, cell: int, cols: int) -> tuple[float, float] | None:
-        """Where a pulled route leads through one of its next cells, as row and col: the middle of its segment's part
-        in it. None where it is the middle of the cell.
+        """Where a pulled route leads through one of its next cells, as row and col: the middle of its segment's
+        part in it. None where it is the middle of the cell.
 
         A cell that the segment does not cross, whatever a planner says, is driven through its middle.
         """
@@ -92,7 +92,10 @@ class Follower:
         leg = bisect_left(self._turns, index)
         if leg == len(self._turns) or self._turns[leg] == index:
             return None
-        (row, col), start, end = divmod(cell, cols), *(divmod(each, cols) for each in self._turn_cells[leg - 1 : leg + 1])
+        (row, col), start, end = (
+            divmod(cell, cols),
+            *(divmod(each, cols) for each in self._turn_cells[leg - 1 : leg + 1]),
+        )
         first, last = 0.0, 1.0
         for at, begin, until in zip((row, col), start, end, strict=True):
             if begin != until:
@@ -106,7 +109,7 @@ class Follower:
         return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
 
     def legs_ahead(self) -> list[int]:
-        """Of a pulled route over how many steps each of its segments goes, from the cell that was passed last on."""
+        """Of a pulled route over how many steps each of its segments goes, from the cell passed last on."""
         last = len(self._cells) - 1
         ends = [turn for turn in self._turns if self._at < turn < last] + [last] * (last > self._at)
         return [end - begin for begin, end in pairwise((self._at, *ends))] if self._turns else []
