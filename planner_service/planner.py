@@ -455,12 +455,8 @@ class Planner:
                 break
             if not searcher.wants_place(id) or now_ns < follower.push_ns:
                 continue
-<<<<<<< HEAD
-            found = searcher.route(id, follower.cell, follower.max_cells, self.tree.map_version)
+            found = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)
             route = self._pulled(found)[0]
-=======
-            route = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)[0]
->>>>>>> main
             follower.push_ns = now_ns + self._push_ns
             if is_place(route):
                 self.followers.sent(follower, route, now_ns + self._push_ns)

@@ -109,14 +109,15 @@ class Agent:
             self._in_reach,
             f"{scenario.seed}/{plan.id}",
         )
-<<<<<<< HEAD
-        pulled = self._pulled = scenario.planner.routes == "pulled"
-        self._driver = Driver(local_map, holdings, self._steering.passable, dynamics, pulled)
-=======
+        self._pulled = scenario.planner.routes == "pulled"
         self._driver = Driver(
-            local_map, holdings, self._steering.passable, dynamics, measures=scenario.map.learning
+            local_map,
+            holdings,
+            self._steering.passable,
+            dynamics,
+            pulled=self._pulled,
+            measures=scenario.map.learning,
         )
->>>>>>> main
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}

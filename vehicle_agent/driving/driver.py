@@ -16,12 +16,9 @@ class Driver:
 
     passable  whether the step between two neighbours is allowed now
     dynamics  how fast vehicles drive; as the ground allows if not given
-<<<<<<< HEAD
     pulled    whether routes are pulled: a step takes what each of both cells takes, as their segments are priced,
               and not what the cell that it enters does
-=======
     measures  whether to note how fast they drove
->>>>>>> main
 
     driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs taken out:
               what vehicles measure; the owner empties it
@@ -34,12 +31,9 @@ class Driver:
         holdings: Holdings,
         passable: Callable[[int, int], bool],
         dynamics: PluginDynamics | None,
-<<<<<<< HEAD
-        pulled: bool = False,
-=======
         *,
+        pulled: bool = False,
         measures: bool = False,
->>>>>>> main
     ) -> None:
         self.entered: dict[int, None] = {}
         self.driven: list[tuple[int, float]] = []
@@ -105,14 +99,10 @@ class Driver:
             else:
                 path = self._holdings.path(vehicle.id)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
-<<<<<<< HEAD
-            measured_s = had_s - left_s if before == head or not self._pulled else 0.0
-            self._measure(vehicle, head, measured_s, length_m * climbing)
-=======
                 if self._dynamics.slowed:  # by itself, not by the ground
                     self._steps.pop(vehicle.id, None)
-            self._measure(vehicle, head, had_s - left_s, length_m * climbing)
->>>>>>> main
+            measured_s = had_s - left_s if before == head or not self._pulled else 0.0
+            self._measure(vehicle, head, measured_s, length_m * climbing)
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)
