@@ -130,7 +130,7 @@ class RouteBatch:
             np.array([route.start for route in routes], np.int64),
             np.frombuffer(b"".join(route.directions for route in routes), np.uint8),
             ends,
-            *(np.array([getattr(route, name) for route in routes], np.float64) for name in _NUMBERS),
+            **{name: np.array([getattr(route, name) for route in routes], np.float64) for name in _NUMBERS},
             legs=np.frombuffer(b"".join(_own_legs(routes)), "<u4"),
         )
 
@@ -241,7 +241,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
             column(self.starts, "<i8"),
             unpack_directions(self.directions, many),
             ends,
-            *(column(getattr(self, name), "<f8") for name in _NUMBERS),
+            **{name: column(getattr(self, name), "<f8") for name in _NUMBERS},
             legs=column(self.legs, "<u4"),
         )
 
