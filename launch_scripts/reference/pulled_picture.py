@@ -60,14 +60,15 @@ def _draw_routes(axes: Axes, pace: Floats) -> float:
         pulled = finder.pull(route)
         saved.append(1 - pulled.cost_s / pulled.grid_cost_s)
         first = len(saved) == 1
-        over = {"label": "over neighbours"} if first else {}
-        straight = {"label": "pulled"} if first else {}
-        axes.plot(*route.cells.T[::-1], color=ORANGE, linewidth=1.6, **over)
-        axes.plot(*pulled.turns.T[::-1], color=BLUE, linewidth=1.6, marker="o", markersize=3, **straight)
+        axes.plot(*route.cells.T[::-1], color=ORANGE, linewidth=1.6, label="over neighbours" if first else None)
+        axes.plot(
+            *pulled.turns.T[::-1], color=BLUE, linewidth=1.6, marker="o", markersize=3,
+            label="pulled" if first else None,
+        )  # fmt: skip
     axes.plot(
-        *_TARGET[::-1], marker="o", color=RED, markersize=9, markeredgecolor=INK, linestyle="", label="target"
-    )
-    axes.legend(loc="lower right", framealpha=0.9, frameon=True)
+        *_TARGET[::-1], color=RED, markeredgecolor=INK, markersize=9, marker="o", linestyle="", label="target"
+    )  # fmt: skip
+    axes.legend(loc="upper right", framealpha=0.9, frameon=True)
     return float(np.mean(saved))
 
 
