@@ -40,6 +40,7 @@ class Puller:
 
     def __init__(self, pace: Floats, resolution_m: float, config: PlannerConfig) -> None:
         # Compiled only for those who pull: nobody else waits for it at a first start.
+        from planner_service.kernels.compile import load
         from planner_service.kernels.pull import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 
         self._metres = resolution_m
@@ -48,6 +49,7 @@ class Puller:
         if config.neighbours == 4:
             self._corners = NO_CORNERS
         self._kernel = pull_routes
+        load(pull_routes)
 
     def pull(
         self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
