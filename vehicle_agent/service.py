@@ -268,9 +268,8 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._maps.take_dirty(), now_ns)
-        driven = agent.take_driven()
         learning = self._maps.learning
-        if learning is not None and (said := learning.tick(driven, now_ns)):
+        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
             self._sync.publish(self._replica.write_learned(said, now_ns))
         columns = Places(self._replica.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)
