@@ -92,6 +92,8 @@ class Driver:
             else:
                 path = self._holdings.path(vehicle.id)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
+                if self._dynamics.slowed:  # by itself, not by the ground
+                    self._steps.pop(vehicle.id, None)
             self._measure(vehicle, head, had_s - left_s, length_m * climbing)
             cell = motion.cell
             if cell != before:
