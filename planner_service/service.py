@@ -179,10 +179,7 @@ class PlannerService:
             return
         match event:
             case Heard(message=Sighted() as sighted):
-                if self._sightings.hear(sighted, now_ns):
-                    for seen in self._sightings.best(now_ns).values():
-                        for _, planner in self._planners:
-                            planner.set_pose(pose_of(seen), now_ns)
+                self._hear_sighted(sighted, now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
@@ -239,6 +236,17 @@ class PlannerService:
             self._finding_strides, search = next(iter(self._stride_searches.items()))
             model_ns = self._planner.tree.times.model_ns
             self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
+
+    def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
+        if not self._sightings.hear(sighted, now_ns):
+            return
+        seen = self._sightings.best(now_ns)
+        for each in seen.values():
+            for _, planner in self._planners:
+                planner.set_pose(pose_of(each), now_ns)
+        search = self._planner.target_search
+        if not seen and search is not None and 0 <= sighted.cell < self._cost_map.grid.cells:
+            search.remember(sighted, now_ns)
 
     def _tag(self, work: str, name: str) -> str:
         """What a piece of work for the planner of a class is called."""

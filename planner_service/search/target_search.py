@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +16,7 @@ from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Floats
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, ids_of
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S
@@ -61,6 +62,10 @@ class TargetSearch:
         self._places_m: list[tuple[float, float]] = []
         self._first_ns: int | None = None
         self._ticked_ns = 0
+        self._remembered: Sighted | None = None
+        """The newest sighting that had expired when it was heard."""
+        self._begun_from: Sighted | None = None
+        """By which of these the search began."""
         self._searched: TargetPose | None = None
         """What was the newest pose when the search began."""
 
@@ -71,6 +76,13 @@ class TargetSearch:
     def hear_vehicles(self, east_m: Floats, south_m: Floats) -> None:
         """Where all vehicles are that count, m from the grid's corner."""
         self._places_m = list(zip(east_m.tolist(), south_m.tolist(), strict=True))
+
+    def remember(self, sighted: Sighted, now_ns: int) -> None:
+        """An earlier sighting is told again, as to a planner that begins anew. Stamps ahead of the clock count as
+        now."""
+        known = self._remembered
+        if known is None or (min(sighted.stamp_ns, now_ns), sighted.author) > (known.stamp_ns, known.author):
+            self._remembered = msgspec.structs.replace(sighted, stamp_ns=min(sighted.stamp_ns, now_ns))
 
     def tick(
         self,
@@ -92,16 +104,19 @@ class TargetSearch:
             self._first_ns = self._ticked_ns = now_ns
         elapsed_s = (now_ns - self._ticked_ns) / NS_PER_S * self.time_scale
         self._ticked_ns = now_ns
-        if self.active and pose is not self._searched:
+        told_since = pose is None and self._begun_from is not self._remembered
+        if self.active and (pose is not self._searched or told_since):
             self.searcher.end()
         if not self.active:
             nearest_m = min((math.dist(place_m, each) for each in self._places_m), default=math.inf)
             if self._is_unseen(pose, nearest_m, age_ns, lost, now_ns):
                 caught = self._hidden.jumps and nearest_m <= 2 * self._hidden.capture_range_m
                 cell = None if pose is None or caught else pose.cell
+                if pose is None and self._remembered is not None:
+                    cell, age_ns = self._remembered.cell, now_ns - self._remembered.stamp_ns
                 age_s = min(age_ns / NS_PER_S * self.time_scale, _LONGEST_S)
                 self.searcher.begin(pace, cell, age_s)
-                self._searched = pose
+                self._searched, self._begun_from = pose, self._remembered
                 self.searches += self.active
         self.searcher.tick(elapsed_s, self._places_m)
 
