@@ -351,6 +351,7 @@ class AgentService:
 
     def _tell_sighted(self, places: Places, now_ns: int) -> None:
         self._untracked.expire(now_ns)
+        self._detector.lose(self._agent.lost(now_ns) - self._untracked.targets)
         for sighted in self._detector.look(places, now_ns):
             self.counters.count("targets_sighted")
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)

@@ -22,6 +22,8 @@ from swarm.wire.routes import Route, RouteBatch, RouteStatus
 UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is told of twice a second: one that is not told of for so long, though a vehicle is where it
 was, is not there."""
+LOST_NS = 30 * NS_PER_S
+"""A target whose tracker is lost is searched for after so long: most trackers are back by then."""
 LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for so long before it takes its target for never seen."""
 _LONGEST_S = 1e7
@@ -29,7 +31,9 @@ _LONGEST_S = 1e7
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """What a planner has to know of a target that only vehicles see.
+    """What a planner has to know of a target to search for it.
+
+    tracked          whether it has a tracker: then it is searched for only while that is lost
 
     sense_range_m    how far they see it
     capture_range_m  how near captures it
@@ -38,6 +42,7 @@ class Hidden:
     seed             of the run, the target and the planner
     """
 
+    tracked: bool
     sense_range_m: float
     capture_range_m: float
     slowness: float
@@ -68,6 +73,11 @@ class TargetSearch:
         """By which of these the search began."""
         self._searched: TargetPose | None = None
         """What was the newest pose when the search began."""
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the target has a tracker, if none that lives."""
+        return self._hidden.tracked
 
     @property
     def active(self) -> bool:
@@ -123,7 +133,9 @@ class TargetSearch:
     def _is_unseen(self, pose: TargetPose | None, nearest_m: float, age_ns: int, lost: bool, now_ns: int) -> bool:
         if pose is None:
             assert self._first_ns is not None
-            return now_ns - self._first_ns >= LISTEN_NS
+            return not self.tracked and now_ns - self._first_ns >= LISTEN_NS
+        if self.tracked:
+            return lost and age_ns >= LOST_NS
         look_m = max(self._hidden.sense_range_m / 2, min(self._hidden.capture_range_m, self._hidden.sense_range_m))
         return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
 
@@ -158,12 +170,13 @@ def is_place(route: Route) -> bool:
 
 
 def hidden_target(scenario: Scenario, target: str, incarnation: int) -> Hidden:
-    """What a scenario says of a target that only vehicles see, for one life of its planner."""
+    """What a scenario says of a target, for one life of its planner."""
     config = next(each for each in scenario.targets if target in ids_of(each))
     speed_m_per_s = config.speed_m_per_s
     # A target never outruns a vehicle: that of an outside process is taken to be as quick.
     slowness = math.inf if speed_m_per_s <= 0 else max(1.0, scenario.cost.flat_speed_m_per_s / speed_m_per_s)
     return Hidden(
+        tracked=target not in scenario.untracked,
         sense_range_m=scenario.vehicles.sense_range_m,
         capture_range_m=scenario.vehicles.capture_range_m,
         slowness=slowness,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Iterable, Set
 
 import numpy as np
 
@@ -62,6 +62,11 @@ class TargetDetector:
             if jumped and last is not None and now_ns - last.stamp_ns <= _IN_SIGHT_NS:
                 del self._last[pose.target]
 
+    def lose(self, targets: Iterable[str]) -> None:
+        """Nobody knows any more where these are."""
+        for target in targets:
+            self._true.pop(target, None)
+
     def hear(self, sighted: Sighted) -> None:
         """Another author saw a target."""
         last = self._last.get(sighted.target)
@@ -117,7 +122,7 @@ class UntrackedTargets:
     reading  whose sightings count
     """
 
-    def __init__(self, targets: Collection[str], reading: MarkFilter) -> None:
+    def __init__(self, targets: Set[str], reading: MarkFilter) -> None:
         self.targets = targets
         self._sightings = Sightings(reading)
 
