@@ -19,6 +19,7 @@ from planner_service.tree.strides import StrideSearch
 from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps
 from shared_map.cost_map import CostMap
+from shared_map.learning.gauges import LearnedGauges
 from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
@@ -146,6 +147,7 @@ class PlannerService:
         """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
         self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
+        self._learned = LearnedGauges(self._cost_map.keys, self.counters)
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
         """The planner of a class that somebody asks for."""
@@ -208,6 +210,7 @@ class PlannerService:
             if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
                 self._planners.used(name, now_ns).hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
+        self._learned.tick(self._cost_map.factors)
         self._sightings.expire(now_ns)
         self._look(now_ns)
         self._obey()

@@ -15,6 +15,7 @@ from planner_service.search.ways import Ways
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Floats
 from swarm.clock import NS_PER_S
+from swarm.config.classes import least_sense_range_m
 from swarm.config.scenario import Scenario, ids_of
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
@@ -177,7 +178,7 @@ def hidden_target(scenario: Scenario, target: str, incarnation: int) -> Hidden:
     slowness = math.inf if speed_m_per_s <= 0 else max(1.0, scenario.cost.flat_speed_m_per_s / speed_m_per_s)
     return Hidden(
         tracked=target not in scenario.untracked,
-        sense_range_m=scenario.vehicles.sense_range_m,
+        sense_range_m=least_sense_range_m(scenario),
         capture_range_m=scenario.vehicles.capture_range_m,
         slowness=slowness,
         jumps=config.caught == "jump" and config.is_simulated,
