@@ -172,15 +172,15 @@ def is_place(route: Route) -> bool:
 
 def hidden_target(scenario: Scenario, target: str, incarnation: int) -> Hidden:
     """What a scenario says of a target, for one life of its planner."""
-    config = next(each for each in scenario.targets if target in ids_of(each))
-    speed_m_per_s = config.speed_m_per_s
-    # A target never outruns a vehicle: that of an outside process is taken to be as quick.
+    config = next((each for each in scenario.targets if target in ids_of(each)), None)
+    # A target never outruns a vehicle; one that was added while the swarm ran is taken to be as quick.
+    speed_m_per_s = math.inf if config is None else config.speed_m_per_s
     slowness = math.inf if speed_m_per_s <= 0 else max(1.0, scenario.cost.flat_speed_m_per_s / speed_m_per_s)
     return Hidden(
         tracked=target not in scenario.untracked,
         sense_range_m=least_sense_range_m(scenario),
         capture_range_m=scenario.vehicles.capture_range_m,
         slowness=slowness,
-        jumps=config.caught == "jump" and config.is_simulated,
+        jumps=config is not None and config.caught == "jump" and config.is_simulated,
         seed=f"{scenario.seed}/{target}/{incarnation}",
     )
