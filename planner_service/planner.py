@@ -68,7 +68,7 @@ class Planner:
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     time_scale      seconds on the terrain per second: by it a target is taken for teleported
     vehicle_class   whose routes these are: what the cost map is for
-    target_search   of a target that only vehicles see: it is searched for while nobody does. All classes share it
+    target_search   for the time in which nobody sees the target. All classes share it
     """
 
     def __init__(
@@ -129,10 +129,11 @@ class Planner:
         self._puller = Puller(cost_map.pace_s_per_m, self._grid.resolution_m, config) if pulls else None
         self._status_due_ns = 0
         self.target_search = target_search
-        """None for a target that has a tracker."""
+        """None for one that is not searched for."""
         self._ways = Ways(tree.cost_grid)
         """To where vehicles of the class are to look."""
-        for name in COUNTS if target_search is None else COUNTS + SEARCH_COUNTS:
+        is_hidden = target_search is not None and not target_search.tracked
+        for name in COUNTS + SEARCH_COUNTS if is_hidden else COUNTS:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
@@ -146,6 +147,10 @@ class Planner:
         """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
         self._push_ns = int(push_s * NS_PER_S)
         self.tree.times.set_budget(cpu_budget)
+
+    def is_lost(self, now_ns: int) -> bool:
+        """Whether nobody knows where the target is that somebody knew of."""
+        return self._watch.lost(now_ns)
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
@@ -253,15 +258,16 @@ class Planner:
         search, pose, grid = self.target_search, self._watch.pose, self._grid
         if search is None:
             return
-        if self.tree.map_version < 0:
+        if self.tree.map_version < 0 and not search.tracked:
             self._learn_map()
         if self.vehicle_class != GROUND:
             return  # that class has told the search all of this
         place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
         age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
         search.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
-        self.counters.counts["searches"] = search.searches
-        self.counters.counts["search_places"] = search.searcher.decisions
+        if search.searches:
+            self.counters.counts["searches"] = search.searches
+            self.counters.counts["search_places"] = search.searcher.decisions
 
     def _learn_map(self) -> None:
         """Take in the map without a target to lead to."""

@@ -360,6 +360,10 @@ class Agent:
             self._moved(counts, now_ns)
         return counts
 
+    def lost(self, now_ns: int) -> set[str]:
+        """The targets of which nobody knows any more where they are."""
+        return self._trackings.lost(now_ns)
+
     def see_target(self, pose: TargetPose, now_ns: int) -> None:
         """Where a target without a tracker is, by the best sighting of it. A pose outside the grid is ignored."""
         if 0 <= pose.cell < self._map.grid.cells:
@@ -441,6 +445,9 @@ class Agent:
             if not pushed:
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
+        if searching and target not in self._unseen and target in self.lost(now_ns):
+            self._unseen.add(target)
+            self._poses.pop(target, None)
         try:
             cells = walk(self._map.grid, route.start, route.directions)
         except ValueError:
