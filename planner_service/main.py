@@ -11,6 +11,7 @@ from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
+from shared_map.prepared_classes import load_classes
 from shared_map.terrain.kept import kept_key
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
@@ -35,6 +36,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         ids = ", ".join(scenario.target_ids)
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
+    load_classes(setup, terrain)
     kernels = KernelLoader(directed=terrain.climb is not None, whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
     prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))

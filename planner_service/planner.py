@@ -13,7 +13,8 @@ from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
 from planner_service.search.searcher import Searcher
-from planner_service.search.target_search import Hidden, TargetSearch, is_place
+from planner_service.search.target_search import TargetSearch, is_place
+from planner_service.search.ways import Ways
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
@@ -65,7 +66,7 @@ class Planner:
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     time_scale      seconds on the terrain per second: by it a target is taken for teleported
     vehicle_class   whose routes these are: what the cost map is for
-    hidden          of a target that only vehicles see: it is searched for while nobody does
+    target_search   of a target that only vehicles see: it is searched for while nobody does. All classes share it
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class Planner:
         shelf: StrideShelf | None = None,
         leads: bool = True,
         time_scale: float = 1.0,
-        hidden: Hidden | None = None,
+        target_search: TargetSearch | None = None,
         vehicle_class: str = GROUND,
     ) -> None:
         self.target = target
@@ -122,13 +123,11 @@ class Planner:
         self._growth_ms = 0.0
         self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
         self._status_due_ns = 0
-        self.target_search: TargetSearch | None = None
+        self.target_search = target_search
         """None for a target that has a tracker."""
-        if hidden is not None:
-            seed = f"{hidden.seed}/{incarnation}"
-            searcher = Searcher(tree.cost_grid, hidden.sense_range_m, hidden.slowness, seed)
-            self.target_search = TargetSearch(hidden, searcher, time_scale)
-        for name in COUNTS if hidden is None else COUNTS + SEARCH_COUNTS:
+        self._ways = Ways(tree.cost_grid)
+        """To where vehicles of the class are to look."""
+        for name in COUNTS if target_search is None else COUNTS + SEARCH_COUNTS:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
@@ -251,6 +250,8 @@ class Planner:
             return
         if self.tree.map_version < 0:
             self._learn_map()
+        if self.vehicle_class != GROUND:
+            return  # that class has told the search all of this
         place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
         age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
         search.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
@@ -328,7 +329,7 @@ class Planner:
         most = MOST_STEPS // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
         if (search := self._under_way) is not None:
-            routes = search.routes(cells, request.vehicles, max_cells, self.tree.map_version)
+            routes = search.routes(self._ways, cells, request.vehicles, max_cells, self.tree.map_version)
         else:
             routes = self.tree.routes(cells, max_cells)
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
@@ -439,13 +440,13 @@ class Planner:
         """Other places for vehicles whose own is not worth the way any more, and for those which still follow a
         route to where the target was."""
         pushes: list[Action] = []
-        searcher.forget_all_but(self.followers.ids())
+        searcher.forget_all_but(self._ways, self.followers.ids())
         for id, follower in self.followers.all_items():
             if not searcher.may_decide:
                 break
             if not searcher.wants_place(id) or now_ns < follower.push_ns:
                 continue
-            route = searcher.route(id, follower.cell, follower.max_cells, self.tree.map_version)[0]
+            route = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)[0]
             follower.push_ns = now_ns + self._push_ns
             if is_place(route):
                 self.followers.sent(follower, route, now_ns + self._push_ns)

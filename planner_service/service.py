@@ -11,13 +11,15 @@ from planner_service.class_planners import ClassPlanners
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
-from planner_service.search.target_search import hidden_target
+from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.strides import StrideSearch
 from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps
 from shared_map.cost_map import CostMap
+from shared_map.learning.gauges import LearnedGauges
 from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
@@ -93,6 +95,12 @@ class PlannerService:
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
 
+        def search_by(costs: CostGrid) -> TargetSearch | None:
+            if not self._untracked:
+                return None
+            hidden = hidden_target(scenario, self._target, setup.incarnation)
+            return TargetSearch(hidden, costs, scenario.time_scale)
+
         def planner_of(name: str, cost_map: CostMap, counters: Counters) -> Planner:
             tree = TargetTree(
                 terrain.grid,
@@ -118,7 +126,7 @@ class PlannerService:
                 shelf=shelf,
                 leads=False,
                 time_scale=scenario.time_scale,
-                hidden=hidden_target(scenario, self._target) if self._untracked else None,
+                target_search=search_by(tree.cost_grid) if name == GROUND else self._planner.target_search,
                 vehicle_class=name,
             )
 
@@ -139,6 +147,7 @@ class PlannerService:
         """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
         self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
+        self._learned = LearnedGauges(self._cost_map.keys, self.counters)
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
         """The planner of a class that somebody asks for."""
@@ -205,6 +214,7 @@ class PlannerService:
             if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
                 self._planners.used(name, now_ns).hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
+        self._learned.tick(self._cost_map.factors)
         self._sightings.expire(now_ns)
         self._look(now_ns)
         self._obey()
@@ -252,9 +262,7 @@ class PlannerService:
             self._presence.hear(heard.message, now_ns)
         self._presence.expire(now_ns)
         vehicles = self._presence.vehicles
-        for _, planner in self._planners:
-            if planner.target_search is not None:
-                planner.target_search.hear_vehicles(vehicles.east_m, vehicles.south_m)
+        self._planner.target_search.hear_vehicles(vehicles.east_m, vehicles.south_m)
 
     def _answer(self, now_ns: int) -> None:
         """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""

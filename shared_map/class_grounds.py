@@ -13,13 +13,10 @@ from shared_map.arrays import Bools, Floats
 from shared_map.class_maps import read_by
 from shared_map.terrain.homes import homes_of
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.classes import GROUND, class_named, driven_classes
+from swarm.config.classes import GROUND, ClassConfig, class_named, driven_classes
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.wire.statements import PACE_LEAST
-
-_MADE: WeakKeyDictionary[Terrain, dict[bytes, Terrain]] = WeakKeyDictionary()
-"""What was made beside a terrain, so that the processes of a simulation make it once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +32,19 @@ class ClassGround:
     homes: Bools
 
 
+_MADE: WeakKeyDictionary[Terrain, dict[bytes, Terrain]] = WeakKeyDictionary()
+"""What was made beside a terrain, so that the processes of a simulation make it once."""
+_KNOWN: WeakKeyDictionary[Terrain, dict[bytes, ClassGround]] = WeakKeyDictionary()
+"""What was prepared beside a terrain, with its truth."""
+
+
+def give_known(scenario: Scenario, common: Terrain, name: str, ground: ClassGround) -> None:
+    """Take this for the ground of a class from now on, beside this terrain."""
+    key = _key(scenario, name)
+    _KNOWN.setdefault(common, {})[key] = ground
+    _MADE.setdefault(common, {})[key] = ground.terrain
+
+
 def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | None = None) -> dict[str, Terrain]:
     """Class -> the terrain by its own rule, of these classes; of all beside "ground" if none are named. Raises
     TerrainError in one sentence.
@@ -45,38 +55,10 @@ def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | N
     return {name: _terrain(scenario, common, name) for name in wanted}
 
 
-def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
-    own = class_named(scenario, name)
-    if own is None:
-        return common
-    made = _MADE.setdefault(common, {})
-    key = msgspec.json.encode([scenario.seed, scenario.terrain, scenario.cost, own])
-    if key not in made:
-        try:
-            terrain = build_terrain(scenario, vehicle_class=name)
-        except TerrainError as error:
-            raise TerrainError(f"class {name}: {error}") from error
-        if terrain.grid != common.grid:
-            raise TerrainError(f"class {name}: its terrain is {terrain.grid}, that of the run {common.grid}")
-        limit = PACE_LEAST if own.max_speed_m_per_s is None else 1 / own.max_speed_m_per_s
-        # The same ground is looked at: what a class has of its own is what it costs.
-        made[key] = replace(
-            terrain, elevation_m=common.elevation_m, photo=common.photo, classes=common.classes, least_s_per_m=limit
-        )
-    return made[key]
-
-
-def class_truth(own: Terrain, common: Terrain, truth: Floats) -> Floats:
-    """What the truth for "ground" is to another class, float32 (rows, cols)."""
-    own_prior, prior = own.ground_s_per_m.reshape(-1), common.ground_s_per_m.reshape(-1)
-    read: Floats = read_by(own_prior, prior, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
-    return read
-
-
 def class_truths(scenario: Scenario, common: Terrain, truth: Floats) -> dict[str, Floats]:
     """Class -> the truth for it, of "ground" and of every class that vehicles of the scenario belong to."""
-    terrains = class_terrains(scenario, common, driven_classes(scenario))
-    return {GROUND: truth} | {name: class_truth(own, common, truth) for name, own in terrains.items()}
+    others = {name: _truth(scenario, common, truth, name) for name in driven_classes(scenario)}
+    return {GROUND: truth, **others}
 
 
 def class_grounds(
@@ -86,13 +68,59 @@ def class_grounds(
 
     common, truth, homes  those of "ground"; `homes_of` the other two, if that is known
     """
-    terrains = class_terrains(scenario, common, driven_classes(scenario))
     known = homes_of(common.pace_s_per_m, truth) if homes is None else homes
     grounds = {GROUND: ClassGround(common, truth, known)}
-    for name, own in terrains.items():
-        own_truth = class_truth(own, common, truth)
-        homes = homes_of(own.pace_s_per_m, own_truth)
-        if not homes.any():
-            raise TerrainError(f"class {name}: no cell that it can drive by the map is so in truth")
-        grounds[name] = ClassGround(own, own_truth, homes)
+    for name in driven_classes(scenario):
+        prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
+        grounds[name] = prepared or _ground(scenario, common, truth, name)
     return grounds
+
+
+def least_pace(own: ClassConfig | None) -> float:
+    """The pace below which no vehicle of a class comes, s/m."""
+    return PACE_LEAST if own is None or own.max_speed_m_per_s is None else 1 / own.max_speed_m_per_s
+
+
+def _ground(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> ClassGround:
+    own, own_truth = _terrain(scenario, common, name), _truth(scenario, common, truth, name)
+    homes = homes_of(own.pace_s_per_m, own_truth)
+    if not homes.any():
+        raise TerrainError(f"class {name}: no cell that it can drive by the map is so in truth")
+    return ClassGround(own, own_truth, homes)
+
+
+def _truth(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> Floats:
+    prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
+    if prepared is not None:
+        return prepared.truth
+    own = _terrain(scenario, common, name)
+    own_prior, prior = own.ground_s_per_m.reshape(-1), common.ground_s_per_m.reshape(-1)
+    read: Floats = read_by(own_prior, prior, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
+    return read
+
+
+def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
+    own = class_named(scenario, name)
+    if own is None:
+        return common
+    made, key = _MADE.setdefault(common, {}), _key(scenario, name)
+    if key not in made:
+        try:
+            terrain = build_terrain(scenario, vehicle_class=name)
+        except TerrainError as error:
+            raise TerrainError(f"class {name}: {error}") from error
+        if terrain.grid != common.grid:
+            raise TerrainError(f"class {name}: its terrain is {terrain.grid}, that of the run {common.grid}")
+        # The same ground is looked at: what a class has of its own is what it costs.
+        made[key] = replace(
+            terrain,
+            elevation_m=common.elevation_m,
+            photo=common.photo,
+            classes=common.classes,
+            least_s_per_m=least_pace(own),
+        )
+    return made[key]
+
+
+def _key(scenario: Scenario, name: str) -> bytes:
+    return msgspec.json.encode([scenario.seed, scenario.terrain, scenario.cost, class_named(scenario, name)])

@@ -71,10 +71,9 @@ class ClassMaps:
         self.common = common
         self.of = {name: CostMap(terrain, learning=common.keys is not None) for name, terrain in terrains.items()}
 
-    def learn(self, words: Sequence[MarkSet]) -> None:
+    def learn(self, words: Sequence[MarkSet]) -> bool:
         """As `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""
-        for cost_map in (self.common, *self.of.values()):
-            cost_map.learn(words)
+        return any([cost_map.learn(words) for cost_map in (self.common, *self.of.values())])  # noqa: C419 - all do
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
         """As `CostMap.apply`, to each map what the statements are to its class."""

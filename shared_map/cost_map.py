@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats, private_copy
-from shared_map.learning.factors import by_process, factors_of, keys_of
-from shared_map.learning.words import KEYS, told
+from shared_map.learning.factors import keys_of
+from shared_map.learning.learned import factors_in
+from shared_map.learning.words import KEYS
 from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
@@ -140,14 +141,15 @@ class CostMap:
             boxes[tile] = boxes[tile].union(box) if tile in boxes else box
         self._dirty = merged(boxes.values(), self._dirty)
 
-    def learn(self, words: Sequence[MarkSet]) -> None:
+    def learn(self, words: Sequence[MarkSet]) -> bool:
         """Make these the words of all authors about kinds of ground. Those which are none change nothing. A change
-        of factors is one of the whole map. Lethal cells stay lethal, and marked cells as they are marked."""
+        of factors is one of the whole map. Lethal cells stay lethal, and marked cells as they are marked.
+        Returns whether the factors changed."""
         if self.keys is None or self._stated is None:
-            return
-        factors = factors_of(by_process([(each.author, said) for each in words if (said := told(each))]))
+            return False
+        factors = factors_in(words)
         if (factors == self.factors).all():
-            return
+            return False
         self.factors = factors
         known = np.asarray(self.terrain.ground_s_per_m)
         by = factors[self.keys]
@@ -158,13 +160,14 @@ class CostMap:
         pace, ground, free = self.pace_s_per_m, self.ground_s_per_m, ~self._stated.reshape(known.shape)
         changed = free & (ground != fresh)
         if not changed.any():
-            return
+            return True
         ground[changed] = fresh[changed]
         if self._halves:
             changed &= np.isfinite(pace)
             pace[changed] = fresh[changed]
         self.version += 1
         self._dirty = [self.grid.window]
+        return True
 
     def take_dirty(self) -> list[Window]:
         """Windows which cover every cell whose pace changed since the last call, 32 at most; none touches

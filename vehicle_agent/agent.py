@@ -109,7 +109,9 @@ class Agent:
             self._in_reach,
             f"{scenario.seed}/{plan.id}",
         )
-        self._driver = Driver(local_map, holdings, self._steering.passable, dynamics)
+        self._driver = Driver(
+            local_map, holdings, self._steering.passable, dynamics, measures=scenario.map.learning
+        )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
@@ -229,7 +231,8 @@ class Agent:
         return compare(sight, self._map.ground, self._map.prior)
 
     def take_driven(self) -> list[tuple[int, float]]:
-        """(cell, s/m) of each step that was driven freely since the last call (see `Driver`)."""
+        """(cell, s/m) of each step that was driven freely since the last call (see `Driver`); none if nothing is
+        learned."""
         driven, self._driver.driven = self._driver.driven, []
         return driven
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable
 
+from shared_map.prepared_classes import load_classes
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -23,6 +24,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     stop_when  blocks until the process has to end; None to run until a signal comes
     """
     terrain = load_terrain(setup)
+    load_classes(setup, terrain)
     truth = load_truth(setup, terrain)
     store: PromiseStore = (
         MemoryPromiseStore(secrets.randbits(60))

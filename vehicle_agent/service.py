@@ -18,7 +18,7 @@ from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
-from swarm.config.classes import GROUND, of_class
+from swarm.config.classes import GROUND, class_named, of_class
 from swarm.config.plugin_names import assignment_key
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -54,7 +54,7 @@ from vehicle_agent.agent_maps import AgentMaps
 from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
-from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
+from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
@@ -95,7 +95,7 @@ class AgentService:
         grid = terrain.grid
         self._class = plan.group.vehicle_class
         grounds = class_grounds(scenario, terrain, truth, load_homes(setup, terrain, truth))
-        common, own = grounds[GROUND], grounds[self._class]
+        common, own, as_class = grounds[GROUND], grounds[self._class], of_class(scenario, self._class)
         spawns = spawn_cells(scenario, grid, grounds)
         self._member = Member(setup.info(grid, terrain.digest), bus, post, setup.before)
         self.counters = self._member.counters
@@ -118,7 +118,7 @@ class AgentService:
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
         self._faults: list[str] = []
         """What plug-ins did wrong and nobody has been told yet."""
-        world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
+        world = SensorWorld(grid, truth, as_class.vehicles.sense_range_m, setup.id, scenario.seed)
         sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), world, self._faults.append)
         self._target_bodies = TargetBodies(scenario, grid)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
@@ -126,22 +126,24 @@ class AgentService:
             grid,
             self._author,
             group,
-            scenario.vehicles.sense_range_m,
+            as_class.vehicles.sense_range_m,
         )
         self._right_of_way = RightOfWaySync(
             setup, grid, spawns, store, bus, post, self._place, self._warn, plan.vehicle_ids
         )
-        bodies = Bodies(grid, of_class(scenario, self._class).cost.vehicle_radius_m)
+        bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)
         assigned = AssignmentWorld(setup.id, group, targets, scenario.seed, plan.group.pursuers)
         named = named_plugin(scenario, assignment_key(scenario, group))
         assigner = assigner_of(named, assigned, self._faults.append)
         self._group_costs = GroupCosts(self._author, group, setup.id) if shares_costs(assigner) else None
         driven = DynamicsWorld(setup.id, grid, scenario.seed)
-        dynamics = dynamics_of(named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append)
+        dynamics = own_dynamics(class_named(scenario, self._class), driven) or dynamics_of(
+            named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append
+        )
         self._agent = Agent(
             plan,
-            scenario,
+            as_class,
             self._maps.local,
             sensor,
             self._right_of_way.core.holdings,
@@ -152,7 +154,7 @@ class AgentService:
         )
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
-        reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
+        reach_m = max(scenario.map.interest_m, 2 * as_class.vehicles.sense_range_m)
         self._zones = ZonesAround(self._replica, self._maps.own, self._maps.read)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
@@ -266,9 +268,8 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._maps.take_dirty(), now_ns)
-        driven = agent.take_driven()
         learning = self._maps.learning
-        if learning is not None and (said := learning.tick(driven, now_ns)):
+        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
             self._sync.publish(self._replica.write_learned(said, now_ns))
         columns = Places(self._replica.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)

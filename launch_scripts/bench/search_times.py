@@ -139,7 +139,7 @@ class Run:
     def _random(self) -> Callable[[float], None]:
         ways = Ways(self.ground.costs)
         ways.grow(self.last)
-        reach_s = ways.costs_s(np.arange(self.ground.terrain.grid.cells)).astype(np.float64) * self.slowness
+        reach_s = ways.costs_s.reshape(-1).astype(np.float64) * self.slowness
         sent: set[int] = set()
 
         def send(now_s: float) -> None:
@@ -151,13 +151,14 @@ class Run:
                 sent.add(number)
                 ways.grow(driver.cell)
                 self.decisions += 1
-                if goal != driver.cell and np.isfinite(ways.costs_s(np.array([goal]))[0]):
+                if goal != driver.cell and np.isfinite(ways.costs_s.flat[goal]):
                     driver.cells = list(ways.way_to(goal).cells[1:])
 
         return send
 
     def _belief(self) -> Callable[[float], None]:
-        searcher = Searcher(self.ground.costs, self.range_m, self.slowness, self.seed)
+        ways = Ways(self.ground.costs)
+        searcher = Searcher(ways, self.range_m, self.slowness, self.seed)
         searcher.begin(self.ground.terrain.pace_s_per_m, self.last, self.lost_s)
         grid = self.ground.terrain.grid
 
@@ -167,7 +168,7 @@ class Run:
                 if (driver.cells and not searcher.wants_place(f"{number}")) or not searcher.may_decide:
                     continue
                 began_s = time.thread_time()
-                route: Route = searcher.route(f"{number}", driver.cell, 0, 0)[0]
+                route: Route = searcher.route(ways, f"{number}", driver.cell, 0, 0)[0]
                 self.cpu_s.append(time.thread_time() - began_s)
                 driver.cells = list(walk(grid, route.start, route.directions))[1:]
             self.decisions = searcher.decisions

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.commands.query import Where
+from launch_scripts.commands.shared_options import AsJson, Tls, spread
 from launch_scripts.report.geo.geo_layers import Layer, mark_layer, write_layers
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
@@ -33,8 +34,12 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
         terrain, grid = store.terrain, store.grid
         if terrain is None or grid is None:
             raise StoreError(f"the store {path} has not been used by a keeper yet: it knows no terrain")
-        # What is learned lies beyond the last tile and is about no cell.
-        return terrain, grid, [each for each in store.load() if each.tile < grid.tiles]
+        return terrain, grid, list(store.load())
+
+
+def _parted(grid: GridSpec, sets: list[MarkSet]) -> tuple[list[MarkSet], list[MarkSet]]:
+    """The sets of marks, and what authors have learned, which lies beyond the last tile and is about no cell."""
+    return [each for each in sets if each.tile < grid.tiles], [each for each in sets if each.tile == grid.tiles]
 
 
 @app.command()
@@ -43,7 +48,8 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
 
     swarm map inspect runs/LAST/map.sqlite
     """
-    terrain, grid, sets = _read(store)
+    terrain, grid, held = _read(store)
+    sets, words = _parted(grid, held)
     _, kind = stored_marks.to_bands(grid, sets, time.time_ns())
     authors: dict[str, list[MarkSet]] = {}
     for each in sets:
@@ -68,6 +74,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
             }
             for author, of in sorted(authors.items())
         },
+        "authors_that_learned": sorted(each.author for each in words if each.kinds),
         "sightings": {
             each.target: {
                 "row_col": list(divmod(each.cell, grid.cols)),
@@ -90,6 +97,8 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
           f"{found['cells_lethal']} of them lethal")  # fmt: skip
     for author, of in sorted(authors.items()):
         print(f"  {author:40} {sum(len(each.kinds) for each in of):7} marks in {len(of):5} tiles")
+    if any(each.kinds for each in words):
+        print(f"  what was learned of kinds of ground, by {len(words)} authors: swarm map learned {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
@@ -100,7 +109,8 @@ def export(
     store: Store,
     out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson: the winners.")],
 ) -> None:
-    """Write the marks of a store: all of them as JSON, which can be imported; the winners as pixels or polygons.
+    """Write the marks of a store: all of them, and what was learned, as JSON, which can be imported; the winners as
+    pixels or polygons.
 
     swarm map export runs/LAST/map.sqlite marks.json
 
@@ -119,7 +129,13 @@ def export(
             raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS + _SHAPES)}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    print(f"{out}: {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
+    print(f"{out}: {_counted(grid, sets, learned=kind_of_file in _TEXT)}")
+
+
+def _counted(grid: GridSpec, sets: list[MarkSet], *, learned: bool = True) -> str:
+    marks, words = _parted(grid, sets)
+    text = f"{sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets"
+    return f"{text}, and what {len(words)} authors have learned" if words and learned else text
 
 
 def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
@@ -140,7 +156,39 @@ def import_(
     with KeeperStore(store) as into:
         into.bind(terrain, grid)
         into.save(sets)
-    print(f"{store}: merged {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
+    print(f"{store}: merged {_counted(grid, sets)}")
+
+
+@app.command()
+@spread
+def learned(
+    where: Where,
+    tls: Tls,
+    store: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A keeper's store, or the folder of its run; if not given, the running swarm is asked."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what vehicles have learned of kinds of ground (map.learning): driven over prior pace, and by what the
+    prior is multiplied.
+
+    swarm map learned
+
+    swarm map learned runs/LAST
+    """
+    from launch_scripts.commands.running.learned import ask_learned, print_learned
+    from swarm.bus.zenoh_bus import open_bus
+
+    if store is not None:
+        _, grid, held = _read(store / "map.sqlite" if store.is_dir() else store)
+        words = _parted(grid, held)[1]
+    else:
+        with open_bus(where.network(tls)) as bus:
+            words = ask_learned(bus, where)
+    print_learned(words, as_json=as_json)
 
 
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:

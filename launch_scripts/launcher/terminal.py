@@ -41,6 +41,7 @@ REPORTED = {
     "driven_into": "bodies driven into",
     "hit_by_bodies": "vehicles hit by bodies",
     "certified_gap": "certified gap",
+    "learned": "learned, times the prior pace",
     "growth_ms": "growing a tree, ms",
     "route_query_ms": "asking for a route, ms",
     "mark_to_tree_ms": "from mark to tree, ms",
@@ -105,7 +106,7 @@ class Terminal:
         """Prints the numbers of a finished run."""
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
-            if name in REPORTED:
+            if name in REPORTED and value != {}:  # of what nobody has learned there is no line
                 table.add_row(REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
         self.print(table)
 

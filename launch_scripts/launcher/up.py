@@ -35,6 +35,7 @@ from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
+from shared_map.prepared_classes import prepare_classes
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
@@ -203,8 +204,11 @@ class _Run:
             )
             setup = self._setup_of(ProcessSpec(LAUNCHER, "0", ""))
             terrain = load_terrain(setup)
-            return terrain, load_truth(setup, terrain)
-        return prepare(self._run_dir, self._scenario, self._prepares)
+            truth = load_truth(setup, terrain)
+        else:
+            terrain, truth = prepare(self._run_dir, self._scenario, self._prepares)
+        prepare_classes(self._run_dir, self._scenario, terrain, truth)
+        return terrain, truth
 
     def _prepares(self, what: str, share: float) -> None:
         self._preparing = f"preparing the terrain: {what}, {share:.0%}"

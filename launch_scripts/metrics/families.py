@@ -23,7 +23,7 @@ from prometheus_client.metrics_core import (
 from launch_scripts.report.results.counts import Counts
 from shared_map.keeper.service import THROTTLED
 from swarm.clock import NS_PER_S
-from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
+from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, LEARNED, Histogram
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Stats
 
@@ -185,6 +185,11 @@ def _gauges(newest: Mapping[tuple[str, str], Stats]) -> Iterator[Metric]:
         labels=(*_PROCESS, "author"),
     )
     states = GaugeMetricFamily(f"{PREFIX}vehicles", "Vehicles in each state", labels=(*_PROCESS, "state"))
+    learned = GaugeMetricFamily(
+        f"{PREFIX}learned_pace_ratio",
+        "What the prior pace of a class of ground is multiplied by, as vehicles have measured",
+        labels=(*_PROCESS, "ground"),
+    )
     for name in _names(stats.gauges for stats in newest.values()):
         full, worth, text = named(name)
         plain = GaugeMetricFamily(full, text, labels=_PROCESS)
@@ -194,6 +199,8 @@ def _gauges(newest: Mapping[tuple[str, str], Stats]) -> Iterator[Metric]:
             value = stats.gauges[name]
             if name.startswith(THROTTLED):
                 throttled.add_metric((*key, name.removeprefix(THROTTLED)), value)
+            elif name.startswith(LEARNED):
+                learned.add_metric((*key, name.removeprefix(LEARNED)), value)
             elif name.startswith(_STATE):
                 states.add_metric((*key, name.removeprefix(_STATE)), value)
             else:
@@ -201,6 +208,7 @@ def _gauges(newest: Mapping[tuple[str, str], Stats]) -> Iterator[Metric]:
         yield plain
     yield throttled
     yield states
+    yield learned
 
 
 def _of_targets(figures: Figures) -> Iterator[Metric]:

@@ -18,6 +18,7 @@ from launch_scripts.bench.search_times import TICK_S, Ground, Run
 from launch_scripts.report.pictures.palette import BLUE, INK, ORANGE, RED
 from launch_scripts.report.pictures.plot_style import STYLE
 from planner_service.search.searcher import Searcher
+from planner_service.search.ways import Ways
 from swarm.config.load import load_scenario
 from swarm.grid import walk
 
@@ -32,7 +33,8 @@ def draw(file: Path) -> None:
     """Write the picture: the belief over the ground at three times of one search."""
     ground = Ground.of(load_scenario(_SCENARIO))
     one = Run(ground, "waypoints", 10, 900.0, _SEED, near=False)
-    searcher = Searcher(ground.costs, one.range_m, one.slowness, one.seed)
+    ways = Ways(ground.costs)
+    searcher = Searcher(ways, one.range_m, one.slowness, one.seed)
     searcher.begin(ground.terrain.pace_s_per_m, one.last, one.lost_s)
     grid, pace = ground.terrain.grid, ground.terrain.pace_s_per_m
     km = grid.resolution_m / 1e3
@@ -47,7 +49,7 @@ def draw(file: Path) -> None:
                 for number, driver in enumerate(one.drivers):
                     name = f"{number}"
                     if (not driver.cells or searcher.wants_place(name)) and searcher.may_decide:
-                        route = searcher.route(name, driver.cell, 0, 0)[0]
+                        route = searcher.route(ways, name, driver.cell, 0, 0)[0]
                         driver.cells = list(walk(grid, route.start, route.directions))[1:]
                 if now_s >= after_s and all(driver.cells for driver in one.drivers):
                     break

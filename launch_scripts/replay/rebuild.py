@@ -15,6 +15,7 @@ from planner_service.service import PlannerService
 from shared_map.arrays import Floats
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KEEPER_STORE, KeeperStore
+from shared_map.prepared_classes import load_classes
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth
 from swarm.bus.bus import Event
 from swarm.config.load import parse_scenario
@@ -58,10 +59,11 @@ class Grounds:
         if self._given is not None:
             return self._given
         scenario = setup.scenario
-        key = msgspec.msgpack.encode((scenario.terrain, scenario.cost, scenario.seed))
+        key = msgspec.msgpack.encode((scenario.terrain, scenario.cost, scenario.classes, scenario.seed))
         ground = self._built.get(key)
         if ground is None:
             terrain = load_terrain(setup)
+            load_classes(setup, terrain)
             ground = self._built[key] = Ground(terrain, load_truth(setup, terrain))
         if ground.terrain.digest != digest:
             raise TerrainError(

@@ -209,6 +209,10 @@ class Observed(Counts):
     def any_marks(self) -> bool:
         return bool(self._marks)
 
+    def learned_words(self) -> list[MarkSet]:
+        """What each author has learned of kinds of ground: sets about the tile beyond the map."""
+        return [marks for (_, tile), marks in sorted(self._marks.items()) if tile == self.grid.tiles]
+
     def marked(self) -> MarkedCells:
         """The newest statement per cell, ties by the larger author; cells cleared again are left out."""
         newest: dict[int, tuple[int, str, int, float]] = {}

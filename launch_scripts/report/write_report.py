@@ -19,6 +19,7 @@ from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, tra
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.result_tables import TABLES, csv_of
 from launch_scripts.report.results.run_folder import REPORT_FILE, ended
+from shared_map.learning.learned import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
 from swarm.errors import StoreError
@@ -52,6 +53,7 @@ def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain
             **bounds_deg(terrain.grid),
             "notes": list(terrain.notes),
         },
+        "learned_kinds": [each._asdict() for each in learned_kinds(recorder.observed.learned_words())],
         "series": recorder.series(),
         "distributions": recorder.distributions(),
         "notes": recorder.notes_told(),
@@ -73,6 +75,7 @@ def write_report(
     report = {**report, **({"made": made} if (made := ended(folder)) else {})}
     # matplotlib takes a moment
     from launch_scripts.report.pictures.ground_picture import GROUND_FILE, ground_picture
+    from launch_scripts.report.pictures.learned_picture import LEARNED_FILE, learned_overlay
 
     tracks = packed_tracks(recorder)
     ground = ground_picture(terrain, recorder.scenario, truth)
@@ -83,6 +86,9 @@ def write_report(
         TRACKS_FILE: lambda: tracks,
         GROUND_FILE: ground.webp,
     }
+    factors = factors_in(recorder.observed.learned_words())
+    if (factors != 1).any():
+        contents[LEARNED_FILE] = lambda: learned_overlay(terrain, factors)
     for name, content in contents.items():
         _write(folder / name, content())
     from launch_scripts.report.page.run_page import write_page

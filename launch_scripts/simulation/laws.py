@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from shared_map.class_grounds import class_grounds
+from shared_map.class_grounds import class_grounds, class_truths
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Event, Heard
 from swarm.config.agents import plan_agents
@@ -127,7 +128,8 @@ class Laws:
 
 
 class Waits:
-    """How long vehicles stand on one cell although they have somewhere to go and nothing is down.
+    """How long vehicles are on one cell, less the time to drive across it, although they have somewhere to go and
+    nothing is down.
 
     A second counts if every process works: one that is dead, hung or cut off is a reason to stand, as it may hold
     the cell ahead, or be the planner or a warden that a vehicle waits for. Messages that are lost or late are none.
@@ -138,6 +140,10 @@ class Waits:
         self.longest: tuple[float, str, int] | None = None
         """When the longest wait ended or was last seen, vehicle and cell."""
         self._simulation = simulation
+        truths = class_truths(simulation.scenario, simulation.terrain, simulation.truth)
+        across_m = math.sqrt(2) * simulation.terrain.grid.resolution_m
+        self._across_s = {name: across_m / simulation.scenario.time_scale * each for name, each in truths.items()}
+        """Class of vehicles -> the time to drive across each cell."""
         self._waited_s: dict[str, tuple[int, float]] = {}
         """Vehicle -> its cell, and the seconds that count since it came there."""
         self._looked_s: dict[str, float] = {}
@@ -150,14 +156,16 @@ class Waits:
         passed_s = now_s - self._looked_s.get(node.name, now_s)
         self._looked_s[node.name] = now_s
         counts_s = 0.0 if self._simulation.disturbed() else passed_s
+        across_s = self._across_s[node.service.agent.plan.group.vehicle_class]
         for vehicle in node.service.agent.vehicles.values():
             cell, waited_s = self._waited_s.get(vehicle.id, (-1, 0.0))
             waits = vehicle.state in (VehicleState.FOLLOWING, VehicleState.WAITING)
             waits = waits and not node.service.agent.stopped(vehicle.id)
             waited_s = waited_s + counts_s if waits and cell == vehicle.cell else 0.0
             self._waited_s[vehicle.id] = (vehicle.cell, waited_s)
-            if waited_s > self.longest_s:
-                self.longest_s, self.longest = waited_s, (now_s, vehicle.id, vehicle.cell)
+            wait_s = waited_s - across_s.item(vehicle.cell)
+            if wait_s > self.longest_s:
+                self.longest_s, self.longest = wait_s, (now_s, vehicle.id, vehicle.cell)
 
 
 class Routed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from launch_scripts.world.service import TICK_HZ, TargetsService
+from shared_map.prepared_classes import load_classes
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -18,6 +19,7 @@ from swarm.runtime.run_secret import authenticator_of
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Moves all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
     terrain = load_terrain(setup)
+    load_classes(setup, terrain)
     truth = load_truth(setup, terrain)
     inbox = Inbox()
     network = setup.scenario.network

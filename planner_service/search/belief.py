@@ -56,6 +56,8 @@ class Belief:
         quick, usual = np.percentile(self._crossing_s[blocks.open], (1, 50)).tolist()
         self._most_s: float = _MOST_MOVED * max(quick, 1e-9)
         self._turns_per_s = TURNS_PER_BLOCK / max(usual, 1e-9)
+        opened = blocks.open.astype(np.float32)
+        self._goes_on = np.stack([blocks.neighbours(opened, direction, 0.0) for direction in range(8)])
         self.mass: Floats = np.zeros((8, *blocks.shape), np.float32)
         if at is None or not blocks.open[at]:
             self.elapsed_s = elapsed_s
@@ -103,7 +105,7 @@ class Belief:
             away = mass[heading] * leaving
             if heading % 2:
                 away *= np.float32(math.sqrt(0.5))
-            moved = away * blocks.steps[heading]
+            moved = away * self._goes_on[heading]
             np.subtract(mass[heading], away, out=driven[heading])
             away -= moved
             stuck += away
@@ -123,14 +125,15 @@ class Belief:
         places_m  (east, south) from the grid's corner; one that is no number or outside sees nothing
         range_m   of their sensors
         """
-        looked = np.zeros(self.blocks.shape, np.bool_)
+        left = np.ones(self.blocks.shape, np.float32)
         for east_m, south_m in places_m:
-            found = self.blocks.within(east_m, south_m, range_m)
+            found = self.blocks.seen_from(east_m, south_m, range_m)
             if found is not None:
-                rows, cols, inside = found
-                looked[rows, cols] |= inside
+                rows, cols, share = found
+                left[rows, cols] *= np.float32(1.0) - share
+        looked = left < 1.0
         if looked.any():
-            self.mass[:, looked] = 0.0
+            self.mass *= left
             self._normalise(looked)
 
     def _normalise(self, looked: Bools) -> None:

@@ -6,18 +6,15 @@ and sends all to the same place, drawing spreads them without negotiation. Times
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planner_service.search.belief import Belief
 from planner_service.search.blocks import Blocks, blocks_of
 from planner_service.search.ways import Way, Ways
-from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Bools, Floats
 from swarm.wire.routes import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, RouteBatch
 
@@ -27,6 +24,9 @@ APART_BLOCKS = 3
 """Around a place that a vehicle has been given, no other is given one."""
 KEPT_SHARE = 0.3
 """A place is given up when no more than this share of the belief around it is left."""
+IDLE_S = 300.0
+"""A place at which nothing is believed is given only to a vehicle that can reach no other. It is given up after so
+long: by then there may be one."""
 STEP_S = 30.0
 """Of the belief, at most; less where blocks are small."""
 MOST_GOALS = 4096
@@ -34,20 +34,32 @@ MOST_GOALS = 4096
 _GROWN_CELLS = 1 << 20
 """Cells that may be grown between two ticks: so many decisions are taken, the rest wait."""
 _MOST_DECISIONS = 8
+_STANDS = 1e30
+"""Slowness of a target that stands still, as a finite number."""
 
 
 @dataclass(slots=True, eq=False)
 class _Goal:
     """Where one vehicle is to look.
 
+    ways         of the vehicle's class
     mass         belief of the block and those around it when it was given
     map_version  which the way was found on
+    age_s        since then
     """
 
     block: tuple[int, int]
+    ways: Ways
     way: Way
     mass: float
     map_version: int
+    age_s: float = 0.0
+
+    def is_worth(self, belief: Belief) -> bool:
+        """Whether the place is still worth the way."""
+        if self.mass > 0.0:
+            return belief.near(self.block) >= KEPT_SHARE * self.mass
+        return self.age_s < IDLE_S
 
 
 class Searcher:
@@ -55,13 +67,13 @@ class Searcher:
 
     Parameters
     ----------
-    costs : the cell costs of the planner's tree, kept up to date by their owner
+    ways : of the vehicles by whose map the target moves
     range_m : how far vehicles see a target
     slowness : how many times as long as a vehicle the target takes for a cell
     seed : decides what is drawn
     """
 
-    def __init__(self, costs: CostGrid, range_m: float, slowness: float, seed: str) -> None:
+    def __init__(self, ways: Ways, range_m: float, slowness: float, seed: str) -> None:
         self.belief: Belief | None = None
         """None while it does not search."""
         self.decisions = 0
@@ -69,11 +81,11 @@ class Searcher:
         self._range_m = range_m
         self._slowness = slowness
         self._chance = random.Random(seed)
-        self._ways = Ways(costs)
+        self._ways = ways
         self._goals: dict[str, _Goal] = {}
         """Vehicle -> where it is to look."""
         self._waited_s = 0.0
-        self._left = self._most = max(1, min(_GROWN_CELLS // costs.grid.cells, _MOST_DECISIONS))
+        self._left = self._most = max(1, min(_GROWN_CELLS // ways.grid.cells, _MOST_DECISIONS))
 
     @property
     def active(self) -> bool:
@@ -101,19 +113,18 @@ class Searcher:
         at = arrival_s = None
         if cell is not None and self._ways.passable(cell):
             at = blocks.of_cell(cell)
-            arrival_s = self._arrivals(blocks, cell, at)
+            arrival_s = self._arrivals(blocks, cell)
         self.belief = Belief(blocks, self._slowness, at, arrival_s, age_s)
 
-    def _arrivals(self, blocks: Blocks, cell: int, at: tuple[int, int]) -> NDArray[np.float64]:
-        """(rows, cols), s after the target was on a cell when it can be in each block at the earliest: it need not
-        come to the middle."""
+    def _arrivals(self, blocks: Blocks, cell: int) -> Floats:
+        """float32 (rows, cols), s after the target was on a cell when it can be in each block at the earliest: on
+        any cell of it, by the cheapest way."""
         self._ways.grow(cell)
-        reach_s = self._ways.costs_s(blocks.places).astype(np.float64)
-        reach_s -= blocks.pace_s_per_m * (blocks.side_m * math.sqrt(0.5))
-        with np.errstate(invalid="ignore"):
-            arrival_s: NDArray[np.float64] = np.maximum(reach_s, 0.0) * self._slowness
-        arrival_s[np.isnan(arrival_s)] = 0.0
-        arrival_s[at] = 0.0
+        # A way is priced by the cells that it enters, and this one is driven the other way round: the cell where it
+        # begins is not entered.
+        first_s = self._ways.step_s(cell)
+        arrival_s: Floats = np.maximum(blocks.lowest(self._ways.costs_s) - first_s, 0.0)
+        arrival_s[arrival_s > 0.0] *= min(self._slowness, _STANDS)
         return arrival_s
 
     def end(self) -> None:
@@ -130,11 +141,12 @@ class Searcher:
         self._waited_s += max(elapsed_s, 0.0)
         if self._waited_s < min(belief.step_s, STEP_S):
             return
-        belief.predict(self._waited_s)
-        self._waited_s = 0.0
+        waited_s, self._waited_s = self._waited_s, 0.0
+        belief.predict(waited_s)
         belief.seen(places_m, self._range_m)
-        for id in [id for id, goal in self._goals.items() if belief.near(goal.block) < KEPT_SHARE * goal.mass]:
-            del self._goals[id]
+        for goal in self._goals.values():
+            goal.age_s += waited_s
+        self._goals = {id: goal for id, goal in self._goals.items() if goal.is_worth(belief)}
 
     def wants_place(self, vehicle: str) -> bool:
         """Whether a vehicle has no place to look at."""
@@ -145,65 +157,92 @@ class Searcher:
         """Whether another place may be given before the next tick."""
         return self._left > 0
 
-    def forget_all_but(self, vehicles: Iterable[str]) -> None:
-        """Others look for another target now."""
+    def forget_all_but(self, ways: Ways, vehicles: Iterable[str]) -> None:
+        """Others of the class with these ways look for another target now."""
         kept = set(vehicles)
-        self._goals = {id: goal for id, goal in self._goals.items() if id in kept}
+        self._goals = {id: goal for id, goal in self._goals.items() if goal.ways is not ways or id in kept}
 
-    def route(self, vehicle: str | None, cell: int, max_cells: int, map_version: int) -> RouteBatch:
+    def route(self, ways: Ways, vehicle: str | None, cell: int, max_cells: int, map_version: int) -> RouteBatch:
         """One route to the place where a vehicle on a cell is to look: SEARCHING, with an infinite cost and no
         steps where it has to ask again.
 
-        vehicle  None for somebody who only asks, and keeps no place
+        ways         of the vehicle's class
+        vehicle      None for somebody who only asks, and keeps no place
+        map_version  of these ways
         """
         asked = np.array([cell], np.int64)
-        grid = self._ways.grid
+        grid = ways.grid
         if not 0 <= cell < grid.cells:
             return RouteBatch.none(asked, OUTSIDE)
-        if not self._ways.passable(cell):
+        if not ways.passable(cell):
             return RouteBatch.none(asked, LETHAL_START)
         goal = None if vehicle is None else self._goals.get(vehicle)
         if goal is not None and goal.map_version == map_version and cell in goal.way.cells[:-1]:
-            return self._ways.route(goal.way, goal.way.cells.index(cell), max_cells)
+            return ways.route(goal.way, goal.way.cells.index(cell), max_cells)
         if self.belief is None or self._left <= 0:
             return RouteBatch.none(asked, SEARCHING)
         self._left -= 1
-        self._ways.grow(cell)
-        cost_s = self._ways.costs_s(self.belief.blocks.places)
-        if goal is not None and 0 < cost_s[goal.block] < np.inf:
+        ways.grow(cell)
+        cost_s = self.belief.blocks.lowest(ways.costs_s)
+        if goal is not None and cell != goal.way.cells[-1] and cost_s[goal.block] < np.inf:
             block, mass = goal.block, goal.mass
         else:
             drawn = self._draw(vehicle, cell, cost_s)
-            if drawn is None:
-                return RouteBatch.none(asked, UNREACHABLE)
             block, mass = drawn, self.belief.near(drawn)
             self.decisions += 1
-        way = self._ways.way_to(int(self.belief.blocks.places[block]))
+        place = self._place(ways, block, cell)
+        if place is None:
+            return RouteBatch.none(asked, UNREACHABLE)
+        way = ways.way_to(place)
         if vehicle is not None:
             self._goals.pop(vehicle, None)
             if len(self._goals) >= MOST_GOALS:
                 del self._goals[next(iter(self._goals))]
-            self._goals[vehicle] = _Goal(block, way, mass, map_version)
-        return self._ways.route(way, 0, max_cells)
+            age_s = goal.age_s if goal is not None and goal.block == block else 0.0
+            self._goals[vehicle] = _Goal(block, ways, way, mass, map_version, age_s)
+        return ways.route(way, 0, max_cells)
 
-    def _draw(self, vehicle: str | None, cell: int, cost_s: Floats) -> tuple[int, int] | None:
-        """The block where to look: not the vehicle's own, and apart from the others' if there is another. None
-        where no way leads to any."""
+    def _draw(self, vehicle: str | None, cell: int, cost_s: Floats) -> tuple[int, int]:
+        """The block where to look: apart from the others' if there is another. The vehicle's own is drawn only if
+        it sees a part of it, or can reach no other.
+
+        cost_s  float32 (rows, cols), from the vehicle to each block
+        """
         belief = self.belief
         assert belief is not None
-        blocks = belief.blocks
-        there = (cost_s > 0.0) & (cost_s < np.inf)
-        there[blocks.of_cell(cell)] = False
-        weights = np.where(there, belief.total / (cost_s.astype(np.float64) + OFFSET_S), 0.0)
-        apart = weights * ~self._taken(blocks, vehicle)
-        anywhere = np.where(there, blocks.share, 0.0) / (np.where(there, cost_s, 0.0) + OFFSET_S)
-        for each in (apart, weights, anywhere):
+        blocks, own = belief.blocks, belief.blocks.of_cell(cell)
+        there = cost_s < np.inf
+        if blocks.seen_whole(self._range_m):
+            there[own] = False
+        nearness = np.where(there, 1.0 / (np.where(there, cost_s, 0.0).astype(np.float64) + OFFSET_S), 0.0)
+        weights = nearness * belief.total
+        for each in (weights * ~self._taken(blocks, vehicle), weights, nearness * blocks.share):
             sums = np.cumsum(each.reshape(-1), dtype=np.float64)
             if sums[-1] > 0.0:
                 at = int(np.searchsorted(sums, self._chance.random() * sums[-1], side="right"))
                 row, col = divmod(min(at, int(np.flatnonzero(each.reshape(-1))[-1])), blocks.shape[1])
                 return row, col
-        return None
+        return own
+
+    def _place(self, ways: Ways, block: tuple[int, int], cell: int) -> int | None:
+        """A cell of a block from which to look: the one nearest to the middle if all is seen from there, or else
+        any. None if there is none but the vehicle's own."""
+        assert self.belief is not None
+        blocks = self.belief.blocks
+        rows, cols = blocks.cells_of(block)
+        reached = ways.costs_s[rows, cols] < np.inf
+        if block == blocks.of_cell(cell):
+            row, col = divmod(cell, blocks.grid.cols)
+            reached[row - rows.start, col - cols.start] = False
+        downs, rights = np.nonzero(reached)
+        if not len(downs):
+            return None
+        if blocks.seen_whole(self._range_m):
+            middle = (blocks.side_cells - 1) / 2
+            at = int(((downs - middle) ** 2 + (rights - middle) ** 2).argmin())
+        else:
+            at = self._chance.randrange(len(downs))
+        return int((rows.start + downs[at]) * blocks.grid.cols + cols.start + rights[at])
 
     def _taken(self, blocks: Blocks, vehicle: str | None) -> Bools:
         """bool (rows, cols): around the places of other vehicles."""
@@ -211,9 +250,9 @@ class Searcher:
         for id, goal in self._goals.items():
             if id != vehicle:
                 row, col = goal.block
-                side_m = blocks.side_m
-                rows, cols, inside = blocks.within(
-                    (col + 0.5) * side_m, (row + 0.5) * side_m, APART_BLOCKS * side_m
-                ) or (slice(0), slice(0), np.zeros((0, 0), np.bool_))
-                taken[rows, cols] |= inside
+                rows = slice(max(row - APART_BLOCKS, 0), row + APART_BLOCKS + 1)
+                cols = slice(max(col - APART_BLOCKS, 0), col + APART_BLOCKS + 1)
+                down, right = np.ogrid[rows.start : rows.stop, cols.start : cols.stop]
+                near = (down - row) ** 2 + (right - col) ** 2 <= APART_BLOCKS**2
+                taken[rows, cols] |= near[: taken[rows].shape[0], : taken[:, cols].shape[1]]
         return taken

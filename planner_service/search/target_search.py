@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.search.searcher import OFFSET_S, Searcher
+from planner_service.search.ways import Ways
+from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Floats
 from swarm.clock import NS_PER_S
+from swarm.config.classes import least_sense_range_m
 from swarm.config.scenario import Scenario, ids_of
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
@@ -32,7 +35,7 @@ class Hidden:
     capture_range_m  how near captures it
     slowness         how many times as long as a vehicle it takes for a cell, at least; inf if it stands still
     jumps            whether it is somewhere else once it is captured
-    seed             of the run and the target
+    seed             of the run, the target and the planner
     """
 
     sense_range_m: float
@@ -43,13 +46,15 @@ class Hidden:
 
 
 class TargetSearch:
-    """Begins the search when nobody sees the target, and ends it with a sighting.
+    """Begins the search when nobody sees the target, and ends it with a sighting. One for all vehicles that chase
+    the target, whatever their class.
 
+    costs       cell costs of the class "ground", by which the target moves, kept up to date by their owner
     time_scale  seconds on the terrain per second
     """
 
-    def __init__(self, hidden: Hidden, searcher: Searcher, time_scale: float) -> None:
-        self.searcher = searcher
+    def __init__(self, hidden: Hidden, costs: CostGrid, time_scale: float) -> None:
+        self.searcher = Searcher(Ways(costs), hidden.sense_range_m, hidden.slowness, hidden.seed)
         self.time_scale = time_scale
         self.searches = 0
         """How often it has begun to."""
@@ -108,13 +113,18 @@ class TargetSearch:
         look_m = max(self._hidden.sense_range_m / 2, min(self._hidden.capture_range_m, self._hidden.sense_range_m))
         return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
 
-    def routes(self, cells: Sequence[int], vehicles: Sequence[str], max_cells: int, version: int) -> RouteBatch:
-        """A route to where each is to look, in order."""
+    def routes(
+        self, ways: Ways, cells: Sequence[int], vehicles: Sequence[str], max_cells: int, version: int
+    ) -> RouteBatch:
+        """A route to where each is to look, in order.
+
+        ways     of the vehicles' class; version: of the map that these are on
+        """
         named: Sequence[str | None] = vehicles or [None] * len(cells)
         found: list[Route] = []
         for n, cell in enumerate(cells):
             vehicle = named[n] if n < len(named) else None
-            found.append(self.searcher.route(vehicle, cell, max_cells, version)[0])
+            found.append(self.searcher.route(ways, vehicle, cell, max_cells, version)[0])
         return RouteBatch.of(found)
 
     def costs_s(self, to_last_s: Floats, open_: NDArray[np.bool_]) -> Floats:
@@ -133,16 +143,16 @@ def is_place(route: Route) -> bool:
     return route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
 
 
-def hidden_target(scenario: Scenario, target: str) -> Hidden:
-    """What a scenario says of a target that only vehicles see."""
+def hidden_target(scenario: Scenario, target: str, incarnation: int) -> Hidden:
+    """What a scenario says of a target that only vehicles see, for one life of its planner."""
     config = next(each for each in scenario.targets if target in ids_of(each))
     speed_m_per_s = config.speed_m_per_s
     # A target never outruns a vehicle: that of an outside process is taken to be as quick.
     slowness = math.inf if speed_m_per_s <= 0 else max(1.0, scenario.cost.flat_speed_m_per_s / speed_m_per_s)
     return Hidden(
-        sense_range_m=scenario.vehicles.sense_range_m,
+        sense_range_m=least_sense_range_m(scenario),
         capture_range_m=scenario.vehicles.capture_range_m,
         slowness=slowness,
         jumps=config.caught == "jump" and config.is_simulated,
-        seed=f"{scenario.seed}/{target}",
+        seed=f"{scenario.seed}/{target}/{incarnation}",
     )

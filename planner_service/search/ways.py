@@ -69,12 +69,16 @@ class Ways:
         back.climbs = (self._depths, *climbs[1:])
         return back
 
-    def costs_s(self, cells: NDArray[np.int64]) -> Floats:
-        """float32, s: between the cell of the last growth and these; inf where there is no way, or for -1."""
-        found: Floats = np.full(cells.shape, np.inf, np.float32)
-        known = cells >= 0
-        found[known] = self._cost[self._costs.pad_all(cells[known])]
-        return found
+    def step_s(self, cell: int) -> float:
+        """s: what a diagonal step into a passable cell takes."""
+        return float(self._costs.cell_cost[self._costs.pad(cell)] * self._costs.diagonal)
+
+    @property
+    def costs_s(self) -> Floats:
+        """float32 (rows, cols), s: from the cell of the last growth to all others; inf where there is no way."""
+        grid = self.grid
+        costs_s: Floats = self._cost.reshape(grid.rows + 2, self._costs.stride)[1:-1, 1:-1]
+        return costs_s
 
     def way_to(self, goal: int) -> Way:
         """The way from the cell of the last growth to one that is not inf by `costs_s`."""

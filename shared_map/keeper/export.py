@@ -11,9 +11,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.marks import Statements, fault, mark_set, statements
+from shared_map.learning.factors import name_of
+from shared_map.learning.words import Said, stated, told
+from shared_map.replication.marks import Statements, fault, is_zone, mark_set, statements
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.tiles import grid_cells, tile_cells, tile_corners
+from shared_map.replication.tiles import beyond_tile, grid_cells, tile_cells, tile_corners
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.wire.messages.marks import MarkSet
@@ -32,13 +34,25 @@ class _Mark(msgspec.Struct, array_like=True, gc=False):
     until_ns: int = FOREVER
 
 
+class _Learned(msgspec.Struct, array_like=True, gc=False):
+    """What an author has measured of one kind of ground (`shared_map.learning`), and how people call that."""
+
+    key: int
+    kind: str
+    cells: int
+    mean: int
+    variance: int
+
+
 class _Set(msgspec.Struct):
     author: str
     group: str
     tile: int
     epoch: int
     seq: int
-    marks: list[_Mark]
+    marks: list[_Mark] = []
+    learned: list[_Learned] = []
+    stamp_ns: int = 0
 
 
 class _Export(msgspec.Struct):
@@ -49,7 +63,8 @@ class _Export(msgspec.Struct):
 
 
 def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
-    """Every set, readable: [row, col, kind, pace or null, stamp_ns] and, where it ends by itself, when."""
+    """Every set, readable: marks as [row, col, kind, pace or null, stamp_ns] and, where one ends by itself, when;
+    what was learned as [number, kind of ground, cells, mean and variance of 65536 ln(driven / prior pace)]."""
     listed = [
         {
             "author": each.author,
@@ -57,14 +72,19 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
             "tile": each.tile,
             "epoch": each.epoch,
             "seq": each.seq,
-            "marks": _marks(each, grid),
+            **({"marks": _marks(each, grid)} if each.tile < grid.tiles else _learned(each)),
         }
         for each in sorted(sets, key=lambda each: (each.tile, each.author))
-        if each.tile < grid.tiles  # what is learned is about no cell
     ]
     lines = ",\n ".join(json.dumps(each) for each in listed)  # a line a set; a line a mark takes thrice that
     head = json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid)})
     return f'{head[:-1]},\n"sets": [\n {lines}\n]}}\n'
+
+
+def _learned(each: MarkSet) -> dict[str, Any]:
+    said = told(each) or {}
+    newest_ns = max(statements(each).stamps_ns.tolist(), default=0)
+    return {"learned": [[key, name_of(key), *said[key]] for key in sorted(said)], "stamp_ns": newest_ns}
 
 
 def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
@@ -103,6 +123,10 @@ def from_json(text: str | bytes) -> tuple[str, GridSpec, list[MarkSet]]:
 
 
 def _set(each: _Set, grid: GridSpec) -> MarkSet:
+    if each.tile == beyond_tile(grid):
+        return _word(each)
+    if each.learned:
+        raise ValueError(f"what is learned belongs to tile {beyond_tile(grid)}, not to tile {each.tile}")
     marks = sorted(each.marks, key=lambda mark: (mark.row, mark.col))
     for mark in marks:
         if not grid.inside(mark.row, mark.col):
@@ -122,6 +146,19 @@ def _set(each: _Set, grid: GridSpec) -> MarkSet:
     reason = fault(made, grid)
     if reason is not None:
         raise ValueError(reason)
+    return made
+
+
+def _word(each: _Set) -> MarkSet:
+    said = {one.key: Said(one.cells, one.mean, one.variance) for one in each.learned}
+    if each.marks or len(said) < len(each.learned):
+        raise ValueError(f"tile {each.tile} holds what is learned, each kind of ground once, and no marks")
+    made = mark_set(
+        each.author, each.group, each.tile, each.epoch, each.seq, Statements(*stated(said, each.stamp_ns))
+    )
+    made.check()
+    if is_zone(each.author) or told(made) != said:
+        raise ValueError("what is learned is not as an author says it")
     return made
 
 

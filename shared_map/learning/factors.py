@@ -51,34 +51,47 @@ def keys_of(classes: Bytes, elevation_m: Floats, resolution_m: float) -> Bytes:
 
 def name_of(key: int) -> str:
     """A kind of ground for people, such as `forest 10-15`."""
-    kind, low = TerrainClass(key // SLOPE_BINS).name.lower(), key % SLOPE_BINS * SLOPE_BIN_DEG
+    number, low = key // SLOPE_BINS, key % SLOPE_BINS * SLOPE_BIN_DEG
+    if number not in tuple(TerrainClass):
+        return f"unknown {key}"
+    kind = TerrainClass(number).name.lower()
     return f"{kind} {low}-{low + SLOPE_BIN_DEG}" if key % SLOPE_BINS < SLOPE_BINS - 1 else f"{kind} {low}+"
 
 
 def log_steps(said: Sequence[Said]) -> int:
-    """The factor of one kind of ground as a power of 1.1, by the words of all authors about it, in any order.
+    """The factor of one kind of ground as a power of 1.1, by the words of all authors about it, in any order."""
+    cells, mean, variance = estimate(said)
+    if cells < _FEWEST_CELLS or mean * mean * cells <= _GATE * variance * ONE:
+        return 0
+    shrunk = _round_div(mean * _PRIOR_VARIANCE * cells, _PRIOR_VARIANCE * cells + variance)
+    return max(-MOST_STEPS, min(MOST_STEPS, _round_div(shrunk, STEPS_PER_10TH)))
 
-    Five authors or more that know five cells each count by their median: less than half of them cannot move it
-    beyond what an honest one says. Of fewer none has a weight above twice the lower median of theirs.
+
+def estimate(said: Sequence[Said]) -> Said:
+    """What all authors together say of one kind of ground: the cells that count, the mean, and the variance of one
+    cell. No cells if nobody says anything.
+
+    No author's mean counts for more than the largest factor there is. Five authors or more that know five cells
+    each count by their median: less than half of them cannot move it beyond what an honest one says. Of fewer none
+    has a weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1) of
+    the largest factor at most where all know as many cells.
     """
     words = sorted(each for each in said if each.cells > 0)
     knowing = [each for each in words if each.cells >= _FEWEST_CELLS]
     if not words:
-        return 0
+        return Said(0, 0, _USUAL_VARIANCE)
     if len(knowing) >= _MEDIAN_FROM:
-        mean = _median([each.mean for each in knowing])
+        mean = _within(_median([each.mean for each in knowing]))
         variance = _median([each.variance for each in knowing])
         cells = len(knowing) * _median([each.cells for each in knowing])
     else:
-        cap = 2 * words[(len(words) - 1) // 2].cells if len(words) > 1 else MOST_CELLS
-        cells, mean, variance = _together(words, [min(each.cells, cap) for each in words])
-    if cells < _FEWEST_CELLS:
-        return 0
+        # Of those that know something: one that has hardly begun must not take the weight of all others.
+        counted = [each.cells for each in knowing or words]
+        cap = 2 * counted[(len(counted) - 1) // 2] if len(words) > 1 else MOST_CELLS
+        bounded = [each._replace(mean=_within(each.mean)) for each in words]
+        cells, mean, variance = _together(bounded, [min(each.cells, cap) for each in words])
     variance = (variance * cells + _USUAL_VARIANCE * _USUAL_CELLS) // (cells + _USUAL_CELLS)
-    if mean * mean * cells <= _GATE * variance * ONE:
-        return 0
-    shrunk = _round_div(mean * _PRIOR_VARIANCE * cells, _PRIOR_VARIANCE * cells + variance)
-    return max(-MOST_STEPS, min(MOST_STEPS, _round_div(shrunk, STEPS_PER_10TH)))
+    return Said(cells, mean, variance)
 
 
 def factors_of(words: Sequence[Mapping[int, Said]]) -> Floats:
@@ -131,6 +144,12 @@ def _of_classes(words: Sequence[Mapping[int, Said]]) -> dict[int, list[Said]]:
         for kind, parts in of.items():
             by_class.setdefault(kind, []).append(_together(parts, [part.cells for part in parts]))
     return by_class
+
+
+def _within(mean: int) -> int:
+    """A mean no further from 0 than the largest factor."""
+    most = MOST_STEPS * STEPS_PER_10TH
+    return max(-most, min(most, mean))
 
 
 def _together(parts: Sequence[Said], weights: Sequence[int]) -> Said:

@@ -45,7 +45,7 @@ class CostSink(Protocol):
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> object: ...
 
-    def learn(self, words: Sequence[MarkSet]) -> object: ...
+    def learn(self, words: Sequence[MarkSet]) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +103,10 @@ class MapReplica:
         self.over_capacity: str | None = None
         self.zones_version = 0
         self._cost_map = cost_map
+        self._learn_due_ns: int | None = (
+            None  # when to look again at words that came too soon; None: there are none
+        )
+        self._learned_ns = -_LEARN_EVERY_NS  # when words last changed the cost map
         self._clock = HybridClock()
         self._publish_ns = int(NS_PER_S / publish_hz)
         self._pending: dict[int, None] = {}  # own tiles whose newest set has not been published, in order
@@ -201,8 +205,7 @@ class MapReplica:
         if beyond in before:
             # Nothing there is about a cell, so no set of it has winners.
             changes = [TileChange(c.tile, [], []) if c.tile == beyond else c for c in changes]
-            if self._cost_map is not None:
-                self._cost_map.learn(self.held.of_tile(beyond))
+            self._learn()
         won = new_winners(self.grid, changes, before_ns, self._now_ns)
         if len(won.cells):
             self.counts["marks_merged"] += len(won.cells)
@@ -213,6 +216,16 @@ class MapReplica:
                 if newest_ns != NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
                     self._newest_ns = newest_ns
         return won.counts
+
+    def _learn(self) -> None:
+        """Bring the cost map to the words that are held; later if it was changed by words just now."""
+        if self._cost_map is None:
+            return
+        self._learn_due_ns = self._learned_ns + _LEARN_EVERY_NS
+        if self._now_ns >= self._learn_due_ns:
+            self._learn_due_ns = None
+            if self._cost_map.learn(self.held.of_tile(beyond_tile(self.grid))):
+                self._learned_ns = self._now_ns
 
     @property
     def now_ns(self) -> int:
@@ -254,6 +267,8 @@ class MapReplica:
     def tick(self, now_ns: int) -> list[PublishSet]:
         """Let statements expire. Returns the own sets that may be published now."""
         self._expire(now_ns)
+        if self._learn_due_ns is not None and self._now_ns >= self._learn_due_ns:
+            self._learn()
         self.held.tombstones.expire(now_ns)
         if self.author is None:
             return []
@@ -439,3 +454,7 @@ class MapReplica:
 
 _MANY = 64
 """Fewer sets are merged one by one."""
+_LEARN_EVERY_NS = 5 * NS_PER_S
+"""Words of what is learned change the cost map at most this often, whoever says them: each change is one of the
+whole map, and grows every tree anew. What is held alone decides what they change it to, so replicas that hold the
+same are equal after this time at the latest."""

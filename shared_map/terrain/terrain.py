@@ -336,20 +336,20 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
     except (KeyError, TypeError, ValueError) as error:
         raise TerrainError(f"prepared terrain {folder / _META} is damaged ({error}); delete the folder") from error
     shape = (grid.rows, grid.cols)
-    pace = _read_array(folder, "pace", shape, np.float32)
-    elevation_m = _read_array(folder, "elevation", shape, np.float32)
+    pace = read_array(folder, "pace", shape, np.float32)
+    elevation_m = read_array(folder, "elevation", shape, np.float32)
     climb = None
     if steepest is not None:
-        factors = _read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
+        factors = read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
         climb = Climb(grid, elevation_m, factors, float(steepest))
     return Terrain(
         grid=grid,
         elevation_m=elevation_m,
-        photo=_read_array(folder, "photo", (*shape, 3), np.uint8),
+        photo=read_array(folder, "photo", (*shape, 3), np.uint8),
         pace_s_per_m=pace,
-        classes=_read_array(folder, "classes", shape, np.uint8),
+        classes=read_array(folder, "classes", shape, np.uint8),
         digest=digest,
-        ground_s_per_m=_read_array(folder, "ground", shape, np.float32) if has_ground else pace,
+        ground_s_per_m=read_array(folder, "ground", shape, np.float32) if has_ground else pace,
         vehicle_radius_m=radius,
         climb=climb,
         notes=notes,
@@ -362,7 +362,7 @@ def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
     if meta is None:
         return None
     grid = GridSpec(**meta["grid"])
-    return _read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
+    return read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
 
 
 def _read_meta(folder: Path, key: str) -> dict[str, Any] | None:
@@ -379,7 +379,8 @@ def _read_meta(folder: Path, key: str) -> dict[str, Any] | None:
     return meta
 
 
-def _read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
+def read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
+    """An array of a prepared folder, mapped read-only. Raises TerrainError if it is not as described."""
     path = folder / f"{name}.npy"
     try:
         array = open_array(path)
@@ -412,7 +413,7 @@ def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
     """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
     meta = None if setup.run_dir is None else _read_meta(setup.run_dir, scenario_key(setup.scenario))
     if setup.run_dir is not None and meta is not None and "homes" in meta["arrays"]:
-        return _read_array(setup.run_dir, "homes", (terrain.grid.rows, terrain.grid.cols), np.bool_)
+        return read_array(setup.run_dir, "homes", (terrain.grid.rows, terrain.grid.cols), np.bool_)
     return homes_of(terrain.pace_s_per_m, truth)
 
 

@@ -12,7 +12,7 @@ from msgspec import Meta
 from swarm.config.cost_rules import PRESETS, check_cost
 from swarm.config.explain import choice
 from swarm.config.ground import CostConfig
-from swarm.config.values import Name, Section
+from swarm.config.values import Name, Positive, Section
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -29,15 +29,22 @@ SHARED = ("zones", "layers", "directional")
 class ClassConfig(Section, frozen=True, kw_only=True):
     """A class of vehicles beside "ground", that of `[cost]` and `[vehicles]`: groups name theirs, and queries may.
 
-    name               what groups and queries call it
-    cost               what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
-                           and `directional` are those of `[cost]`
-    max_speed_m_per_s  none of the speeds of its cost is more than this: level, on roads, downhill
+    name                 what groups and queries call it
+    cost                 what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
+                             and `directional` are those of `[cost]`
+    max_speed_m_per_s    it is never faster than this: level, on roads, downhill, whatever is marked or learned
+    sense_range_m        as `vehicles.sense_range_m`, which counts if this is not given
+    accel_m_per_s2       it speeds up no quicker, and brakes no harder before turns and where it has to stop
+    turn_rate_deg_per_s  it turns no quicker, so it takes turns slowly. With this or `accel_m_per_s2` it drives by
+                         these, not by `vehicles.dynamics`
     """
 
     name: Name
     cost: CostConfig = CostConfig()
     max_speed_m_per_s: Annotated[float, Meta(ge=0.01, le=340)] | None = None
+    sense_range_m: Positive | None = None
+    accel_m_per_s2: Annotated[float, Meta(ge=0.001, le=1000)] | None = None
+    turn_rate_deg_per_s: Annotated[float, Meta(ge=0.1, le=36_000)] | None = None
 
 
 def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
@@ -110,12 +117,21 @@ def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
 
 
 def of_class(scenario: Scenario, name: str) -> Scenario:
-    """The scenario as it is for vehicles of one class: its cost is theirs. That of `GROUND` is the scenario itself.
-    Raises ConfigError on an unknown class."""
+    """The scenario as it is for vehicles of one class: its cost is theirs, and how far they see. `GROUND` is the
+    scenario itself. Raises ConfigError on an unknown class."""
     own = class_named(scenario, name)
     if own is None:
         return scenario
-    return msgspec.structs.replace(scenario, cost=_limited(own))
+    vehicles = scenario.vehicles
+    if own.sense_range_m is not None:
+        vehicles = msgspec.structs.replace(vehicles, sense_range_m=own.sense_range_m)
+    return msgspec.structs.replace(scenario, cost=_limited(own), vehicles=vehicles)
+
+
+def least_sense_range_m(scenario: Scenario) -> float:
+    """How far vehicles of every class that drives see."""
+    driven = {group.vehicle_class for group in scenario.groups}
+    return min(of_class(scenario, name).vehicles.sense_range_m for name in sorted(driven))
 
 
 def _limited(own: ClassConfig) -> CostConfig:

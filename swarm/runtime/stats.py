@@ -25,6 +25,8 @@ UNPROVEN_TO = "followed_unproven_to"
 UNPROVEN_OF = "followed_unproven_of"
 """The same per vehicle."""
 
+LEARNED = "learned."
+"""Gauges, each followed by a class of ground: by what its prior pace is multiplied, as vehicles have measured."""
 ENDED = "ended"
 """Gauge: 1 in the last words of a process that ends because it was asked to."""
 RESTARTS = "restarts"

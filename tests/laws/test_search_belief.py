@@ -13,12 +13,14 @@ from support.effort import few
 
 from planner_service.search.belief import Belief
 from planner_service.search.blocks import blocks_of
-from planner_service.search.searcher import Searcher
+from planner_service.search.searcher import IDLE_S, Searcher
+from planner_service.search.ways import Ways
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.step_climb import climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, walk
+from swarm.grid import GridSpec, Window, walk
 from swarm.wire.routes import RouteStatus
 
 METRES = 10.0
@@ -81,10 +83,11 @@ def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones
     asked = [int(cell) for cell in chance.integers(-2, rows * cols + 2, 5)]
     told = []
     for _ in range(2):
-        searcher = Searcher(costs, 30.0, 3.0, f"{seed}")
+        ways = Ways(costs)
+        searcher = Searcher(ways, 30.0, 3.0, f"{seed}")
         searcher.begin(pace, last, 60.0)
         searcher.tick(40.0, places)
-        routes = [searcher.route(f"v{n}", cell, 0, 0)[0] for n, cell in enumerate(asked)]
+        routes = [searcher.route(ways, f"v{n}", cell, 0, 0)[0] for n, cell in enumerate(asked)]
         told.append((routes, dict(searcher.goals)))
     (routes, goals), again = told
     assert (routes, goals) == again
@@ -105,20 +108,21 @@ def test_vehicles_are_given_ways_to_places_that_they_can_reach_and_the_same_ones
             assert route.status is RouteStatus.UNREACHABLE
 
 
-def searching_flat_ground(side: int) -> Searcher:
+def searching_flat_ground(side: int) -> tuple[Searcher, Ways]:
     """One that looks for a target which nobody ever saw, with sensors of 50 m."""
     pace = np.full((side, side), 0.2, np.float32)
     costs = CostGrid(GridSpec(side, side, METRES), PlannerConfig())
     costs.load(pace)
-    searcher = Searcher(costs, 50.0, 2.0, "s")
+    ways = Ways(costs)
+    searcher = Searcher(ways, 50.0, 2.0, "s")
     searcher.begin(pace, None, 0.0)
-    return searcher
+    return searcher, ways
 
 
 def test_vehicles_look_at_places_apart_from_each_other() -> None:
-    searcher = searching_flat_ground(200)
+    searcher, ways = searching_flat_ground(200)
     for n in range(8):
-        assert searcher.route(f"v{n}", 100 * 200 + 100 + n, 0, 0)[0].status is RouteStatus.SEARCHING
+        assert searcher.route(ways, f"v{n}", 100 * 200 + 100 + n, 0, 0)[0].status is RouteStatus.SEARCHING
     cells = np.array(list(searcher.goals.values()))
     places = np.stack(np.divmod(cells, 200), axis=1) * METRES
     apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) + 1e9 * np.eye(8)
@@ -126,13 +130,13 @@ def test_vehicles_look_at_places_apart_from_each_other() -> None:
 
 
 def test_a_vehicle_that_comes_late_in_a_tick_is_told_to_ask_again_and_is_told_a_place_in_the_next() -> None:
-    searcher = searching_flat_ground(40)
-    statuses = [searcher.route(f"v{n}", n, 0, 0)[0] for n in range(20)]
+    searcher, ways = searching_flat_ground(40)
+    statuses = [searcher.route(ways, f"v{n}", n, 0, 0)[0] for n in range(20)]
     late = [route for route in statuses if math.isinf(route.cost_s)]
     assert late
     assert all(route.status is RouteStatus.SEARCHING and not route.directions for route in late)
     searcher.tick(0.1, [])
-    assert math.isfinite(searcher.route("v19", 19, 0, 0)[0].cost_s)
+    assert math.isfinite(searcher.route(ways, "v19", 19, 0, 0)[0].cost_s)
 
 
 def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_looked() -> None:
@@ -140,11 +144,12 @@ def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_lo
     grid = GridSpec(100, 100, METRES)
     costs = CostGrid(grid, PlannerConfig())
     costs.load(pace)
-    searcher = Searcher(costs, 100.0, 4.0, "s")
+    ways = Ways(costs)
+    searcher = Searcher(ways, 100.0, 4.0, "s")
     searcher.begin(pace, 5050, 60.0)
-    route = searcher.route("v", 0, 0, 0)[0]
+    route = searcher.route(ways, "v", 0, 0, 0)[0]
     path = walk(grid, route.start, route.directions)
-    rest = searcher.route("v", path[3], 0, 0)[0]
+    rest = searcher.route(ways, "v", path[3], 0, 0)[0]
     assert rest.directions == route.directions[3:]
     goal = searcher.goals["v"]
     row, col = divmod(goal, 100)
@@ -153,6 +158,91 @@ def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_lo
     )
     searcher.tick(60.0, [(col * METRES + x, row * METRES + y) for x in (-100, 0, 100) for y in (-100, 0, 100)])
     assert searcher.wants_place("v")
+
+
+@settings(max_examples=60, deadline=None)
+@given(_SIDES, _SIDES, _SEEDS, st.floats(1, 120), st.integers(1, 700))
+def test_who_stands_where_it_was_sent_to_look_sees_something_of_that_block(
+    rows: int, cols: int, seed: int, range_m: float, most_blocks: int
+) -> None:
+    pace = _pace(rows, cols, seed)
+    costs = CostGrid(GridSpec(rows, cols, METRES), PlannerConfig())
+    costs.load(pace)
+    ways = Ways(costs)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("planner_service.search.blocks.MOST_BLOCKS", most_blocks)
+        searcher = Searcher(ways, range_m, 3.0, f"{seed}")
+        searcher.begin(pace, None, 0.0)
+    assert searcher.belief is not None
+    blocks = searcher.belief.blocks
+    for n, cell in enumerate(np.random.default_rng(seed).choice(np.flatnonzero(np.isfinite(pace)), 4).tolist()):
+        searcher.tick(0.0, [])
+        route = searcher.route(ways, f"v{n}", cell, 0, 0)[0]
+        alone = np.isinf(ways.costs_s).sum() == rows * cols - 1
+        assert (route.status is RouteStatus.UNREACHABLE) == alone, "only who can drive nowhere is told so"
+        if alone:
+            continue
+        row, col = divmod(searcher.goals[f"v{n}"], cols)
+        found = blocks.seen_from((col + 0.5) * METRES, (row + 0.5) * METRES, range_m)
+        assert found is not None
+        shares = np.zeros(blocks.shape)
+        shares[found[:2]] = found[2]
+        share = shares[blocks.of_cell(row * cols + col)]
+        assert share == 1.0 if blocks.seen_whole(range_m) else 0.0 < share <= 1.0
+
+
+def test_a_mark_in_the_middle_of_a_block_does_not_take_it_out_of_the_search() -> None:
+    grid = GridSpec(15, 30, METRES)
+    pace = np.full((15, 30), 0.2, np.float32)
+    costs = CostGrid(grid, PlannerConfig())
+    costs.load(pace)
+    ways = Ways(costs)
+    searcher = Searcher(ways, 150.0, 3.0, "s")  # two blocks
+    searcher.begin(pace, None, 0.0)
+    pace[7, 22] = np.inf
+    costs.apply(pace, [Window(7, 22, 8, 23)])
+    route = searcher.route(ways, "v", 7 * 30 + 7, 0, 1)[0]
+    assert route.status is RouteStatus.SEARCHING
+    assert searcher.goals["v"] % 30 >= 15
+
+
+def test_a_place_at_which_nothing_is_believed_is_given_up_in_time() -> None:
+    pace = np.full((20, 60), 0.2, np.float32)
+    pace[:, 29] = np.inf  # the target is on the other side
+    costs = CostGrid(GridSpec(20, 60, METRES), PlannerConfig())
+    costs.load(pace)
+    ways = Ways(costs)
+    searcher = Searcher(ways, 50.0, 3.0, "s")
+    searcher.begin(pace, 10 * 60 + 45, 60.0)
+    assert searcher.route(ways, "v", 10 * 60 + 5, 0, 0)[0].status is RouteStatus.SEARCHING
+    searcher.tick(IDLE_S / 2, [])
+    assert not searcher.wants_place("v")
+    searcher.tick(IDLE_S / 2, [])
+    assert searcher.wants_place("v")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 20), st.integers(1, 20), _SEEDS, st.floats(15, 90))
+def test_a_target_is_never_taken_to_be_where_it_is_not_because_it_came_there_by_a_quick_lane(
+    rows: int, cols: int, seed: int, range_m: float
+) -> None:
+    pace = _pace(rows, cols, seed)
+    pace[:, :: max(cols // 3, 1)] = 0.02  # roads
+    costs = CostGrid(GridSpec(rows, cols, METRES), PlannerConfig())
+    costs.load(pace)
+    chance = np.random.default_rng(seed)
+    start, goal = (int(each) for each in chance.choice(np.flatnonzero(np.isfinite(pace)), 2))
+    tree = CostToGoTree(costs)
+    tree.grow(goal)
+    ways = Ways(costs)
+    ways.grow(goal)
+    if goal == start or np.isinf(ways.costs_s.flat[start]):
+        return
+    took_s = 3.0 * float(tree.inner(tree.cost)[divmod(start, cols)])
+    searcher = Searcher(ways, range_m, 3.0, "s")
+    searcher.begin(pace, start, took_s * (1 + 1e-5))
+    assert searcher.belief is not None
+    assert searcher.belief.reachable[searcher.belief.blocks.of_cell(goal)]
 
 
 @settings(max_examples=25, deadline=None)
@@ -165,12 +255,13 @@ def test_where_one_can_come_down_and_not_up_nobody_is_sent_to_where_he_stands(se
     costs = CostGrid(grid, PlannerConfig(), climb)
     pace = np.full((12, 30), 0.2, np.float32)
     costs.load(pace)
-    searcher = Searcher(costs, 20.0, 2.0, f"{seed}")
+    ways = Ways(costs)
+    searcher = Searcher(ways, 20.0, 2.0, f"{seed}")
     searcher.begin(pace, None, 0.0)
     for n in range(12):
         for _ in range(80):  # who is told to ask again asks again
             searcher.tick(0.1, [])
-            route = searcher.route(f"v{n}", 30 * n, 0, 0)[0]
+            route = searcher.route(ways, f"v{n}", 30 * n, 0, 0)[0]
             if math.isfinite(route.cost_s):
                 break
         path = walk(grid, route.start, route.directions)

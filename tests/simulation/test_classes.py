@@ -39,6 +39,9 @@ vehicles = 8
 [[classes]]
 name = "walker"
 max_speed_m_per_s = 2.0
+sense_range_m = 40.0
+accel_m_per_s2 = 1.0
+turn_rate_deg_per_s = 120.0
 cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.8, road_speed_m_per_s = 2.0, max_slope_deg = 38.0 }
 [vehicles]
 per_agent = 4

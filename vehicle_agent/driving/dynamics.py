@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from swarm.config.classes import ClassConfig
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
@@ -42,6 +43,8 @@ class Stretch:
     turn_rad       by how much it has turned since the last stretch, -pi to pi, clockwise
     ahead_m        metres to the end of the cells that it was granted, where it stops unless more are granted
     tick_s         seconds on the terrain from one tick to the next
+    left_s         what is left of the tick
+    turns          (metres from here, radians) of each turn on the cells that it was granted
     """
 
     vehicle: str
@@ -50,6 +53,45 @@ class Stretch:
     turn_rad: float
     ahead_m: float
     tick_s: float
+    left_s: float = 0.0
+    turns: tuple[tuple[float, float], ...] = ()
+
+
+class Inertia:
+    """The built-in dynamics of a class with limits of its own, in m/s2 and degrees/s; None is no limit.
+
+    What it says can be driven from tick to tick: at the end of each it can still brake for all that is ahead. A
+    turn is driven on the half of a cell behind it.
+    """
+
+    def __init__(self, grid: GridSpec, accel: float | None, turn_rate_deg_per_s: float | None) -> None:
+        self._accel = math.inf if accel is None else accel
+        self._turn_rate = math.inf if turn_rate_deg_per_s is None else math.radians(turn_rate_deg_per_s)
+        self._half_m = grid.resolution_m / 2
+
+    def speed(self, stretch: Stretch) -> float:
+        """See `Dynamics`."""
+        speed = min(stretch.limit_m_per_s, stretch.speed_m_per_s + self._accel * stretch.tick_s)
+        if stretch.turn_rad:
+            speed = min(speed, self._through(stretch.turn_rad))
+        if math.isinf(self._accel):
+            return speed
+        for ahead_m, turn_rad in stretch.turns:
+            speed = min(speed, self._down_to(self._through(turn_rad), ahead_m, stretch.left_s))
+        return min(speed, self._down_to(0.0, stretch.ahead_m, stretch.left_s))
+
+    def _through(self, turn_rad: float) -> float:
+        return self._turn_rate * self._half_m / abs(turn_rad)
+
+    def _down_to(self, then: float, ahead_m: float, seconds: float) -> float:
+        """The speed from which it can brake to another within so many metres, after some seconds at this speed: the
+        v of v seconds + (v^2 - then^2) / 2 accel = ahead. What it loses within that time it may drive at once."""
+        if math.isinf(then):
+            return math.inf
+        room = 2 * self._accel * ahead_m + then * then
+        lag = self._accel * seconds
+        smooth = room / (lag + math.sqrt(lag * lag + room)) if room > 0 else 0.0
+        return max(smooth, then, min(lag, ahead_m / seconds) if seconds > 0 else 0.0)
 
 
 class Dynamics(Protocol):
@@ -70,10 +112,23 @@ def dynamics_of(plugin: Plugin, world: DynamicsWorld, tell: Tell) -> PluginDynam
     return PluginDynamics(plugin.make(world), world.grid, Guard(plugin, tell))
 
 
-class PluginDynamics:
-    """Drives vehicles at the speeds of a plug-in; as the ground allows once it has failed."""
+def own_dynamics(own: ClassConfig | None, world: DynamicsWorld) -> PluginDynamics | None:
+    """The dynamics that a class says itself; None if it says none."""
+    if own is None or (own.accel_m_per_s2 is None and own.turn_rate_deg_per_s is None):
+        return None
+    return PluginDynamics(Inertia(world.grid, own.accel_m_per_s2, own.turn_rate_deg_per_s), world.grid, None)
 
-    def __init__(self, dynamics: Dynamics, grid: GridSpec, guard: Guard) -> None:
+
+class PluginDynamics:
+    """Drives vehicles at the speeds of a plug-in, or of built-in dynamics; as the ground allows once it has failed.
+
+    guard   what calls the plug-in; None if it is built in
+
+    slowed  whether the last stretch was driven slower than the ground allows
+    """
+
+    def __init__(self, dynamics: Dynamics, grid: GridSpec, guard: Guard | None) -> None:
+        self.slowed = False
         self._dynamics = dynamics
         self._grid = grid
         self._guard = guard
@@ -95,23 +150,43 @@ class PluginDynamics:
 
         path  the cells that the vehicle was granted, from its own on
         """
-        if not self._guard.works or not math.isfinite(pace_s_per_m):
+        self.slowed = False
+        guard = self._guard
+        if (guard is not None and not guard.works) or not math.isfinite(pace_s_per_m):
             return motion.advance(seconds, pace_s_per_m)
         limit = 1.0 / pace_s_per_m
         speed, heading = self._were.get(vehicle, (0.0, motion.heading_rad))
         before = self._are[vehicle][1] if vehicle in self._are else heading
-        turn = (motion.heading_rad - before + math.pi) % math.tau - math.pi
-        stretch = Stretch(vehicle, speed, limit, turn, self._ahead_m(motion, path), self._tick_s)
-        wanted = self._guard.ask(lambda: self._dynamics.speed(stretch), _checked, lambda: limit)
+        turn = _turn(before, motion.heading_rad)
+        ahead_m, turns = self._ahead(motion, path)
+        stretch = Stretch(vehicle, speed, limit, turn, ahead_m, self._tick_s, seconds, turns)
+        if guard is None:
+            wanted = self._dynamics.speed(stretch)
+        else:
+            wanted = guard.ask(lambda: self._dynamics.speed(stretch), _checked, lambda: limit)
         chosen = min(wanted, limit)
+        self.slowed = chosen < limit
         self._are[vehicle] = chosen, motion.heading_rad
         return motion.advance(seconds, 1.0 / chosen if chosen > 0 else math.inf)
 
-    def _ahead_m(self, motion: Motion, path: Sequence[int]) -> float:
+    def _ahead(self, motion: Motion, path: Sequence[int]) -> tuple[float, tuple[tuple[float, float], ...]]:
+        """Metres to the end of what was granted, and the turns until there."""
         cells = path[path.index(motion.head) :] if motion.head in path else ()
-        grid = self._grid
-        sides = (1.0 if abs(tail - head) in (1, grid.cols) else math.sqrt(2) for tail, head in pairwise(cells))
-        return motion.left_m + grid.resolution_m * sum(sides)
+        cols, resolution_m = self._grid.cols, self._grid.resolution_m
+        ahead_m, heading_rad = motion.left_m, motion.heading_rad
+        turns: list[tuple[float, float]] = []
+        for tail, head in pairwise(cells):
+            south, east = head // cols - tail // cols, head % cols - tail % cols
+            onward_rad = math.atan2(east, -south) % math.tau
+            if onward_rad != heading_rad:
+                turns.append((ahead_m, _turn(heading_rad, onward_rad)))
+            heading_rad = onward_rad
+            ahead_m += resolution_m * (math.sqrt(2) if south and east else 1.0)
+        return ahead_m, tuple(turns)
+
+
+def _turn(before_rad: float, after_rad: float) -> float:
+    return (after_rad - before_rad + math.pi) % math.tau - math.pi
 
 
 def _checked(speed: object) -> float:

@@ -46,8 +46,22 @@ class Answer:
     took_ms: float
 
     @property
+    def searching(self) -> bool:
+        """Whether nobody sees the target: then the route leads to a place to look at."""
+        return isinstance(self.reply, RouteReply) and self.reply.routes[0].status is RouteStatus.SEARCHING
+
+    @property
+    def goal(self) -> int | None:
+        """Where the route leads to; None if the planner does not tell: of a search it tells no place further on
+        than the steps that were asked for."""
+        if not self.searching:
+            return self.target_cell
+        cells = self.path()
+        return cells[-1] if cells and self.reply.routes[0].remaining_s == 0 else None  # type: ignore[union-attr]
+
+    @property
     def target_cell(self) -> int | None:
-        """Where the answer leads to."""
+        """Where the target is, or was last."""
         cell = self.reply.target_cell
         return cell if cell is not None and 0 <= cell < self.frame.grid.cells else None
 
@@ -112,11 +126,15 @@ def _ask(bus: Bus, request: CostRequest | RouteRequest, target: str, where: obje
 
 def as_json(answer: Answer) -> str:
     """The planner's answer, with its places in all coordinates that the terrain has."""
-    frame, target, cells = answer.frame, answer.target_cell, answer.path()
+    frame, goal, last, cells = answer.frame, answer.goal, answer.target_cell, answer.path()
     fields = json.loads(encode_readable(answer.reply))
     fields["crs"] = frame.grid.crs
     fields["from"] = fields_of(frame, answer.start)
-    fields["to"] = None if target is None else fields_of(frame, target)
+    fields["to"] = None if goal is None else fields_of(frame, goal)
+    if isinstance(answer.reply, RouteReply):
+        fields["searching"] = answer.searching
+    if answer.searching:
+        fields["last_seen"] = None if last is None else fields_of(frame, last)
     if cells:
         route = _route(answer, cells)
         fields["path"] = {name: line.round(6).tolist() for name, line in zip("xy", route.metres(), strict=True)}
@@ -139,7 +157,7 @@ def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
     path = np.array(cells, np.int64)
     (route,) = answer.reply.routes  # type: ignore[union-attr]
     return DescribedRoute(
-        name=f"to {answer.reply.target}",
+        name=f"{'in search of' if answer.searching else 'to'} {answer.reply.target}",
         grid=grid,
         cells=path,
         cost_s=route.cost_s,
@@ -183,7 +201,8 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
     gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
     typer.echo(f"from {written(answer.frame, answer.start)}")
     if found.status is RouteStatus.SEARCHING:
-        place = written(answer.frame, answer.path()[-1])
+        goal = answer.goal
+        place = "where this leads" if goal is None else written(answer.frame, goal)
         typer.echo(f"searching: nobody sees {reply.target}; {place} is a place to look at, in {found.cost_s:.1f} s")
     else:
         typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")

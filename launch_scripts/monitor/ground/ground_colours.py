@@ -34,19 +34,27 @@ COST_COLOURS = tuple(_CIVIDIS.split())
 _VIRIDIS = "#fde725 #aadc32 #5cc863 #27ad81 #21908d #2c718e #3b518b #472c7a #440154"
 COST_TO_GO_COLOURS = tuple(_VIRIDIS.split())
 """From the target outwards."""
+LEARNED_COLOURS = (palette.BLUE, "#6f757b", palette.ORANGE)
+"""From a quarter of the prior pace to four times it."""
+_MOST_FACTOR = 4.0
 _COST_STEPS = 256
 
 
 class GroundColours:
     """The layers' pixels. What is known now is read from the shared map's ground, which changes in place.
 
-    now     float32 (rows, cols)  the ground as the map knows it; inf is lethal
-    truth   the ground as it is, where this process knows it
+    now      float32 (rows, cols)  the ground as the map knows it; inf is lethal
+    truth    the ground as it is, where this process knows it
+    unmarked float32 (rows, cols)  the ground without marks, with what is learned, which changes in place, too; the
+             prior if not given
     slowest_s_per_m, quickest_s_per_m  ends of the scale of costs
     """
 
-    def __init__(self, mesh: TerrainMesh, terrain: Terrain, now: Floats, truth: Floats | None) -> None:
-        self._mesh, self._now, self._truth, self._prior = mesh, now, truth, terrain.ground_s_per_m
+    def __init__(
+        self, mesh: TerrainMesh, terrain: Terrain, now: Floats, truth: Floats | None, unmarked: Floats | None = None
+    ) -> None:
+        self._mesh, self._now, self._truth, self._known_before = mesh, now, truth, terrain.ground_s_per_m
+        self._prior = self._known_before if unmarked is None else unmarked
         seen = mesh.seen
         shade = 0.42 + 0.78 * hillshade(seen.elevation_m, seen.grid.resolution_m)[..., None]
         self._shade = np.asarray(shade, np.float32)
@@ -60,6 +68,7 @@ class GroundColours:
         self.quickest_s_per_m = float(ends[0])
         self.slowest_s_per_m = max(float(ends[1]), 1.25 * self.quickest_s_per_m)
         self._cost_colours = between(COST_COLOURS, _COST_STEPS)
+        self._learned_colours = between(LEARNED_COLOURS, _COST_STEPS)
 
     def close(self, cells: NDArray[np.int64]) -> None:
         """Says which cells zones close."""
@@ -118,6 +127,20 @@ class GroundColours:
         ):
             seen = any_in_blocks(where, side)
             image[seen] = _mixed(image[seen], colour, 0.85)
+        return image
+
+    def learned_of(self, window: Window) -> Bytes:
+        """By what the prior pace is multiplied, by what vehicles have measured of each kind of ground: on grey
+        relief, orange where it is slower and blue where it is quicker."""
+        part, side, texels = _cells(window), self._mesh.texel, self._texels(window)
+        before, prior = (np.asarray(each[part])[::side, ::side] for each in (self._known_before, self._prior))
+        lethal = np.isinf(before)
+        with np.errstate(invalid="ignore"):
+            off = np.where(lethal, 0.0, np.log(prior / before)) / np.log(_MOST_FACTOR)
+        index = np.rint((np.clip(off, -1, 1) + 1) / 2 * (_COST_STEPS - 1)).astype(np.intp)
+        shade = 0.45 + 0.55 * self._shade[texels]
+        image: Bytes = np.clip(self._learned_colours[index] * shade, 0, 255).astype(np.uint8)
+        self._hatch(image, window)
         return image
 
     def lethal_at(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bools:

@@ -13,6 +13,7 @@ from launch_scripts.monitor.ground.ground_drawing import GroundDrawing
 from launch_scripts.monitor.ground.layers import (
     COST,
     KNOWN,
+    LEARNED,
     NEAREST,
     PHOTO,
     Layer,
@@ -98,13 +99,16 @@ class GroundView:
         self._movers = movers
         self._cells = terrain.grid.cells
         self._drawing = GroundDrawing(rec, mesh)
-        self._colours = colours = GroundColours(mesh, terrain, cost_map.ground_s_per_m, truth)
+        self._colours = colours = GroundColours(
+            mesh, terrain, cost_map.ground_s_per_m, truth, cost_map.prior_s_per_m
+        )
         self._colours.close(closed_cells(self._zones))
         self._shown, self._target_ids = list(layers), list(targets)
         tiled = (
             _Tiles(PHOTO, colours.photo_of, NS_PER_S, 80),
             _Tiles(COST, colours.cost_of, _LAYER_NS, 80),
             _Tiles(KNOWN, colours.known_of, _LAYER_NS, 80),
+            _Tiles(LEARNED, colours.learned_of, _LAYER_NS, 80),
         )
         self._layers = [each for each in tiled if each.layer in layers]
         self._targets = [layer for layer in layers if layer.target is not None]

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.monitor.ground.cost_to_go import unit_of
-from launch_scripts.monitor.ground.ground_colours import COST_COLOURS, COST_TO_GO_COLOURS, GroundColours
+from launch_scripts.monitor.ground.ground_colours import (
+    COST_COLOURS,
+    COST_TO_GO_COLOURS,
+    LEARNED_COLOURS,
+    GroundColours,
+)
 from launch_scripts.monitor.ground.ground_drawing import PHOTO as PHOTO_ENTITY
 from launch_scripts.monitor.ground.legend import (
     CLOSED,
@@ -42,12 +47,17 @@ class Layer:
 PHOTO = Layer("photo", "Photo", PHOTO_ENTITY)
 COST = Layer("cost", "Cost", "world/layers/cost")
 KNOWN = Layer("known", "Known and true", "world/layers/known")
+LEARNED = Layer("learned", "Learned", "world/layers/learned")
 NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest")
 _ENTRIES = {
     PHOTO: (*CLOSED, *FOUND),
     COST: (*CLOSED, LETHAL_COST),
     KNOWN: KNOWN_OR_NOT,
+    LEARNED: CLOSED,
 }
+
+
+_LEARNED_SCALE = Scale(LEARNED_COLOURS, "times the prior pace", ("1/4", "1/2", "1", "2", "4"))
 
 
 def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
@@ -56,6 +66,8 @@ def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
     shown = [PHOTO, COST]
     if knows_truth:
         shown.append(KNOWN)
+    if scenario.map.learning:
+        shown.append(LEARNED)
     if targets:
         target = scenario.monitor.show_target or targets[0]
         shown.append(Layer("to_target", f"To {target}", "world/layers/to_target", target))
@@ -69,7 +81,7 @@ def legends(colours: GroundColours, shown: Sequence[Layer], movers: Sequence[Loo
 
     movers  what it says of all that moves
     """
-    scales = {COST.name: _cost_scale(colours)}
+    scales = {COST.name: _cost_scale(colours), LEARNED.name: _LEARNED_SCALE}
     return {
         layer.name: legend_picture((*entries, WINDOW, *movers), scales.get(layer.name))
         for layer, entries in _ENTRIES.items()

@@ -12,6 +12,7 @@ import numpy as np
 
 from launch_scripts.report.geo.track_file import RunTracks
 from launch_scripts.report.pictures.ground_picture import GROUND_FILE
+from launch_scripts.report.pictures.learned_picture import LEARNED_FILE
 from launch_scripts.report.pictures.map_picture import (
     Points,
     colours_of_groups,
@@ -49,11 +50,12 @@ def map_parts(folder: Path, tracks: RunTracks, report: Mapping[str, Any]) -> dic
     ]
     pieces = [(track.id, in_km(track, grid) * scale) for track in tracks.targets if len(track.time_ns)]
     bar_km = round_length(grid.cols * grid.resolution_m / 5000)
-    ground = folder / GROUND_FILE
+    ground, learned = folder / GROUND_FILE, folder / LEARNED_FILE
     return {
         "width": round(grid.cols * grid.resolution_m / 1000 * scale, 1),
         "height": round(grid.rows * grid.resolution_m / 1000 * scale, 1),
         "ground": data_uri("image/webp", read_bytes(ground, FileKind.RUN)) if ground.exists() else None,
+        "learned": data_uri("image/png", read_bytes(learned, FileKind.RUN)) if learned.exists() else None,
         "marks": _png(tracks) if len(tracks.marks.cells) else None,
         "groups": groups,
         "vehicles": vehicles,

@@ -13,6 +13,7 @@ from launch_scripts.report.files import write_file
 from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
 from launch_scripts.report.page.map_svg import map_parts
 from launch_scripts.report.page.theme import themed_svg
+from launch_scripts.report.pictures.learned_picture import QUICKER, SLOWER
 from launch_scripts.report.pictures.plots import PLOTS, draw_plot
 from launch_scripts.report.results.certified_gap import percent
 from launch_scripts.report.results.result_tables import TABLES
@@ -58,6 +59,8 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         alarms=_alarms(report),
         left_behind=_left_behind(report),
         map=map_parts(folder, read_tracks(tracks), report) if tracks.exists() else None,
+        slower=SLOWER,
+        quicker=QUICKER,
         plots=[
             (plot, themed_svg(lambda axes, plot=plot: draw_plot(axes, plot, report, titled=False)))  # type: ignore[misc]
             for plot in PLOTS

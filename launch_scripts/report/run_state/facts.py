@@ -95,6 +95,11 @@ def each(value: Mapping[str, int]) -> str:
     return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none yet"
 
 
+def factors(value: Mapping[str, float]) -> str:
+    """grass x 2.9, forest x 0.63"""
+    return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
+
+
 def _gap_mean(value: CertifiedGap | None) -> str:
     return NONE if value is None else percent(value.mean)
 
@@ -126,6 +131,10 @@ FACTS: tuple[Fact, ...] = (
     Fact(
         "certified_gap", "certified gap", "", lambda s: s.certified_gap, _gap,
         "How far above the optimum the routes that vehicles began can be at most, as planners have proven.",
+    ),
+    Fact(
+        "learned", "learned", "", lambda s: s.learned, factors,
+        "By what the prior pace of a class of ground is multiplied, as vehicles have measured (map.learning).",
     ),
     Fact("collisions", "collisions", "", lambda s: s.collisions, count, "Two vehicles on one cell; must be 0."),
     Fact(
@@ -196,6 +205,8 @@ LINES: tuple[tuple[str, ...], ...] = (
     ("processes_well", "restarts", "messages_now_per_s"),
 )
 """How the facts of a run are set in lines."""
+IF_ANY = ("learned",)
+"""Facts that have a line of their own, where there is anything to say."""
 MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", "payloads_dropped")
 """Facts that are shown only where they are not 0."""
 
@@ -203,6 +214,7 @@ MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", 
 def lines(state: RunState) -> list[str]:
     """The facts of a run but its time, in lines for people: `label text` with two spaces between facts."""
     found = ["  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in names) for names in LINES]
+    found += [f"{fact(name).label} {fact(name).shown(state)}" for name in IF_ANY if fact(name).of(state)]
     wrong = [name for name in MUST_BE_ZERO if fact(name).of(state)]
     if wrong:
         found.append("  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in wrong))

@@ -16,7 +16,7 @@ from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.order_book import OrderBook
-from swarm.runtime.stats import CAPTURES_OF, MESSAGES_PER_S, RESTARTS
+from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 from swarm.wire.messages.vehicles import VehicleState
 
 
@@ -70,6 +70,8 @@ class RunState:
     alive           processes that are as they should be: alive, or ended because they were asked to
     expected        processes that the run needs
     crew            role -> (alive, expected)
+    learned         class of ground -> by what its prior pace is multiplied, as vehicles have measured; those alone
+                    whose prior does not stand
     beside          processes that are alive and not needed: routers, monitors, agents of guests
     messages_per_s  that all processes send now
     """
@@ -96,6 +98,7 @@ class RunState:
     crew: dict[str, tuple[int, int]]
     beside: dict[str, int]
     certified_gap: CertifiedGap
+    learned: dict[str, float]
     alarms: tuple[Alarm, ...]
     orders: tuple[str, ...]
     grid: GridSpec
@@ -142,6 +145,7 @@ def state_of(
         crew=_by_role(crew, well),
         beside=_beside(observed, set(crew)),
         certified_gap=certified_gap(observed),
+        learned=_learned(observed),
         alarms=alarms_of(observed, tracked, plan, targets, now_ns),
         orders=tuple(book.standing),
         grid=observed.grid,
@@ -207,3 +211,13 @@ def _lines(
             )
         )
     return tuple(lines)
+
+
+def _learned(observed: Observed) -> dict[str, float]:
+    """As the planner says that has learned most: those of other groups may have been told less."""
+    told = [
+        {name.removeprefix(LEARNED): value for name, value in stats.gauges.items() if name.startswith(LEARNED)}
+        for (role, _), stats in observed.newest().items()
+        if role == "planner"
+    ]
+    return dict(sorted(max(told, key=len, default={}).items()))

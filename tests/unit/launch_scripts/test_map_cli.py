@@ -134,11 +134,52 @@ def test_a_garbled_export_is_refused_with_the_place(change: dict[str, object], p
         from_json(text)
 
 
+def learned_sets(author: str, *said: Said) -> list[MarkSet]:
+    replica = MapReplica(GRID, author=author)
+    return [each.mark_set for each in replica.write_learned(dict(enumerate(said)), 1)]
+
+
 def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:
-    author = MapReplica(GRID, author="all.a1.1")
-    words = [each.mark_set for each in author.write_learned({0: Said(400, 72_000, 6_500)}, 1)]
-    store = stored(tmp_path / "map.sqlite", [*SETS, *words])
+    store = stored(tmp_path / "map.sqlite", [*SETS, *learned_sets("all.a1.1", Said(400, 72_000, 6_500))])
     found = json.loads(CliRunner().invoke(app, ["inspect", str(store), "--json"]).stdout)
     assert (found["sets"], found["marks"], list(found["authors"])) == (3, 3, ["a1.1", "a2.1"])
+    assert found["authors_that_learned"] == ["all.a1.1"]
     told = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "marks.json")]).stdout
-    assert told.endswith("3 marks in 3 sets\n")
+    assert told.endswith("3 marks in 3 sets, and what 1 authors have learned\n")
+
+
+def test_what_is_learned_is_imported_as_it_was_exported(tmp_path: Path) -> None:
+    words = [
+        *learned_sets("all.a1.1", Said(400, 72_000, 6_500)),
+        *learned_sets("all.a2.1", Said(9, 70_000, 0), Said(1, 0, 7)),
+    ]
+    file, again = tmp_path / "marks.json", tmp_path / "again.sqlite"
+    file.write_text(to_json("t", GRID, [*SETS, *words]), encoding="utf-8")
+    assert [each for each in from_json(file.read_bytes())[2] if each.tile == GRID.tiles] == words
+    assert CliRunner().invoke(app, ["import", str(file), str(again)]).exit_code == 0
+    with KeeperStore(again, read_only=True) as store:
+        assert sorted(each.author for each in store.load() if each.tile == GRID.tiles) == ["all.a1.1", "all.a2.1"]
+    (row, *_) = json.loads(CliRunner().invoke(app, ["learned", str(again), "--json"]).stdout)["kinds"]
+    assert (row["kind"], row["cells"], row["authors"]) == ("unknown 0-5", 409, 2)
+    assert 2.5 < row["factor"] <= row["measured"] < 3.1
+    assert "unknown 5-10" in CliRunner().invoke(app, ["learned", str(again)]).stdout
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"learned": [[0, "x", 400, 1 << 40, 0]]},
+        {"learned": [[0, "x", 0, 0, 0]]},
+        {"learned": [[-1, "x", 1, 0, 0]]},
+        {"learned": [[256, "x", 1, 0, 0]]},
+        {"learned": [[0, "x", 1, 0, 0], [0, "x", 2, 0, 0]]},
+        {"author": "operator.z1"},
+        {"tile": 0},
+        {"marks": [[0, 0, "clear", None, 1]]},
+    ],
+)
+def test_a_file_that_says_what_no_author_could_have_learned_is_refused(change: dict[str, object]) -> None:
+    exported = json.loads(to_json("t", GRID, learned_sets("all.a1.1", Said(400, 72_000, 6_500))))
+    exported["sets"][0] |= change
+    with pytest.raises(StoreError, match=r"sets\[0\]"):
+        from_json(json.dumps(exported))

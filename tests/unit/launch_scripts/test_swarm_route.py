@@ -72,6 +72,41 @@ def test_programs_get_the_way_in_metres_and_degrees(tmp_path: Path) -> None:
         write(answer(RouteStatus.UNREACHABLE), tmp_path / "none.csv")
 
 
+def test_of_a_search_the_place_to_look_at_is_told_and_where_the_target_was_last(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole, cut = (
+        Route(
+            status=RouteStatus.SEARCHING,
+            start=START,
+            directions=bytes([1, 1, 2]),
+            cost_s=30.0,
+            length_m=76.57,
+            remaining_s=rest_s,
+        )
+        for rest_s in (0.0, 12.0)
+    )
+    seen = GRID.cell(50, 70)
+
+    def told(route: Route) -> Answer:
+        reply = RouteReply(
+            target="t3", incarnation=1, target_cell=seen, map_version=0, tree_age_ms=1.0, rows=60, cols=80,
+            routes=RouteBatch.of([route]).columns(),
+        )  # fmt: skip
+        return Answer(reply, FRAME, START, 2.0)
+
+    fields = json.loads(as_json(told(whole)))
+    assert fields["searching"] is True
+    assert (fields["to"]["row"], fields["to"]["col"]) == (8, 13)
+    assert (fields["last_seen"]["row"], fields["last_seen"]["col"]) == (50, 70)
+    assert json.loads(as_json(told(cut)))["to"] is None, "the end of a part is not the place"
+    known = json.loads(as_json(answer()))
+    assert (known["searching"], "last_seen" in known) == (False, False)
+    for route, place in ((whole, "cell:8,13"), (cut, "where this leads")):
+        show(told(route))
+        assert f"nobody sees t3; {place}" in capsys.readouterr().out
+
+
 def test_the_frame_is_that_of_most_processes() -> None:
     def info(id: str, crs: str, rows: int = 60) -> RunInfo:
         return RunInfo(

@@ -1,0 +1,91 @@
+"""A planner whose target only vehicles see: one search for all who chase it, whatever their class."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from support.planner_swarm import Ear
+from support.swarm_model import SwarmModel
+
+from planner_service.service import PlannerService
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.bus.scheduler import InlineWorker
+from swarm.config.load import parse_scenario
+from swarm.grid import walk
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.topics import ROUTE
+
+_TEXT = """
+seed = 3
+terrain = { source = "synthetic", rows = 48, cols = 48, relief_m = 500.0, roads = 2 }
+cost = { max_slope_deg = 25.0 }
+vehicles = { sense_range_m = 60.0 }
+[[targets]]
+name = "h"
+count = 1
+tracker = "sighted"
+[[classes]]
+name = "low"
+cost = { max_slope_deg = 15.0, vehicle_radius_m = 12.0 }
+"""
+
+
+class World(SwarmModel):
+    """The planner of a target that nobody has seen, and somebody who asks."""
+
+    def __init__(self) -> None:
+        scenario = parse_scenario(_TEXT)
+        self.ground: Terrain = build_terrain(scenario)
+        super().__init__(terrain=self.ground, scenario=scenario)
+        self.ear = Ear(self)
+        self.life = 0
+        self.service = self.restart()
+
+    def restart(self) -> PlannerService:
+        """A planner that knows nothing of the one before."""
+        self.life += 1
+        setup = self.setup("planner", "h", self.life)
+        worker = InlineWorker(self.scheduler)
+        return self.start(
+            f"planner-h{self.life}",
+            lambda bus, post: PlannerService(setup, self.ground, bus, post, worker),
+            phase_ns=0,
+        )
+
+    def route(self, vehicle: str, cell: int, vehicle_class: str = "ground") -> Route:
+        """What a vehicle is answered."""
+        self.ear.ended.clear()
+        self.ear.replies.clear()
+        request = RouteRequest(cells=[cell], vehicles=[vehicle], vehicle_class=vehicle_class)
+        self.ear.ask(ROUTE, request, target="h")
+        while not self.ear.ended:
+            self.run(0.1)
+        reply: Any = self.ear.replies[0]
+        return next(iter(reply.routes))
+
+
+def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_ground_and_apart() -> None:
+    world = World()
+    world.run(8)
+    planners = {"ground": world.service._planner, "low": world.service._planners.used("low", 0)}
+    world.run(1)
+    low = np.flatnonzero(np.isfinite(planners["low"]._cost_map.pace_s_per_m))
+    start = int(low[len(low) // 2])
+    ends = {}
+    for name, planner in planners.items():
+        route = world.route(f"v-{name}", start, name)
+        assert route.status is RouteStatus.SEARCHING
+        assert math.isfinite(route.cost_s)
+        cells = walk(world.ground.grid, route.start, route.directions)
+        assert np.isfinite(planner._cost_map.pace_s_per_m.flat[cells]).all()
+        ends[name] = cells[-1]
+    search = planners["ground"].target_search
+    assert search is not None
+    assert search is planners["low"].target_search
+    assert search.searches == 1
+    assert {f"v-{name}": cell for name, cell in ends.items()} == search.searcher.goals
+    rows, cols = np.divmod(np.array(list(ends.values())), world.ground.grid.cols)
+    assert math.hypot(rows[1] - rows[0], cols[1] - cols[0]) * world.ground.grid.resolution_m > 120.0

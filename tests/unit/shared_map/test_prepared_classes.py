@@ -1,0 +1,78 @@
+"""Grounds of classes of vehicles: prepared in a run's folder, mapped by every process, kept for later runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared_map import class_grounds as module
+from shared_map.class_grounds import class_grounds, class_terrains, class_truths
+from shared_map.prepared_classes import load_classes, prepare_classes
+from shared_map.terrain.terrain import prepare
+from swarm.config.load import parse_scenario
+from swarm.errors import TerrainError
+from swarm.runtime.role import RoleSetup
+
+_TEXT = """
+seed = 5
+terrain = {{ source = "synthetic", rows = 48, cols = 64, relief_m = 400.0, hidden = {{ rubble_fields = 3 }} }}
+cost = {{ max_slope_deg = 20.0, directional = {directional} }}
+groups = [{{ vehicles = 1 }}, {{ name = "walkers", class = "walker", vehicles = 1 }}]
+[[classes]]
+name = "walker"
+max_speed_m_per_s = {speed}
+cost = {{ max_slope_deg = 40.0, vehicle_radius_m = 9.0 }}
+"""
+
+
+@pytest.mark.parametrize("directional", ["false", "true"])
+def test_what_is_prepared_is_what_would_be_made(
+    tmp_path: Path, directional: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = parse_scenario(_TEXT.format(speed=1.5, directional=directional))
+    terrain, truth = prepare(tmp_path, scenario)
+    made = class_grounds(scenario, terrain, truth)
+    prepare_classes(tmp_path, scenario, terrain, truth)
+    again, truth_again = prepare(tmp_path, scenario)
+    monkeypatch.setattr(module, "build_terrain", None)  # nothing is built twice
+    load_classes(RoleSetup(scenario, "run", "agent", "a0", 1, 1, run_dir=tmp_path), again)
+    found = class_grounds(scenario, again, truth_again)
+    assert list(found) == list(made) == ["ground", "walker"]
+    for name, ground in found.items():
+        for array in ("truth", "homes"):
+            assert np.array_equal(getattr(ground, array), getattr(made[name], array))
+        for array in ("pace_s_per_m", "ground_s_per_m", "elevation_m"):
+            same = getattr(ground.terrain, array), getattr(made[name].terrain, array)
+            assert np.array_equal(*same, equal_nan=True)
+        assert ground.terrain.digest == made[name].terrain.digest
+        assert ground.terrain.least_s_per_m == made[name].terrain.least_s_per_m
+        assert (ground.terrain.climb is None) == (directional == "false")
+    assert class_terrains(scenario, again)["walker"] is found["walker"].terrain
+    assert class_truths(scenario, again, truth_again)["walker"] is found["walker"].truth
+
+
+def test_a_folder_of_another_class_is_none(tmp_path: Path) -> None:
+    slow, quick = (parse_scenario(_TEXT.format(speed=speed, directional="false")) for speed in (0.5, 1.5))
+    terrain, truth = prepare(tmp_path, slow)
+    prepare_classes(tmp_path, slow, terrain, truth)
+    load_classes(RoleSetup(quick, "run", "agent", "a0", 1, 1, run_dir=tmp_path), terrain)
+    walker = class_grounds(quick, terrain, truth)["walker"]
+    assert 1 / 1.5 <= float(walker.truth.min()) < 1.0
+
+
+def test_a_damaged_folder_is_said_in_one_sentence(tmp_path: Path) -> None:
+    scenario = parse_scenario(_TEXT.format(speed=1.5, directional="false"))
+    terrain, truth = prepare(tmp_path, scenario)
+    prepare_classes(tmp_path, scenario, terrain, truth)
+    (tmp_path / "classes/walker/class.json").write_text("{")
+    with pytest.raises(TerrainError, match=r"prepared class .* is damaged .*; delete the folder"):
+        prepare_classes(tmp_path, scenario, terrain, truth)
+
+
+def test_a_class_that_can_stand_nowhere_in_truth_is_said() -> None:
+    scenario = parse_scenario(_TEXT.format(speed=1.5, directional="false").replace("= 40.0", "= 10.0"))
+    terrain = module.build_terrain(scenario)
+    with pytest.raises(TerrainError, match="class walker: no cell that it can drive by the map is so in truth"):
+        class_grounds(scenario, terrain, np.full_like(terrain.pace_s_per_m, np.inf))
