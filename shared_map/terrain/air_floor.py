@@ -46,11 +46,13 @@ class AirGround:
     height_m      float32 (rows, cols), above the same zero as the terrain; NaN where nobody flies
     pace_s_per_m  float32 (rows, cols); inf where nobody flies
     climb         the factor of a step by its rise
+    grade         of the surface
     """
 
     height_m: Floats
     pace_s_per_m: Floats
     climb: Climb
+    grade: float
 
 
 def air_ground(
@@ -72,7 +74,7 @@ def air_ground(
     rises = np.linspace(-steepest, steepest, 2 * ENTRIES + 1)
     metres_s = np.where(rises > 0, rises * flight.climb_s_per_m, -rises * flight.descent_s_per_m)
     factors = (1.0 + flight.speed_mps * metres_s).astype(np.float32)
-    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest))
+    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest), flight.grade)
 
 
 def clearance_floor(elevation_m: Floats, clearance_m: float) -> NDArray[np.float64]:
