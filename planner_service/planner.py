@@ -12,6 +12,7 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
+from planner_service.pulled_routes import Puller
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.search.ways import Ways
@@ -45,6 +46,7 @@ MAX_GAP = 1.5
 MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
+MOST_PULLED_STEPS = MOST_STEPS >> 3
 GOOD_GAP = 1.05
 """Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
 good already."""
@@ -121,7 +123,10 @@ class Planner:
         # For the status: the part grown last, and how long the last full growth took.
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
-        self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
+        climb = cost_map.terrain.climb
+        self._gaps = GapStatistics(self._grid, config, counters, climb)
+        pulls = config.routes == "pulled" and climb is None
+        self._puller = Puller(cost_map.pace_s_per_m, self._grid.resolution_m, config) if pulls else None
         self._status_due_ns = 0
         self.target_search = target_search
         """None for one that is not searched for."""
@@ -335,7 +340,7 @@ class Planner:
 
     def _routes(self, request: RouteRequest, now_ns: int) -> RouteReply:
         cells = self._cells(request)
-        most = MOST_STEPS // max(len(cells), 1)
+        most = (MOST_STEPS if self._puller is None else MOST_PULLED_STEPS) // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
         if (search := self._under_way) is not None:
             routes = search.routes(self._ways, cells, request.vehicles, max_cells, self.tree.map_version)
@@ -344,6 +349,7 @@ class Planner:
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
                 routes = self.tree.routes(cells, max_cells)
             self._certify(routes, now_ns)
+        routes = self._pulled(routes)
         self.counters.count("routes_served", len(routes))
         for index, vehicle in enumerate(request.vehicles):
             self.followers.given(vehicle, routes[index], request.max_cells, now_ns, now_ns + self._push_ns)
@@ -360,6 +366,9 @@ class Planner:
             tracker_lost=self._watch.lost(now_ns),
             vehicle_class=self.vehicle_class,
         )
+
+    def _pulled(self, routes: RouteBatch) -> RouteBatch:
+        return routes if self._puller is None else self._puller.pull_batch(routes)
 
     def _improvable(self, cells: list[int], routes: RouteBatch) -> list[int]:
         """The cells whose routes may be worth a growth: all, or those without a proof that they are good."""
@@ -435,7 +444,7 @@ class Planner:
         pushes: list[Action] = []
         for max_cells, batch in due.items():
             cells = [follower.cell for _, follower in batch]
-            routes = self.tree.routes(cells, max_cells)
+            routes = self._pulled(self.tree.routes(cells, max_cells))
             for (id, follower), route in zip(batch, routes, strict=True):
                 follower.stale = False
                 if route.status not in _WORTH_PUSHING or not self.followers.is_news(follower, route):
@@ -455,7 +464,8 @@ class Planner:
                 break
             if not searcher.wants_place(id) or now_ns < follower.push_ns:
                 continue
-            route = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)[0]
+            found = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)
+            route = self._pulled(found)[0]
             follower.push_ns = now_ns + self._push_ns
             if is_place(route):
                 self.followers.sent(follower, route, now_ns + self._push_ns)

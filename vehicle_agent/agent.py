@@ -109,8 +109,14 @@ class Agent:
             self._in_reach,
             f"{scenario.seed}/{plan.id}",
         )
+        self._pulled = scenario.planner.routes == "pulled"
         self._driver = Driver(
-            local_map, holdings, self._steering.passable, dynamics, measures=scenario.map.learning
+            local_map,
+            holdings,
+            self._steering.passable,
+            dynamics,
+            pulled=self._pulled,
+            measures=scenario.map.learning,
         )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
@@ -449,7 +455,10 @@ class Agent:
                 vehicle.no_answer(now_ns)
             return []
         partial = route.remaining_s > 0.0
-        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching)
+        turns = route.turns if self._pulled else ()
+        given = GivenRoute(
+            target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching, turns
+        )
         path = self.holdings.path(vehicle.id)
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:

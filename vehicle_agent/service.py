@@ -28,7 +28,7 @@ from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
-from swarm.wire.fields import column
+from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.orders import Obey
@@ -447,6 +447,7 @@ class AgentService:
                 directions=directions_of(route.cells, self._replica.grid.cols),
                 cost_s=route.cost_s,
                 lower_bound_s=route.lower_bound_s,
+                legs=pack_column(route.legs, "<u4"),
             )
             self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
 
