@@ -75,6 +75,7 @@ class MoversView:
         self._drawing.begin()
         self._vehicles.draw_anew()
         self._targets.draw_anew()
+        self._searches.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             middle = self._mesh.width_m / 2, self._mesh.depth_m / 2
             self._drawing.followed(followed_point(self._mesh, middle))

@@ -32,6 +32,10 @@ class Searches:
         else:
             self._of.pop(believed.target, None)
 
+    def draw_anew(self) -> None:
+        """All of it is drawn once more."""
+        self._changed = True
+
     def take_changed(self, now_ns: int) -> Mapping[str, Believed] | None:
         """Target -> what is believed; None if that is the same as before."""
         silent = [id for id, (_, heard_ns) in self._of.items() if now_ns - heard_ns >= SILENT_NS]

@@ -233,7 +233,7 @@ def test_where_a_target_is_believed_to_be_is_drawn_until_it_is_seen(
     rig.play([(NS_PER_S // 2, told), (2 * NS_PER_S, msgspec.structs.replace(told, cells=[], shares=b""))])
     rig.run(3)
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/searched"] == 2, "there, nowhere"
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/searched"] == 3, "none, there, none"
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
