@@ -168,7 +168,7 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
 def places_of(service: object) -> list[tuple[str, int, float]]:
     if not isinstance(service, AgentService):
         return []
-    return [(id, each.cell, each.motion.share) for id, each in service.agent.vehicles.items()]
+    return [(id, each.cell, each.motion.done_m) for id, each in service.agent.vehicles.items()]
 
 
 def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_them_join() -> None:
