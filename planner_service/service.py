@@ -39,10 +39,10 @@ from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
+from swarm.wire.messages.planning import Believed, CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Chasers, Fleet
-from swarm.wire.topics import CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.topics import BELIEVED, CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
@@ -385,6 +385,8 @@ class PlannerService:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:
                     self._tell_status(status)
+                case Believed() as believed:
+                    self._bus.publish(BELIEVED, believed, target=self._target)
                 case Tell(kind, text, cell):
                     log.info("%s: %s", kind, text)
                     self._member.note(now_ns, kind, text, cell)
