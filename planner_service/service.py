@@ -95,9 +95,7 @@ class PlannerService:
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
 
-        def search_by(costs: CostGrid) -> TargetSearch | None:
-            if not self._untracked:
-                return None
+        def search_by(costs: CostGrid) -> TargetSearch:
             hidden = hidden_target(scenario, self._target, setup.incarnation)
             return TargetSearch(hidden, costs, scenario.time_scale)
 
@@ -130,6 +128,8 @@ class PlannerService:
                 vehicle_class=name,
             )
 
+        self._listens = False
+        """Whether vehicles tell where they are and what they see."""
         self._pose: TargetPose | None = None
         """The newest that a tracker told, for the planner of a class that is made later."""
         self._planner_of = planner_of
@@ -165,8 +165,7 @@ class PlannerService:
         self._member.join()
         self._sync.start(now_ns)
         if self._untracked:
-            self._bus.subscribe(SIGHTED, self._post, target=self._target)
-            self._bus.collect(FLEET)
+            self._listen(True)
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
@@ -181,10 +180,7 @@ class PlannerService:
             return
         match event:
             case Heard(message=Sighted() as sighted):
-                if self._sightings.hear(sighted, now_ns):
-                    for seen in self._sightings.best(now_ns).values():
-                        for _, planner in self._planners:
-                            planner.set_pose(pose_of(seen), now_ns)
+                self._hear_sighted(sighted, now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
@@ -243,6 +239,17 @@ class PlannerService:
             model_ns = self._planner.tree.times.model_ns
             self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
 
+    def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
+        if not self._listens or not self._sightings.hear(sighted, now_ns):
+            return  # a tracker knows better
+        seen = self._sightings.best(now_ns)
+        for each in seen.values():
+            for _, planner in self._planners:
+                planner.set_pose(pose_of(each), now_ns)
+        search = self._planner.target_search
+        if not seen and search is not None and 0 <= sighted.cell < self._cost_map.grid.cells:
+            search.remember(sighted, now_ns)
+
     def _tag(self, work: str, name: str) -> str:
         """What a piece of work for the planner of a class is called."""
         return f"{work}/{name}/{self._planners.begun_ns(name)}"
@@ -254,15 +261,31 @@ class PlannerService:
         return self._planners.held(name) if tag == self._tag(work, name) else None
 
     def _look(self, now_ns: int) -> None:
-        """Take in where vehicles are, who would see a target that nobody tracks."""
-        if self._planner.target_search is None:
+        """Take in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
+        search = self._planner.target_search
+        assert search is not None
+        if search.tracked:
+            self._listen(self._planner.is_lost(now_ns))
+        if not self._listens:
             return
         for heard in self._bus.collected(FLEET):
             assert isinstance(heard.message, Fleet)
             self._presence.hear(heard.message, now_ns)
         self._presence.expire(now_ns)
         vehicles = self._presence.vehicles
-        self._planner.target_search.hear_vehicles(vehicles.east_m, vehicles.south_m)
+        search.hear_vehicles(vehicles.east_m, vehicles.south_m)
+
+    def _listen(self, listens: bool) -> None:
+        """Hear from vehicles where they are and what they see, or do not."""
+        if listens == self._listens:
+            return
+        self._listens = listens
+        if listens:
+            self._bus.subscribe(SIGHTED, self._post, target=self._target)
+            self._bus.collect(FLEET)
+        else:
+            self._bus.unsubscribe(SIGHTED, target=self._target)
+            self._bus.unsubscribe(FLEET)
 
     def _answer(self, now_ns: int) -> None:
         """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""

@@ -90,6 +90,8 @@ def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_o
     assert trial.run(SECONDS) == []
     report = simulation.report(SECONDS)
     assert report["lethal_entries"] == report["collisions"] == 0
+    assert report["by_group"]["walkers"]["class"] == "walker"
+    assert report["by_vehicle"]["a2-00"]["class"] == "walker"
     captures = captures_by_class(simulation)
     assert min(captures["ground"], captures["walker"]) > 0
     grounds = grounds_of(simulation)
@@ -112,6 +114,8 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
         simulation.after_tick.append(lambda node, places=places: places.extend(places_of(node.service)))  # type: ignore[misc]
         simulation.run_until(6.0)
         tracks.append(places)
+        told = simulation.report(6.0)["classes"]
+        assert told == ({"ground": 16} if name == "ground" else {"ground": 8, "same": 8})
     assert tracks[0] == tracks[1]
     assert len({cell for _, cell, _ in tracks[0]}) > 100
 
@@ -119,4 +123,4 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
 def places_of(service: object) -> list[tuple[str, int, float]]:
     if not isinstance(service, AgentService):
         return []
-    return [(id, each.cell, each.motion.share) for id, each in service.agent.vehicles.items()]
+    return [(id, each.cell, each.motion.done_m) for id, each in service.agent.vehicles.items()]

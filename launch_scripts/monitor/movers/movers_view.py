@@ -110,7 +110,7 @@ class MoversView:
         if self._fleets_new:
             self._fleets_new = False
             vehicles = observed.driven(self._crew, now_ns)
-            self._vehicles.draw(vehicles, observed.groups, now_ns)
+            self._vehicles.draw(vehicles, observed.groups, observed.classes, now_ns)
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
         lost = self._recorder.tracked.lost(now_ns)
