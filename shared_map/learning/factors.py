@@ -112,7 +112,7 @@ def factors_of(words: Sequence[Mapping[int, Said]]) -> Floats:
         first = kind * SLOPE_BINS
         factors[first : first + SLOPE_BINS] = FACTORS[log_steps(said) + MOST_STEPS]
     for key, said in by_key.items():
-        if sum(each.cells for each in said) >= _FEWEST_CELLS:
+        if estimate(said).cells >= _FEWEST_CELLS:  # those that count: a few words of one cell each are not enough
             factors[key] = FACTORS[log_steps(said) + MOST_STEPS]
     return factors
 

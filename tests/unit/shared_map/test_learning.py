@@ -207,6 +207,16 @@ def test_a_cell_counts_once_and_what_is_no_pace_not_at_all() -> None:
     assert measured.said == {0: Said(1, round(np.log(3) * ONE), 0)}
 
 
+def test_a_slope_of_which_too_little_counts_has_the_factor_of_its_class() -> None:
+    level, steep = 0, 3
+    words = [{level: THRICE, steep: THRICE._replace(cells=4)}, {level: THRICE, steep: THRICE._replace(cells=1)}]
+    factors = factors_of(words)
+    assert factors[steep] == factors[level] > 2.5
+    assert factors_of([words[0], {steep: Said(100, 0, ONE // 10)}])[steep] == 1, (
+        "it is known to be as the prior says"
+    )
+
+
 @pytest.mark.parametrize("cells", [4, 5, 20, 400])
 def test_only_what_is_significant_is_learned(cells: int) -> None:
     assert (log_steps([Said(cells, THRICE.mean, ONE // 10)]) > 8) == (cells >= 5)
