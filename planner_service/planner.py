@@ -185,6 +185,9 @@ class Planner:
         if self.leads:
             actions.extend(told)
             actions.extend(self._pushes(now_ns))
+            if self.target_search is not None and self.vehicle_class == GROUND:
+                believed = self.target_search.told(self.target, self._incarnation, now_ns)
+                actions.extend([] if believed is None else [believed])
         if self.leads and now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + STATUS_NS
             actions.append(self.status(now_ns))

@@ -6,6 +6,8 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
+import msgspec
+
 from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
 from planner_service.class_planners import ClassPlanners
 from planner_service.full_growth import GrownTree
@@ -36,12 +38,11 @@ from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
+from swarm.wire.messages.planning import Believed, CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Chasers, Fleet
-from swarm.wire.topics import CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.topics import BELIEVED, CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +100,7 @@ class PlannerService:
             hidden = hidden_target(scenario, self._target, setup.incarnation)
             return TargetSearch(hidden, costs, scenario.time_scale)
 
-        def planner_of(name: str, cost_map: CostMap, counters: Counters) -> Planner:
+        def planner_of(name: str, cost_map: CostMap) -> Planner:
             tree = TargetTree(
                 terrain.grid,
                 scenario.planner,
@@ -117,7 +118,7 @@ class PlannerService:
                 scenario.planner,
                 tree,
                 cost_map,
-                counters,
+                self.counters,
                 route_cells=scenario.vehicles.route_cells,
                 stopwatch=stopwatch,
                 newest_mark_ns=self._replica.take_newest_stamp_ns if name == GROUND else lambda: None,
@@ -133,7 +134,7 @@ class PlannerService:
         self._pose: TargetPose | None = None
         """The newest that a tracker told, for the planner of a class that is made later."""
         self._planner_of = planner_of
-        self._planner = planner_of(GROUND, self._cost_map, self.counters)
+        self._planner = planner_of(GROUND, self._cost_map)
         self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version = 0
@@ -151,7 +152,7 @@ class PlannerService:
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
         """The planner of a class that somebody asks for."""
-        planner = self._planner_of(name, self._maps.of[name], Counters())  # the status tells of "ground" alone
+        planner = self._planner_of(name, self._maps.of[name])
         planner.lead(self._planner.leads)
         self._pace(planner)
         if self._pose is not None:
@@ -348,7 +349,7 @@ class PlannerService:
             event.refuse(f"{event.topic.name}: the planner ends")
             event.end()
         if self._planner.leads:
-            self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
+            self._tell_status(self._planner.status(now_ns))
         self._member.publish_stats(now_ns)
 
     def _lead(self, leads: bool, now_ns: int) -> None:
@@ -364,6 +365,12 @@ class PlannerService:
                 self._bus.unserve(topic, target=self._target)
         self._candidacy.tell(self._member, now_ns)
 
+    def _tell_status(self, status: PlannerStatus) -> None:
+        """That of "ground", with the vehicles of all classes."""
+        following = sum(len(planner.followers) for _, planner in self._planners)
+        told = msgspec.structs.replace(status, following=following)
+        self._bus.publish(STATUS, told, target=self._target)
+
     def _perform(self, planner: Planner, actions: list[Action], now_ns: int) -> None:
         name = planner.vehicle_class
         for action in actions:
@@ -377,7 +384,9 @@ class PlannerService:
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:
-                    self._bus.publish(STATUS, status, target=self._target)
+                    self._tell_status(status)
+                case Believed() as believed:
+                    self._bus.publish(BELIEVED, believed, target=self._target)
                 case Tell(kind, text, cell):
                     log.info("%s: %s", kind, text)
                     self._member.note(now_ns, kind, text, cell)

@@ -17,6 +17,8 @@ from shared_map.arrays import Floats
 from swarm.clock import NS_PER_S
 from swarm.config.classes import least_sense_range_m
 from swarm.config.scenario import Scenario, ids_of
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import MOST_BELIEVED, Believed
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
@@ -27,6 +29,7 @@ LOST_NS = 30 * NS_PER_S
 """A target whose tracker is lost is searched for after so long: most trackers are back by then."""
 LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for so long before it takes its target for never seen."""
+_TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
 
 
@@ -72,6 +75,9 @@ class TargetSearch:
         """The newest sighting that had expired when it was heard."""
         self._begun_from: Sighted | None = None
         """By which of these the search began."""
+        self._tell_ns = 0
+        self._has_told = False
+        """Whether a search under way was told of last."""
         self._searched: TargetPose | None = None
         """What was the newest pose when the search began."""
 
@@ -139,6 +145,22 @@ class TargetSearch:
             return lost and age_ns >= LOST_NS
         look_m = max(self._hidden.sense_range_m / 2, min(self._hidden.capture_range_m, self._hidden.sense_range_m))
         return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
+
+    def told(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
+        """What is believed, for people to look at; None if it is not time to tell it."""
+        if now_ns < self._tell_ns or not (self.active or self._has_told):
+            return None
+        self._tell_ns = now_ns + _TELL_NS
+        self._has_told = self.active
+        cells, shares, side_m = self.searcher.likeliest(MOST_BELIEVED)
+        return Believed(
+            target=target,
+            incarnation=incarnation,
+            stamp_ns=now_ns,
+            side_m=side_m,
+            cells=cells.tolist(),
+            shares=pack_column(shares, "<f4"),
+        )
 
     def routes(
         self, ways: Ways, cells: Sequence[int], vehicles: Sequence[str], max_cells: int, version: int
