@@ -17,6 +17,9 @@ from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import ENTRIES, Climb
 from swarm.grid import GridSpec
 
+_GRADES = 0.1, 0.5
+_GRADE_OF_RELIEF = 1.8
+"""Of the relief over the shorter side: steep terrain needs a steep surface, over gentle one it only costs."""
 _ROOM = 1.02
 """How far beyond the grade of a surface the table of factors reaches: rounding makes steps a hair steeper."""
 
@@ -124,3 +127,11 @@ def _along_the_row(heights: NDArray[np.float64], step_m: float) -> None:
     for way in (slice(None), slice(None, None, -1)):
         there = heights[way]
         np.maximum(there, np.maximum.accumulate(there + fallen) - fallen, out=there)
+
+
+def grade_of(elevation_m: Floats, resolution_m: float) -> float:
+    """The grade of a surface over a terrain: 0.1 over gentle ones, up to 0.5 where relief is a third of the side."""
+    relief_m = float(np.nanmax(elevation_m) - np.nanmin(elevation_m)) if np.isfinite(elevation_m).any() else 0.0
+    low, high = _GRADES
+    side_m = min(elevation_m.shape) * resolution_m
+    return float(min(max(_GRADE_OF_RELIEF * relief_m / side_m, low), high))

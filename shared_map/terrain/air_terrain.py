@@ -8,17 +8,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from shared_map.arrays import Bools, Floats
-from shared_map.terrain.air_floor import AirGround, Flight, air_ground
+from shared_map.arrays import Bools
+from shared_map.terrain.air_floor import AirGround, Flight, air_ground, grade_of
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import paint_zones
 from swarm.config.classes import AirConfig
 from swarm.config.ground import CostConfig
 from swarm.errors import TerrainError
-
-_GRADES = 0.1, 0.4
-_GRADE_OF_RELIEF = 0.8
-"""Of the relief over the shorter side: steep terrain needs a steep surface, over gentle one it only costs."""
 
 
 def air_terrain(common: Terrain, air: AirConfig, named: str) -> Terrain:
@@ -60,11 +56,3 @@ def flight_of(common: Terrain, air: AirConfig, closed: Bools) -> AirGround:
         descent_s_per_m=1 / air.descent_m_per_s,
     )
     return air_ground(common.grid, common.elevation_m, flight, closed)
-
-
-def grade_of(elevation_m: Floats, resolution_m: float) -> float:
-    """The grade of a surface over a terrain: 0.1 over gentle ones, up to 0.4 where relief is half the side."""
-    relief_m = float(np.nanmax(elevation_m) - np.nanmin(elevation_m)) if np.isfinite(elevation_m).any() else 0.0
-    low, high = _GRADES
-    side_m = min(elevation_m.shape) * resolution_m
-    return float(min(max(_GRADE_OF_RELIEF * relief_m / side_m, low), high))
