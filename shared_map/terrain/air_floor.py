@@ -130,7 +130,7 @@ def _along_the_row(heights: NDArray[np.float64], step_m: float) -> None:
 
 
 def grade_of(elevation_m: Floats, resolution_m: float) -> float:
-    """The grade of a surface over a terrain: 0.1 over gentle ones, up to 0.5 where relief is a third of the side."""
+    """The grade of a surface over a terrain: 0.1 over gentle ones, up to 0.5 where relief is 0.28 of the side."""
     relief_m = float(np.nanmax(elevation_m) - np.nanmin(elevation_m)) if np.isfinite(elevation_m).any() else 0.0
     low, high = _GRADES
     side_m = min(elevation_m.shape) * resolution_m
