@@ -57,4 +57,5 @@ install() {
         fi
     fi
     wanted >"$stamp"
+    say "Installed. The first start loads and compiles what all later ones find ready: half a minute, or more from a slow disk."
 }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from planner_service.full_growth import GrownTree
 from planner_service.tree.strides import StrideSearch
-from swarm.wire.messages.planning import PlannerStatus, PushedRoute
+from swarm.wire.messages.planning import Believed, PlannerStatus, PushedRoute
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,5 +41,5 @@ class Tell:
     cell: int | None = None
 
 
-Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Tell
+Action = GrowTree | FindStrides | PushedRoute | PlannerStatus | Believed | Tell
 """What a planner wants done: a growth run, networks of strides found, a message published."""

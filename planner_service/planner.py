@@ -12,6 +12,7 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
+from planner_service.pulled_routes import Puller
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.search.ways import Ways
@@ -45,6 +46,7 @@ MAX_GAP = 1.5
 MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
+MOST_PULLED_STEPS = MOST_STEPS >> 3
 GOOD_GAP = 1.05
 """Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
 good already."""
@@ -66,7 +68,7 @@ class Planner:
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     time_scale      seconds on the terrain per second: by it a target is taken for teleported
     vehicle_class   whose routes these are: what the cost map is for
-    target_search   of a target that only vehicles see: it is searched for while nobody does. All classes share it
+    target_search   for the time in which nobody sees the target. All classes share it
     """
 
     def __init__(
@@ -121,13 +123,17 @@ class Planner:
         # For the status: the part grown last, and how long the last full growth took.
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
-        self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
+        climb = cost_map.terrain.climb
+        self._gaps = GapStatistics(self._grid, config, counters, climb)
+        pulls = config.routes == "pulled" and climb is None
+        self._puller = Puller(cost_map.pace_s_per_m, self._grid.resolution_m, config) if pulls else None
         self._status_due_ns = 0
         self.target_search = target_search
-        """None for a target that has a tracker."""
+        """None for one that is not searched for."""
         self._ways = Ways(tree.cost_grid)
         """To where vehicles of the class are to look."""
-        for name in COUNTS if target_search is None else COUNTS + SEARCH_COUNTS:
+        is_hidden = target_search is not None and not target_search.tracked
+        for name in COUNTS + SEARCH_COUNTS if is_hidden else COUNTS:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
@@ -141,6 +147,10 @@ class Planner:
         """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
         self._push_ns = int(push_s * NS_PER_S)
         self.tree.times.set_budget(cpu_budget)
+
+    def is_lost(self, now_ns: int) -> bool:
+        """Whether nobody knows where the target is that somebody knew of."""
+        return self._watch.lost(now_ns)
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
@@ -175,6 +185,9 @@ class Planner:
         if self.leads:
             actions.extend(told)
             actions.extend(self._pushes(now_ns))
+            if self.target_search is not None and self.vehicle_class == GROUND:
+                believed = self.target_search.told(self.target, self._incarnation, now_ns)
+                actions.extend([] if believed is None else [believed])
         if self.leads and now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + STATUS_NS
             actions.append(self.status(now_ns))
@@ -248,15 +261,16 @@ class Planner:
         search, pose, grid = self.target_search, self._watch.pose, self._grid
         if search is None:
             return
-        if self.tree.map_version < 0:
+        if self.tree.map_version < 0 and not search.tracked:
             self._learn_map()
         if self.vehicle_class != GROUND:
             return  # that class has told the search all of this
         place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
         age_ns = int((self._watch.age_s(now_ns) or 0.0) * NS_PER_S)
         search.tick(pose, place_m, age_ns, self._watch.lost(now_ns), self._cost_map.pace_s_per_m, now_ns)
-        self.counters.counts["searches"] = search.searches
-        self.counters.counts["search_places"] = search.searcher.decisions
+        if search.searches:
+            self.counters.counts["searches"] = search.searches
+            self.counters.counts["search_places"] = search.searcher.decisions
 
     def _learn_map(self) -> None:
         """Take in the map without a target to lead to."""
@@ -326,7 +340,7 @@ class Planner:
 
     def _routes(self, request: RouteRequest, now_ns: int) -> RouteReply:
         cells = self._cells(request)
-        most = MOST_STEPS // max(len(cells), 1)
+        most = (MOST_STEPS if self._puller is None else MOST_PULLED_STEPS) // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
         if (search := self._under_way) is not None:
             routes = search.routes(self._ways, cells, request.vehicles, max_cells, self.tree.map_version)
@@ -335,6 +349,7 @@ class Planner:
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
                 routes = self.tree.routes(cells, max_cells)
             self._certify(routes, now_ns)
+        routes = self._pulled(routes)
         self.counters.count("routes_served", len(routes))
         for index, vehicle in enumerate(request.vehicles):
             self.followers.given(vehicle, routes[index], request.max_cells, now_ns, now_ns + self._push_ns)
@@ -351,6 +366,9 @@ class Planner:
             tracker_lost=self._watch.lost(now_ns),
             vehicle_class=self.vehicle_class,
         )
+
+    def _pulled(self, routes: RouteBatch) -> RouteBatch:
+        return routes if self._puller is None else self._puller.pull_batch(routes)
 
     def _improvable(self, cells: list[int], routes: RouteBatch) -> list[int]:
         """The cells whose routes may be worth a growth: all, or those without a proof that they are good."""
@@ -426,7 +444,7 @@ class Planner:
         pushes: list[Action] = []
         for max_cells, batch in due.items():
             cells = [follower.cell for _, follower in batch]
-            routes = self.tree.routes(cells, max_cells)
+            routes = self._pulled(self.tree.routes(cells, max_cells))
             for (id, follower), route in zip(batch, routes, strict=True):
                 follower.stale = False
                 if route.status not in _WORTH_PUSHING or not self.followers.is_news(follower, route):
@@ -446,7 +464,8 @@ class Planner:
                 break
             if not searcher.wants_place(id) or now_ns < follower.push_ns:
                 continue
-            route = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)[0]
+            found = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)
+            route = self._pulled(found)[0]
             follower.push_ns = now_ns + self._push_ns
             if is_place(route):
                 self.followers.sent(follower, route, now_ns + self._push_ns)

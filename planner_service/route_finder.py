@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.pulled_routes import DIRECTION_OF, Puller
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -140,25 +141,23 @@ class RouteFinder:
         Raises ValueError where uphill is not downhill, on a route that does not lead to a target, and on one
         that the map's changes have shut.
         """
-        # Compiled only for those who pull: no planner waits for it at its first start.
-        from planner_service.kernels.pull import pull
-
         if self._directional:
             raise ValueError("routes are not pulled where uphill is not downhill: a climb has a price per step")
         if route.status is not RouteStatus.OK:
             raise ValueError(
                 f"route is {route.status.value!r}, expected 'ok': only a route to the target is pulled"
             )
-        cells = np.ascontiguousarray(route.cells @ np.array((self.grid.cols, 1), np.int64))
-        costs = np.empty((2, cells.size), np.float64)
-        before, turns = np.empty(cells.size, np.int64), np.empty(cells.size, np.int64)
-        count = pull(self._pace.ravel(), self.grid.cols, self._config.corner_cutting, cells, costs, before, turns)
-        if not np.isfinite(costs[1, -1]):
+        puller = Puller(self._pace, self.grid.resolution_m, self._config)
+        start = self.grid.cell(*route.cells[0].tolist())
+        codes = DIRECTION_OF[tuple(np.diff(route.cells, axis=0).T + 1)]
+        pulled, prices = puller.pull(np.array([start]), codes, np.array([codes.size]))
+        if not np.isfinite(prices[0, 0]):
             raise ValueError("the route passes a cell or a corner that is shut by now: ask for it again")
-        at = _without_straight_turns(route.cells[turns[:count]])
-        metres = self.grid.resolution_m
-        length_m = float(np.hypot(*np.diff(at, axis=0).T).sum()) * metres
-        return PulledRoute(at, float(costs[1, -1]) * metres, float(costs[0, -1]) * metres, length_m)
+        cells = walk(self.grid, start, pulled.directions.tobytes())
+        at = np.concatenate(((0,), np.cumsum(pulled.legs, dtype=np.int64)))
+        turns = np.stack(np.divmod(np.array(cells)[at], self.grid.cols), axis=1)
+        cost_s, grid_cost_s, length_m = prices[:, 0].tolist()
+        return PulledRoute(turns, cost_s, grid_cost_s, length_m)
 
     def cost_to_go_s(self) -> NDArray[np.float32]:
         """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""
@@ -173,11 +172,3 @@ class RouteFinder:
             tree.adopt(grown, pace, self._target, [], self._version, [])
         if tree.wants_strides:
             tree.take_strides(tree.stride_job().run())
-
-
-def _without_straight_turns(turns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Without those in which the route goes straight on; both segments and the one cross the same cells."""
-    legs = np.diff(turns, axis=0)
-    into, out = legs[:-1], legs[1:]
-    straight = (into[:, 0] * out[:, 1] == into[:, 1] * out[:, 0]) & ((into * out).sum(axis=1) > 0)
-    return turns[np.concatenate(((True,), ~straight, (True,)))[-len(turns) :]]

@@ -6,6 +6,8 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
+import msgspec
+
 from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
 from planner_service.class_planners import ClassPlanners
 from planner_service.full_growth import GrownTree
@@ -36,12 +38,11 @@ from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
+from swarm.wire.messages.planning import Believed, CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Chasers, Fleet
-from swarm.wire.topics import CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.topics import BELIEVED, CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
@@ -95,13 +96,11 @@ class PlannerService:
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
 
-        def search_by(costs: CostGrid) -> TargetSearch | None:
-            if not self._untracked:
-                return None
+        def search_by(costs: CostGrid) -> TargetSearch:
             hidden = hidden_target(scenario, self._target, setup.incarnation)
             return TargetSearch(hidden, costs, scenario.time_scale)
 
-        def planner_of(name: str, cost_map: CostMap, counters: Counters) -> Planner:
+        def planner_of(name: str, cost_map: CostMap) -> Planner:
             tree = TargetTree(
                 terrain.grid,
                 scenario.planner,
@@ -119,7 +118,7 @@ class PlannerService:
                 scenario.planner,
                 tree,
                 cost_map,
-                counters,
+                self.counters,
                 route_cells=scenario.vehicles.route_cells,
                 stopwatch=stopwatch,
                 newest_mark_ns=self._replica.take_newest_stamp_ns if name == GROUND else lambda: None,
@@ -130,10 +129,12 @@ class PlannerService:
                 vehicle_class=name,
             )
 
+        self._listens = False
+        """Whether vehicles tell where they are and what they see."""
         self._pose: TargetPose | None = None
         """The newest that a tracker told, for the planner of a class that is made later."""
         self._planner_of = planner_of
-        self._planner = planner_of(GROUND, self._cost_map, self.counters)
+        self._planner = planner_of(GROUND, self._cost_map)
         self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version = 0
@@ -151,7 +152,7 @@ class PlannerService:
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
         """The planner of a class that somebody asks for."""
-        planner = self._planner_of(name, self._maps.of[name], Counters())  # the status tells of "ground" alone
+        planner = self._planner_of(name, self._maps.of[name])
         planner.lead(self._planner.leads)
         self._pace(planner)
         if self._pose is not None:
@@ -165,8 +166,7 @@ class PlannerService:
         self._member.join()
         self._sync.start(now_ns)
         if self._untracked:
-            self._bus.subscribe(SIGHTED, self._post, target=self._target)
-            self._bus.collect(FLEET)
+            self._listen(True)
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
@@ -181,10 +181,7 @@ class PlannerService:
             return
         match event:
             case Heard(message=Sighted() as sighted):
-                if self._sightings.hear(sighted, now_ns):
-                    for seen in self._sightings.best(now_ns).values():
-                        for _, planner in self._planners:
-                            planner.set_pose(pose_of(seen), now_ns)
+                self._hear_sighted(sighted, now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
@@ -243,6 +240,17 @@ class PlannerService:
             model_ns = self._planner.tree.times.model_ns
             self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
 
+    def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
+        if not self._listens or not self._sightings.hear(sighted, now_ns):
+            return  # a tracker knows better
+        seen = self._sightings.best(now_ns)
+        for each in seen.values():
+            for _, planner in self._planners:
+                planner.set_pose(pose_of(each), now_ns)
+        search = self._planner.target_search
+        if not seen and search is not None and 0 <= sighted.cell < self._cost_map.grid.cells:
+            search.remember(sighted, now_ns)
+
     def _tag(self, work: str, name: str) -> str:
         """What a piece of work for the planner of a class is called."""
         return f"{work}/{name}/{self._planners.begun_ns(name)}"
@@ -254,15 +262,31 @@ class PlannerService:
         return self._planners.held(name) if tag == self._tag(work, name) else None
 
     def _look(self, now_ns: int) -> None:
-        """Take in where vehicles are, who would see a target that nobody tracks."""
-        if self._planner.target_search is None:
+        """Take in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
+        search = self._planner.target_search
+        assert search is not None
+        if search.tracked:
+            self._listen(self._planner.is_lost(now_ns))
+        if not self._listens:
             return
         for heard in self._bus.collected(FLEET):
             assert isinstance(heard.message, Fleet)
             self._presence.hear(heard.message, now_ns)
         self._presence.expire(now_ns)
         vehicles = self._presence.vehicles
-        self._planner.target_search.hear_vehicles(vehicles.east_m, vehicles.south_m)
+        search.hear_vehicles(vehicles.east_m, vehicles.south_m)
+
+    def _listen(self, listens: bool) -> None:
+        """Hear from vehicles where they are and what they see, or do not."""
+        if listens == self._listens:
+            return
+        self._listens = listens
+        if listens:
+            self._bus.subscribe(SIGHTED, self._post, target=self._target)
+            self._bus.collect(FLEET)
+        else:
+            self._bus.unsubscribe(SIGHTED, target=self._target)
+            self._bus.unsubscribe(FLEET)
 
     def _answer(self, now_ns: int) -> None:
         """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""
@@ -325,7 +349,7 @@ class PlannerService:
             event.refuse(f"{event.topic.name}: the planner ends")
             event.end()
         if self._planner.leads:
-            self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
+            self._tell_status(self._planner.status(now_ns))
         self._member.publish_stats(now_ns)
 
     def _lead(self, leads: bool, now_ns: int) -> None:
@@ -341,6 +365,12 @@ class PlannerService:
                 self._bus.unserve(topic, target=self._target)
         self._candidacy.tell(self._member, now_ns)
 
+    def _tell_status(self, status: PlannerStatus) -> None:
+        """That of "ground", with the vehicles of all classes."""
+        following = sum(len(planner.followers) for _, planner in self._planners)
+        told = msgspec.structs.replace(status, following=following)
+        self._bus.publish(STATUS, told, target=self._target)
+
     def _perform(self, planner: Planner, actions: list[Action], now_ns: int) -> None:
         name = planner.vehicle_class
         for action in actions:
@@ -354,7 +384,9 @@ class PlannerService:
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:
-                    self._bus.publish(STATUS, status, target=self._target)
+                    self._tell_status(status)
+                case Believed() as believed:
+                    self._bus.publish(BELIEVED, believed, target=self._target)
                 case Tell(kind, text, cell):
                     log.info("%s: %s", kind, text)
                     self._member.note(now_ns, kind, text, cell)

@@ -116,7 +116,7 @@ class TargetWatch:
         assert pose is not None
         self._lost, self._lost_since_ns = True, self._tracking.heard_ns
         self._count("trackers_lost")
-        then = "routes lead to where it was"
+        then = "routes lead to where it was, and after 30 s it is searched for"
         if not self._tracker:
             then = "it is searched for"
             why = f"no vehicle has seen it for {(now_ns - self._tracking.heard_ns) / NS_PER_S:.1f} s"

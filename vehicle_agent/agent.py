@@ -109,8 +109,14 @@ class Agent:
             self._in_reach,
             f"{scenario.seed}/{plan.id}",
         )
+        self._pulled = scenario.planner.routes == "pulled"
         self._driver = Driver(
-            local_map, holdings, self._steering.passable, dynamics, measures=scenario.map.learning
+            local_map,
+            holdings,
+            self._steering.passable,
+            dynamics,
+            pulled=self._pulled,
+            measures=scenario.map.learning,
         )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
         self._planners: dict[str, int] = {}
@@ -354,6 +360,10 @@ class Agent:
             self._moved(counts, now_ns)
         return counts
 
+    def lost(self, now_ns: int) -> set[str]:
+        """The targets of which nobody knows any more where they are."""
+        return self._trackings.lost(now_ns)
+
     def see_target(self, pose: TargetPose, now_ns: int) -> None:
         """Where a target without a tracker is, by the best sighting of it. A pose outside the grid is ignored."""
         if 0 <= pose.cell < self._map.grid.cells:
@@ -435,6 +445,9 @@ class Agent:
             if not pushed:
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
+        if searching and target not in self._unseen and target in self.lost(now_ns):
+            self._unseen.add(target)
+            self._poses.pop(target, None)
         try:
             cells = walk(self._map.grid, route.start, route.directions)
         except ValueError:
@@ -442,7 +455,10 @@ class Agent:
                 vehicle.no_answer(now_ns)
             return []
         partial = route.remaining_s > 0.0
-        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching)
+        turns = route.turns if self._pulled else ()
+        given = GivenRoute(
+            target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching, turns
+        )
         path = self.holdings.path(vehicle.id)
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:

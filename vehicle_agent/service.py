@@ -28,7 +28,7 @@ from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
-from swarm.wire.fields import column
+from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.orders import Obey
@@ -229,6 +229,8 @@ class AgentService:
                     self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
             case Appeared(peer):
                 self._roster.appeared(peer)
+                if peer.role == "planner":
+                    self._detector.retell(job_of(peer.id), now_ns)
                 agent.set_planners(self._planners(), now_ns)
             case Disappeared(peer):
                 self._roster.gone(peer)
@@ -350,10 +352,13 @@ class AgentService:
 
     def _tell_sighted(self, places: Places, now_ns: int) -> None:
         self._untracked.expire(now_ns)
+        self._detector.lose(self._agent.lost(now_ns) - self._untracked.targets)
         for sighted in self._detector.look(places, now_ns):
             self.counters.count("targets_sighted")
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
             self._hear_sighted(sighted, now_ns)
+        for sighted in self._detector.retold(now_ns):
+            self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
 
     def _hear_pose(self, heard: Heard, now_ns: int) -> None:
         pose = heard.message
@@ -388,6 +393,7 @@ class AgentService:
         bodies.complaints.clear()
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
+        self._detector.hear(sighted)
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
             self._agent.see_target(pose, now_ns)
@@ -441,6 +447,7 @@ class AgentService:
                 directions=directions_of(route.cells, self._replica.grid.cols),
                 cost_s=route.cost_s,
                 lower_bound_s=route.lower_bound_s,
+                legs=pack_column(route.legs, "<u4"),
             )
             self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
 

@@ -197,7 +197,7 @@ def chase(
         _drive(at, left_s, chased, parents, cost_grid.cell_cost, (offsets, steps_m))
         cells = cost_grid.unpad_all(at)
         for vehicle, cell in zip(agents.vehicles, cells.tolist(), strict=True):
-            vehicle.motion.tail = vehicle.motion.head = cell
+            vehicle.motion.put(cell)
         for n in open_targets:
             walkers[n].advance(world.truth, _TICK_S, cells)
         now_s += _TICK_S

@@ -247,15 +247,20 @@ def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _figures(times: Sequence[float]) -> dict[str, Any]:
-    median = statistics.median(times)
-    never = sum(map(math.isinf, times)) / len(times)
-    return {"runs": len(times), "median_s": None if math.isinf(median) else median, "never": never}
+    """The median lies between the two of `median_95_s` with 95 %, whatever the times are distributed like: so many
+    ranks from the middle of the runs (null: never)."""
+    ordered, many = sorted(times), len(times)
+    off = 0.98 * math.sqrt(many)
+    between = (ordered[max(math.floor(many / 2 - off), 0)], ordered[min(math.ceil(many / 2 + off), many) - 1])
+    median, *ends = (None if math.isinf(each) else each for each in (statistics.median(ordered), *between))
+    never = sum(map(math.isinf, times)) / many
+    return {"runs": many, "median_s": median, "median_95_s": ends, "never": never}
 
 
 def tables(report: dict[str, Any]) -> list[Table | str]:
     """For people."""
     title = f"{report['vehicles']} vehicles, lost for {report['lost_s']:g} s, {report['hours']:g} h"
-    found = table(title, "<walk", "<strategy", "runs", "median s", "never %", "decisions", "ms each")
+    found = table(title, "<walk", "<strategy", "runs", "median s", "95 %", "never %", "decisions", "ms each")
     for row in report["runs"]:
         median, cpu = row["median_s"], row["decision_ms"]
         found.add_row(
@@ -263,6 +268,7 @@ def tables(report: dict[str, Any]) -> list[Table | str]:
             row["strategy"],
             str(row["runs"]),
             "-" if median is None else f"{median:,.0f}",
+            " to ".join("-" if each is None else f"{each:,.0f}" for each in row["median_95_s"]),
             f"{100 * row['never']:.0f}",
             f"{row['decisions']:.0f}",
             "-" if cpu is None else f"{cpu:.1f}",

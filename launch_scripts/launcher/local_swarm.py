@@ -207,11 +207,12 @@ class LocalSwarm:
     def _start(self, running: Running, restarts: int = 0) -> None:
         listen, tell = self._context.Pipe(duplex=False)
         spec = running.spec
+        setup = self._setup_of(spec)
         process = self._context.Process(
             target=run_child,
             args=(
                 spec.entry,
-                replace(self._setup_of(spec), restarts=restarts),
+                replace(setup, restarts=restarts, anew=setup.anew and not restarts),
                 self._log_dir / f"{spec.name}.log",
                 tell,
             ),

@@ -76,7 +76,6 @@ def run_swarm(options: UpOptions) -> int:
     if not options.joins:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = run_id_of(options)
-    is_new = not options.joins and options.is_whole and options.run_id is None  # else others may use its folder
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
@@ -85,7 +84,7 @@ def run_swarm(options: UpOptions) -> int:
         run = _Run(options, run_id, run_dir, started_ns)
         return run.run()
     finally:
-        if is_new and (run is None or not run.begun):
+        if options.is_new and (run is None or not run.begun):
             shutil.rmtree(run_dir, ignore_errors=True)
 
 
@@ -227,6 +226,7 @@ class _Run:
             started_ns=self._started_ns,
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,
+            anew=self._options.is_new,
             before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
         )
 

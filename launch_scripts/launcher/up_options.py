@@ -43,6 +43,11 @@ class UpOptions:
     metrics_port: int | None = None
 
     @property
+    def is_new(self) -> bool:
+        """Whether the run begins here, with all of its processes."""
+        return not self.joins and self.is_whole and self.run_id is None
+
+    @property
     def is_whole(self) -> bool:
         """Whether nothing but a router may be lacking."""
         return set(ROLES[1:]) <= set(self.roles) and self.rank is None

@@ -35,7 +35,7 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
+from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,14 @@ _GONE = "gone"
 """Tag of the question what processes that are gone have counted."""
 FRAME_HZ = 10.0
 """How often the view is drawn."""
-_DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
+_DRAWN: dict[Topic, float] = {
+    FLEET: 0.5 / FRAME_HZ,
+    POSE: 0.0,
+    FOLLOWED: 0.5,
+    SIGHTED: 0.0,
+    BODY: 0.0,
+    BELIEVED: 0.5,
+}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _ENDED_KEPT = 4096
 _ANSWER_S = 5.0

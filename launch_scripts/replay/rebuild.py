@@ -87,6 +87,7 @@ def setup_of(head: Head, folder: Path) -> RoleSetup:
         added=head.added,
         restarts=head.restarts,
         before=decode(head.before, Stats) if head.before else None,
+        anew=head.anew,
     )
 
 

@@ -193,6 +193,10 @@ class Observed(Counts):
         """Vehicle -> its group."""
         return {id: fleet.group for fleet in self._fleets.values() for id in fleet.ids}
 
+    def classes(self) -> dict[str, str]:
+        """Vehicle -> the class that it belongs to."""
+        return {id: fleet.vehicle_class for fleet in self._fleets.values() for id in fleet.ids}
+
     def targets(self) -> dict[str, tuple[float, float]]:
         """(east, south) in metres of every target, in order of id."""
         return {id: self.place_m(pose) for id, pose in sorted(self.poses.items())}

@@ -9,7 +9,7 @@ from launch_scripts.world.referee import BodyHit, Collision, LethalEntry
 from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.targets import Action, Captured, Publish, TargetWorld
 from launch_scripts.world.telling import Telling
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.liveness import Roster
@@ -44,9 +44,17 @@ class TargetsService:
         self._post = post
         self._ask_due_ns = 0
         self._candidacy = Candidacy(setup, setup.scenario.standbys.targets, TICK_HZ, bus, post)
-        self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation, leads=self._candidacy.leads)
+        self._world = TargetWorld(
+            setup.scenario,
+            terrain,
+            truth,
+            setup.incarnation,
+            homes=load_homes(setup, terrain, truth),
+            leads=self._candidacy.leads,
+        )
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
+        self._anew = setup.anew
         self._heard: set[str] = set()
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
         self._telling = Telling(terrain.grid.resolution_m)
@@ -131,6 +139,8 @@ class TargetsService:
             self._obeyed_version = orders.book.version
             obeyed = self._world.obey(orders.book, self._scenario, now_ns, first=version is None)
             self._perform(obeyed, now_ns)
+            if version is None and self._anew:
+                self._world.begin_anew()
             self._hear_targets()
         orders.tick(now_ns)
 

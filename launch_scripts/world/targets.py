@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from launch_scripts.world.referee import BodyHit, Collision, LethalEntry, Referee
 from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.walks import Budget, TrueTerrain, Walker, WalkWorld, far_place, slowness_of, walk_of
-from shared_map.arrays import Floats, private_copy
+from shared_map.arrays import Bools, Floats, private_copy
 from shared_map.class_grounds import class_truths
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.places import MapFrame
@@ -90,6 +90,7 @@ class TargetWorld:
     leads   false for a standby, which follows the poses that another tells and does nothing itself
     paused  nothing moves, and nobody is captured
     faults  what plug-ins did wrong, for the owner to tell and clear
+    homes   `homes_of` terrain and truth, where they have been found already
     """
 
     paused = False
@@ -101,6 +102,7 @@ class TargetWorld:
         truth_s_per_m: NDArray[np.float32],
         incarnation: int,
         *,
+        homes: Bools | None = None,
         leads: bool = True,
     ) -> None:
         self.leads = leads
@@ -112,7 +114,7 @@ class TargetWorld:
         pace: Floats = inflate(truth_s_per_m, halves) if halves else private_copy(truth_s_per_m)
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
-        self._terrain = TrueTerrain(terrain.grid, pace, terrain.climb)
+        self._terrain = TrueTerrain(terrain.grid, pace, terrain.climb, None if halves else homes)
         self._referee = Referee(class_truths(scenario, terrain, truth_s_per_m), terrain.grid)
         self._target_bodies = TargetBodies(scenario, terrain.grid)
         self.rovers = Rovers(scenario, self._terrain, incarnation)
@@ -202,6 +204,11 @@ class TargetWorld:
             target.walker.put(cell)
             target.placed = True
         target.unheard_of = not target.placed
+
+    def begin_anew(self) -> None:
+        """Places all targets at the next tick: nobody can have seen them before."""
+        for target in self._targets.values():
+            target.unheard_of = not target.placed
 
     def planner_up(self, id: str, up: bool) -> None:
         """The planner of a target has appeared or gone."""

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import CellsOf
+from shared_map.arrays import Bools, CellsOf
+from shared_map.terrain.homes import largest_part
 from shared_map.terrain.step_climb import Climb
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
@@ -42,12 +43,16 @@ class TrueTerrain:
     """True pace of every cell, and the steps that are possible.
 
     climb  factor of a step's cost by its slope; None if steps cost the same both ways
+    home   the largest connected part that can be driven, where that has been found already
     """
 
-    def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32], climb: Climb | None = None) -> None:
-        # Imported here: it takes as long as all else that a run's roles share, and one process of them needs it.
-        from scipy.ndimage import label
-
+    def __init__(
+        self,
+        grid: GridSpec,
+        pace_s_per_m: NDArray[np.float32],
+        climb: Climb | None = None,
+        home: Bools | None = None,
+    ) -> None:
         self.grid = grid
         self.climb = climb
         self.pace_s_per_m = pace_s_per_m.view()
@@ -55,13 +60,7 @@ class TrueTerrain:
         passable = np.isfinite(pace_s_per_m)
         if not passable.any():
             raise TerrainError("every cell of the terrain is lethal: no target could stand on it")
-        # A diagonal step has passable cells beside it, so what is connected by eight-neighbour steps is exactly
-        # what is connected by four-neighbour steps.
-        regions: NDArray[np.signedinteger[Any]]
-        regions, _ = label(passable)
-        sizes = np.bincount(regions.ravel())
-        sizes[0] = 0
-        self._home = CellsOf(regions == int(sizes.argmax()))
+        self._home = CellsOf(largest_part(passable) if home is None else home)
 
     @property
     def home(self) -> NDArray[np.int64]:

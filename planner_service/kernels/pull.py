@@ -1,13 +1,19 @@
-"""Pulling a route straight: which of its cells a vehicle turns in, when it drives segments from centre to centre.
+"""Pulling routes straight: which of its cells a vehicle turns in, when it drives segments from centre to centre.
 
 A segment costs the integral of the pace of the cells that it crosses, found by Amanatides and Woo, "A fast voxel
-traversal algorithm" (1987), with crossings compared as integers. Arrays, of n cells of a route over a map of
-rows x cols:
-    pace    float32  (rows * cols,)  s for a metre; inf is lethal
-    cells   int64    (n,)     the route's cells, neighbours of each other, none lethal
-    costs   float64  (2, n)   in paces times cells, from the first cell to each: along the route itself, and pulled
-    before  int64    (n,)     index of the cell in which the cheapest pulled way to each one turned last
-    turns   int64    (n,)     indices of the cells in which the pulled route turns, its first and last ones included
+traversal algorithm" (1987), with crossings compared as integers. Arrays, of n routes over a map of rows x cols, of
+which the longest has m cells:
+    pace       float32  (rows * cols,)  s for a metre; inf is lethal
+    routes     (starts int64 (n,), directions uint8 (sum of steps,), ends int64 (n,)), as `RouteBatch`
+    cells      int64    (m,)     those of one route, neighbours of each other
+    costs      float64  (2, m)   in paces times cells, from its first cell to each: along the route, and pulled
+    before     int64    (m,)     index of the cell in which the cheapest pulled way to each one turned last
+    turns      int64    (m,)     indices of the cells in which the pulled route turns, its first and last included
+    pulled     (directions uint8 (2 * sum of steps,), ends int64 (n,), legs uint32 (2 * sum of steps,),
+               many int64 (1,)): steps along the cells that each pulled route crosses, and of each of its
+               segments over how many of them it goes; how many segments there are
+    prices     float64  (3, n)   of each route: cost pulled, cost along the route, both as above, and the length
+                                 of the segments in cells
 """
 
 from __future__ import annotations
@@ -20,12 +26,17 @@ from planner_service.kernels.compile import helper, kernel
 
 LOOK_BACK = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """How many cells back a segment may begin, beside the cell before and where the way to that one turned."""
+NO_CORNERS, OPEN_CORNERS, ALL_CORNERS = range(3)
+"""Through an exact corner a segment passes never, between two passable cells only, or always."""
+
+_ROW_STEP = (-1, -1, 0, 1, 1, 1, 0, -1)
+_COL_STEP = (0, 1, 1, 1, 0, -1, -1, -1)
 
 
 @helper
 def segment_cost(pace, cols, corners, start, end, limit):
     """float64: a segment's cost, in paces times cells; inf if it is not below `limit`, or meets a lethal cell, or a
-    lethal one beside a corner that it passes exactly (unless `corners` are cut)."""
+    an exact corner that it may not pass."""
     down, right = end // cols - start // cols, end % cols - start % cols
     rows_left, cols_left = abs(down), abs(right)
     length = math.sqrt(np.float64(rows_left * rows_left + cols_left * cols_left))
@@ -43,9 +54,9 @@ def segment_cost(pace, cols, corners, start, end, limit):
         total += np.float64(pace[np.uint64(cell)]) * (crossing - at)
         if not total < limit:
             return np.inf
-        if next_row == next_col and not corners:
+        if next_row == next_col and corners != ALL_CORNERS:
             beside = max(pace[np.uint64(cell + row_step)], pace[np.uint64(cell + col_step)])
-            if beside == np.inf:
+            if beside == np.inf or corners == NO_CORNERS:
                 return np.inf
         on_row, on_col = next_row == crossing, next_col == crossing
         if on_row:
@@ -59,14 +70,15 @@ def segment_cost(pace, cols, corners, start, end, limit):
     return total * (length / whole) if total < limit else np.inf
 
 
-@kernel("i8(f4[::1], i8, b1, i8[::1], f8[:, ::1], i8[::1], i8[::1])")
-def pull(pace, cols, corners, cells, costs, before, turns):
-    """Write `costs`, `before` and `turns`; returns how many turns there are. Never dearer than the route itself:
-    each cell's pulled cost is at most that of the cell before plus the step between."""
+@helper
+def _pull(pace, cols, corners, scratch, size):
+    """Write `costs`, `before` and `turns` of the first `size` cells; returns how many turns there are. Never dearer
+    than the route itself: each cell's pulled cost is at most that of the cell before plus the step between."""
+    cells, costs, before, turns = scratch
     along, pulled = costs[0], costs[1]
     along[0] = pulled[0] = 0.0
     before[0] = 0
-    for j in range(1, cells.size):
+    for j in range(1, size):
         step = segment_cost(pace, cols, corners, cells[j - 1], cells[j], np.inf)
         along[j] = along[j - 1] + step
         best, turn = pulled[j - 1] + step, j - 1
@@ -87,7 +99,7 @@ def pull(pace, cols, corners, cells, costs, before, turns):
                 break
             i = before[i]
         pulled[j], before[j] = best, turn
-    count, j = 1, cells.size - 1
+    count, j = 1, size - 1
     turns[0] = j
     while j > 0:
         j = before[j]
@@ -96,3 +108,84 @@ def pull(pace, cols, corners, cells, costs, before, turns):
     for i in range(count // 2):
         turns[i], turns[count - 1 - i] = turns[count - 1 - i], turns[i]
     return count
+
+
+@helper
+def _goes_straight(cols, a, b, c):
+    """Whether a way over three centres does not turn in the second one."""
+    down, right = b // cols - a // cols, b % cols - a % cols
+    further_down, further_right = c // cols - b // cols, c % cols - b % cols
+    same_line = down * further_right == right * further_down
+    return same_line and down * further_down + right * further_right > 0
+
+
+@helper
+def _lay_out(cols, start, end, directions, at):
+    """Write the steps along the cells that a segment crosses, from index `at` on; returns the index behind them."""
+    down, right = end // cols - start // cols, end % cols - start % cols
+    rows_left, cols_left = abs(down), abs(right)
+    whole = 2 * max(rows_left, 1) * max(cols_left, 1)
+    next_row = max(cols_left, 1) if rows_left else whole
+    next_col = max(rows_left, 1) if cols_left else whole
+    straight_down, straight_right = np.uint8(4 if down > 0 else 0), np.uint8(2 if right > 0 else 6)
+    if down > 0:
+        both = np.uint8(3 if right > 0 else 5)
+    else:
+        both = np.uint8(1 if right > 0 else 7)
+    while next_row < whole or next_col < whole:
+        if next_row == next_col:
+            directions[at] = both
+        else:
+            directions[at] = straight_down if next_row < next_col else straight_right
+        on_row, on_col = next_row <= next_col, next_col <= next_row
+        if on_row:
+            next_row += 2 * max(cols_left, 1)
+        if on_col:
+            next_col += 2 * max(rows_left, 1)
+        at += 1
+    return at
+
+
+@kernel(
+    "void(f4[::1], i8, i8, Tuple((i8[::1], u1[::1], i8[::1])), Tuple((i8[::1], f8[:, ::1], i8[::1], i8[::1])), "
+    "Tuple((u1[::1], i8[::1], u4[::1], i8[::1])), f8[:, ::1])"
+)
+def pull_routes(pace, cols, corners, routes, scratch, pulled, prices):
+    """Write `pulled` and `prices`. A route that meets a lethal cell costs inf and stays as it is, each step a
+    segment."""
+    starts, directions, ends = routes
+    cells, costs, _, turns = scratch
+    out, out_ends, legs, many_legs = pulled
+    at = many = 0
+    begin = np.int64(0)
+    for n in range(starts.size):
+        size = ends[n] - begin + 1
+        cells[0] = starts[n]
+        for i in range(1, size):
+            code = directions[begin + i - 1]
+            cells[i] = cells[i - 1] + _ROW_STEP[code] * cols + _COL_STEP[code]
+        prices[0, n] = prices[1, n] = prices[2, n] = 0.0
+        if size > 1:
+            count = _pull(pace, cols, corners, scratch, size)
+            prices[0, n], prices[1, n] = costs[1, size - 1], costs[0, size - 1]
+            if prices[0, n] == np.inf:
+                for i in range(size - 1):
+                    out[at + i], legs[many + i] = directions[begin + i], 1
+                at, many = at + size - 1, many + size - 1
+                count = 0
+            first = 0  # of the segment that is under way, as an index into `turns`
+            for i in range(1, count):
+                more = i + 1 < count and _goes_straight(
+                    cols, cells[turns[first]], cells[turns[i]], cells[turns[i + 1]]
+                )
+                if more:
+                    continue
+                start, end = cells[turns[first]], cells[turns[i]]
+                down, right = end // cols - start // cols, end % cols - start % cols
+                prices[2, n] += math.sqrt(np.float64(down * down + right * right))
+                until = _lay_out(cols, start, end, out, at)
+                legs[many] = until - at
+                at, many, first = until, many + 1, i
+        begin = ends[n]
+        out_ends[n] = at
+    many_legs[0] = many

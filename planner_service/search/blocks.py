@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -45,6 +46,16 @@ class Blocks:
         """bool (rows, cols): the blocks with a passable cell."""
         opened: Bools = self.share > 0.0
         return opened
+
+    @property
+    def middles(self) -> NDArray[np.int64]:
+        """int64 (rows * cols,): the cell of the grid that is nearest to the middle of each block."""
+        rows, cols = (
+            np.minimum(np.arange(many) * self.side_cells + self.side_cells // 2, last)
+            for many, last in zip(self.shape, (self.grid.rows - 1, self.grid.cols - 1), strict=True)
+        )
+        middles: NDArray[np.int64] = (rows[:, None] * self.grid.cols + cols).reshape(-1)
+        return middles
 
     def of_cell(self, cell: int) -> tuple[int, int]:
         """(row, col) of the block of a cell of the grid."""

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from planner_service.search.belief import Belief
 from planner_service.search.blocks import Blocks, blocks_of
@@ -95,6 +96,16 @@ class Searcher:
     def goals(self) -> dict[str, int]:
         """Vehicle -> the cell at which it is to look."""
         return {id: goal.way.cells[-1] for id, goal in self._goals.items()}
+
+    def likeliest(self, most: int) -> tuple[NDArray[np.int64], Floats, float]:
+        """The likeliest blocks: a cell near the middle of each, its probability, and the metres of a side. None of
+        them while it does not search."""
+        if self.belief is None:
+            return np.empty(0, np.int64), np.empty(0, np.float32), 0.0
+        blocks, total = self.belief.blocks, self.belief.total.reshape(-1)
+        best = np.argsort(-total, kind="stable")[:most]
+        best = best[total[best] > 0.0]
+        return blocks.middles[best], np.minimum(total[best], np.float32(1.0)), blocks.side_m
 
     def begin(self, pace_s_per_m: Floats, cell: int | None, age_s: float) -> None:
         """Search from now on.

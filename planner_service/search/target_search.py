@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,20 +17,27 @@ from shared_map.arrays import Floats
 from swarm.clock import NS_PER_S
 from swarm.config.classes import least_sense_range_m
 from swarm.config.scenario import Scenario, ids_of
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import MOST_BELIEVED, Believed
+from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is told of twice a second: one that is not told of for so long, though a vehicle is where it
 was, is not there."""
+LOST_NS = 30 * NS_PER_S
+"""A target whose tracker is lost is searched for after so long: most trackers are back by then."""
 LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for so long before it takes its target for never seen."""
+_TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
 
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """What a planner has to know of a target that only vehicles see.
+    """What a planner has to know of a target to search for it.
+
+    tracked          whether it has a tracker: then it is searched for only while that is lost
 
     sense_range_m    how far they see it
     capture_range_m  how near captures it
@@ -38,6 +46,7 @@ class Hidden:
     seed             of the run, the target and the planner
     """
 
+    tracked: bool
     sense_range_m: float
     capture_range_m: float
     slowness: float
@@ -62,8 +71,20 @@ class TargetSearch:
         self._places_m: list[tuple[float, float]] = []
         self._first_ns: int | None = None
         self._ticked_ns = 0
+        self._remembered: Sighted | None = None
+        """The newest sighting that had expired when it was heard."""
+        self._begun_from: Sighted | None = None
+        """By which of these the search began."""
+        self._tell_ns = 0
+        self._has_told = False
+        """Whether a search under way was told of last."""
         self._searched: TargetPose | None = None
         """What was the newest pose when the search began."""
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the target has a tracker, if none that lives."""
+        return self._hidden.tracked
 
     @property
     def active(self) -> bool:
@@ -72,6 +93,13 @@ class TargetSearch:
     def hear_vehicles(self, east_m: Floats, south_m: Floats) -> None:
         """Where all vehicles are that count, m from the grid's corner."""
         self._places_m = list(zip(east_m.tolist(), south_m.tolist(), strict=True))
+
+    def remember(self, sighted: Sighted, now_ns: int) -> None:
+        """An earlier sighting is told again, as to a planner that begins anew. Stamps ahead of the clock count as
+        now."""
+        known = self._remembered
+        if known is None or (min(sighted.stamp_ns, now_ns), sighted.author) > (known.stamp_ns, known.author):
+            self._remembered = msgspec.structs.replace(sighted, stamp_ns=min(sighted.stamp_ns, now_ns))
 
     def tick(
         self,
@@ -93,25 +121,46 @@ class TargetSearch:
             self._first_ns = self._ticked_ns = now_ns
         elapsed_s = (now_ns - self._ticked_ns) / NS_PER_S * self.time_scale
         self._ticked_ns = now_ns
-        if self.active and pose is not self._searched:
+        told_since = pose is None and self._begun_from is not self._remembered
+        if self.active and (pose is not self._searched or told_since):
             self.searcher.end()
         if not self.active:
             nearest_m = min((math.dist(place_m, each) for each in self._places_m), default=math.inf)
             if self._is_unseen(pose, nearest_m, age_ns, lost, now_ns):
                 caught = self._hidden.jumps and nearest_m <= 2 * self._hidden.capture_range_m
                 cell = None if pose is None or caught else pose.cell
+                if pose is None and self._remembered is not None:
+                    cell, age_ns = self._remembered.cell, now_ns - self._remembered.stamp_ns
                 age_s = min(age_ns / NS_PER_S * self.time_scale, _LONGEST_S)
                 self.searcher.begin(pace, cell, age_s)
-                self._searched = pose
+                self._searched, self._begun_from = pose, self._remembered
                 self.searches += self.active
         self.searcher.tick(elapsed_s, self._places_m)
 
     def _is_unseen(self, pose: TargetPose | None, nearest_m: float, age_ns: int, lost: bool, now_ns: int) -> bool:
         if pose is None:
             assert self._first_ns is not None
-            return now_ns - self._first_ns >= LISTEN_NS
+            return not self.tracked and now_ns - self._first_ns >= LISTEN_NS
+        if self.tracked:
+            return lost and age_ns >= LOST_NS
         look_m = max(self._hidden.sense_range_m / 2, min(self._hidden.capture_range_m, self._hidden.sense_range_m))
         return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
+
+    def told(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
+        """What is believed, for people to look at; None if it is not time to tell it."""
+        if now_ns < self._tell_ns or not (self.active or self._has_told):
+            return None
+        self._tell_ns = now_ns + _TELL_NS
+        self._has_told = self.active
+        cells, shares, side_m = self.searcher.likeliest(MOST_BELIEVED)
+        return Believed(
+            target=target,
+            incarnation=incarnation,
+            stamp_ns=now_ns,
+            side_m=side_m,
+            cells=cells.tolist(),
+            shares=pack_column(shares, "<f4"),
+        )
 
     def routes(
         self, ways: Ways, cells: Sequence[int], vehicles: Sequence[str], max_cells: int, version: int
@@ -144,15 +193,16 @@ def is_place(route: Route) -> bool:
 
 
 def hidden_target(scenario: Scenario, target: str, incarnation: int) -> Hidden:
-    """What a scenario says of a target that only vehicles see, for one life of its planner."""
-    config = next(each for each in scenario.targets if target in ids_of(each))
-    speed_m_per_s = config.speed_m_per_s
-    # A target never outruns a vehicle: that of an outside process is taken to be as quick.
+    """What a scenario says of a target, for one life of its planner."""
+    config = next((each for each in scenario.targets if target in ids_of(each)), None)
+    # A target never outruns a vehicle; one that was added while the swarm ran is taken to be as quick.
+    speed_m_per_s = math.inf if config is None else config.speed_m_per_s
     slowness = math.inf if speed_m_per_s <= 0 else max(1.0, scenario.cost.flat_speed_m_per_s / speed_m_per_s)
     return Hidden(
+        tracked=target not in scenario.untracked,
         sense_range_m=least_sense_range_m(scenario),
         capture_range_m=scenario.vehicles.capture_range_m,
         slowness=slowness,
-        jumps=config.caught == "jump" and config.is_simulated,
+        jumps=config is not None and config.caught == "jump" and config.is_simulated,
         seed=f"{scenario.seed}/{target}/{incarnation}",
     )

@@ -1,4 +1,4 @@
-"""Made-up terrains of earlier runs, kept in the user's cache folder: making one again gives the same bits, slowly.
+"""Built-in terrains of earlier runs, kept in the user's cache folder: making one again gives the same bits, slowly.
 
 A terrain is kept under the digest of all that it is made from: the scenario's part in it, and the code. Its files
 are linked into a run's folder where the file system allows, so that they lie on the disk once. Every file is
@@ -23,6 +23,7 @@ from pathlib import Path
 import msgspec
 
 from shared_map.source_digest import source_digest
+from swarm.config.load import BUILT_IN_TERRAINS
 from swarm.config.scenario import Scenario
 
 log = logging.getLogger(__name__)
@@ -40,15 +41,16 @@ def kept_root() -> Path:
 
 
 def kept_key(scenario: Scenario) -> str | None:
-    """Digest of all that a terrain and its truth follow from; None where files have a part in it."""
+    """Digest of all that a terrain and its truth follow from; None where files of the user's have a part in it."""
     terrain, cost = scenario.terrain, scenario.cost
     zones = (*cost.zones, *terrain.hidden.zones)
     files = terrain.photo or terrain.labels or terrain.cover or cost.layers or any(z.mask or z.file for z in zones)
-    if terrain.source != "synthetic" or files:
+    if terrain.source not in BUILT_IN_TERRAINS or files:
         return None
     here = Path(__file__).parent
     code = source_digest(here.parent, *sorted(each.parent for each in here.rglob("__init__.py")))
-    libraries = f"{version('scipy')} {version('scikit-image')}"
+    # One of them brings the elevation of "jacksboro".
+    libraries = " ".join(map(version, ("scipy", "scikit-image", "matplotlib")))
     payload = msgspec.json.encode([code, libraries, scenario.seed, terrain, cost], order="sorted")
     return hashlib.blake2b(payload, digest_size=16).hexdigest()
 

@@ -18,6 +18,7 @@ from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError
 from swarm.wire.fields import check_id
+from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.targets import POSE_LEASE_S
 
@@ -89,6 +90,7 @@ class Swarm:
         radius_m: float = 1.0,
         lease_s: float = 2.0,
         right_of_way: bool | str | Path = False,
+        vehicle_class: str = GROUND,
     ) -> Vehicle:
         """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
 
@@ -99,8 +101,9 @@ class Swarm:
         right_of_way  it may reserve cells, which nobody else enters then (`Vehicle.reserve`). Needs the user of the
                       swarm, or with certificates the name `rover.GROUP.ID`. What its next life needs is kept in the
                       file of this path; if True, in one of this user's own for each run and id
+        vehicle_class  whose routes it asks for: one of the scenario's classes of vehicles
         """
-        vehicle = Vehicle(self._session, id, group, radius_m, lease_s)
+        vehicle = Vehicle(self._session, id, group, radius_m, lease_s, vehicle_class)
         if right_of_way:
             file = None if right_of_way is True else Path(right_of_way)
             try:

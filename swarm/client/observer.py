@@ -47,6 +47,7 @@ class SeenVehicle:
     heading_rad: float | None
     state: str
     target: str | None
+    vehicle_class: str = "ground"
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +233,7 @@ def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
     return [
         SeenVehicle(
             id, fleet.group, grid.west_m + east_m, grid.north_m - south_m, heading_rad,
-            VehicleState(state).name.lower(), target,
+            VehicleState(state).name.lower(), target, fleet.vehicle_class,
         )
         for id, east_m, south_m, heading_rad, state, target in zip(*columns, strict=True)
     ]  # fmt: skip

@@ -24,6 +24,8 @@ class Route:
     status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target;
                    searching
     cells          from the vehicle's cell to the target's, or as far as the planner tells
+    turns          of a pulled route the indices of the cells in which it turns, its first and last included: it
+                   goes straight from one to the next, along the cells between. Empty: from cell to cell
     cost_s         seconds that it takes
     lower_bound_s  proven: no route is quicker on the planner's present map
     remaining_s    cost-to-go from the last cell; 0 if that is the target's
@@ -40,6 +42,7 @@ class Route:
     remaining_s: float
     pose_age_s: float | None = None
     tracker_lost: bool = False
+    turns: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
@@ -50,7 +53,7 @@ class Route:
         age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
         return cls(
             frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
-            age_s, lost,
+            age_s, lost, route.turns if led else (),
         )  # fmt: skip
 
     @property
@@ -71,12 +74,13 @@ class Route:
 
     @cached_property
     def points_m(self) -> tuple[Point, ...]:
-        """(x_m, y_m) of the middles of its cells."""
-        return tuple(map(self.frame.centre_m, self.cells))
+        """(x_m, y_m) of the middles of its cells; of a pulled route, of those in which it turns."""
+        turns = (self.cells[turn] for turn in self.turns) if self.turns else self.cells
+        return tuple(map(self.frame.centre_m, turns))
 
     @cached_property
     def points_wgs84(self) -> tuple[Point, ...]:
-        """(lat_deg, lon_deg) of the middles of its cells. Raises as `Frame.to_wgs84`."""
+        """(lat_deg, lon_deg) of `points_m`. Raises as `Frame.to_wgs84`."""
         return tuple(self.frame.to_wgs84(*point) for point in self.points_m)
 
     @property

@@ -21,7 +21,7 @@ from swarm.errors import BusError, ConfigError
 from swarm.wire.fields import check_id
 from swarm.wire.messages.bodies import LONGEST_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
 from swarm.wire.messages.marks import MarkSet, MarksRequest
-from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
+from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
 from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE, ROUTE
 
@@ -39,11 +39,20 @@ class Vehicle:
     group        whose it is: who reads its marks
     radius_m     around its place, which others keep clear
     lease_s      others avoid its last place for so long after they hear nothing more
+    vehicle_class  whose routes it asks for
     incarnation  when it joined, in ns: tells it from an earlier life under the same id
     """
 
-    def __init__(self, session: Session, id: str, group: str, radius_m: float, lease_s: float) -> None:
-        for name, value in (("id", id), ("group", group)):
+    def __init__(
+        self,
+        session: Session,
+        id: str,
+        group: str,
+        radius_m: float,
+        lease_s: float,
+        vehicle_class: str = GROUND,
+    ) -> None:
+        for name, value in (("id", id), ("group", group), ("vehicle_class", vehicle_class)):
             try:
                 check_id(name, value)
             except ValueError as error:
@@ -59,6 +68,7 @@ class Vehicle:
         self.group = group
         self.radius_m = radius_m
         self.lease_s = lease_s
+        self.vehicle_class = vehicle_class
         self.incarnation = session.now_ns()
         self._session = session
         self._body: Body | None = None
@@ -180,7 +190,8 @@ class Vehicle:
         """As `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
         session = self._session
         _check_target(session, target)
-        asked = session.ask(ROUTE, RouteRequest(cells=[self.cell]), timeout_s, target=target)
+        request = RouteRequest(cells=[self.cell], vehicle_class=self.vehicle_class)
+        asked = session.ask(ROUTE, request, timeout_s, target=target)
         found: Future[Route] = Future()
 
         def finish(done: Future[list[Any]]) -> None:
@@ -235,7 +246,9 @@ class Vehicle:
         if self._asking:
             return
         ran_out = before is not None and (not before.ok or (before.remaining_s > 0 and self._near_end(before)))
-        request = RouteRequest(cells=[self.cell], vehicles=[self.id], force=ran_out)
+        request = RouteRequest(
+            cells=[self.cell], vehicles=[self.id], force=ran_out, vehicle_class=self.vehicle_class
+        )
         asked = self._session.ask(ROUTE, request, _TIMEOUT_S, target=target)
         self._asking = True
 

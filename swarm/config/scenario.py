@@ -164,6 +164,8 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
                       2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
     cpu_budget        auto: share of one core that this planner may use
     push_s            newer routes are pushed to a vehicle at most this often
+    routes            grid: vehicles drive from the middle of a cell to that of a neighbour; pulled: straight from
+                      cell to distant cell, where that is no slower. Where `cost.directional` they are not pulled
     """
 
     strategy: Annotated[str, plugin_name(Strategy)] = "auto"
@@ -176,6 +178,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     k_min: Annotated[int, Meta(ge=0, le=12)] = 3
     cpu_budget: Annotated[float, Meta(gt=0, le=1)] = 0.1
     push_s: Positive = 1.0
+    routes: Literal["grid", "pulled"] = "grid"
 
 
 class StandbyConfig(Section, frozen=True, kw_only=True):

@@ -22,6 +22,7 @@ class RoleSetup:
     added        of an agent that the scenario does not name: what it hosts
     restarts     how often it was started before in this run
     before       what its earlier lives have counted; None if that is not known
+    anew         whether the run begins with it: nobody has seen an earlier life of it
     record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     """
 
@@ -36,6 +37,7 @@ class RoleSetup:
     restarts: int = 0
     before: Stats | None = None
     record_inputs: bool = False
+    anew: bool = False
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """What this process answers when others ask which run it belongs to."""

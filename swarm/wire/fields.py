@@ -146,6 +146,8 @@ LongText = Annotated[str, Meta(max_length=1 << 16)]
 
 Directions = Annotated[bytes, Meta(max_length=4 << 20), Column("<u1", least=0, most=7)]
 """One code 0..7 per step, clockwise from north. No planner gives more steps in one answer."""
+Legs = Annotated[bytes, Meta(max_length=4 << 20), Column("<u4", least=1, most=8 << 20)]
+"""Of the straight segments of pulled routes, over how many steps each goes."""
 
 MOST_VEHICLES = 1000
 """Of one agent: what a scenario may say at most."""

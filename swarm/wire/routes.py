@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 import math
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +14,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from swarm.lazy_numpy import np, numpy_loaded
-from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Length, check_column, column, pack_column
+from swarm.wire.fields import (
+    Bounded,
+    Cell,
+    Column,
+    Cost,
+    Directions,
+    Legs,
+    Length,
+    check_column,
+    column,
+    pack_column,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,10 +54,13 @@ class Route(Bounded, frozen=True, kw_only=True):
     """One route. `directions` holds one code 0..7 per step, clockwise from north. Its numbers are finite if the
     status is OK.
 
-    cost_s         travel time of the whole route, as driven along its cells
-    lower_bound_s  proven: no route from `start` is quicker on the planner's present map
-    length_m       length of the steps given
-    remaining_s    cost-to-go after them, 0 at the target
+    cost_s         travel time of the whole route, as driven from middle to middle of neighbouring cells
+    lower_bound_s  proven: no route from cell to neighbouring cell is quicker on the planner's present map
+    length_m       length of the way given
+    remaining_s    cost-to-go after it, 0 at the target
+    legs           uint32: of each straight segment of a pulled route, over how many of the steps it goes, from
+                   the middle of one cell to that of another. The steps are along the cells that it crosses, and
+                   may themselves be driven. Costs and bound are of the route that was pulled. Empty: it was not
     """
 
     status: RouteStatus
@@ -55,11 +70,18 @@ class Route(Bounded, frozen=True, kw_only=True):
     lower_bound_s: Cost = 0.0
     length_m: Length = 0.0
     remaining_s: Cost = 0.0
+    legs: Legs = b""
 
     def relate(self) -> None:
+        check_legs([len(self.directions)], self.legs)
         total = self.cost_s + self.lower_bound_s + self.length_m + self.remaining_s
         if self.status is RouteStatus.OK and not math.isfinite(total):
             raise ValueError("a route whose status is ok has a number that is not finite")
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """Of a pulled route the indices of the cells in which it turns, its first and last included; else empty."""
+        return tuple(accumulate(_listed(self.legs, "I"), initial=0)) if self.legs else ()
 
     @property
     def gap(self) -> float:
@@ -77,6 +99,7 @@ class RouteBatch:
     starts      int64    cell
     directions  uint8    of all routes, one after the other; ends: int64, where each stops in it
     cost_s, lower_bound_s, length_m, remaining_s  float64
+    legs        uint32   of all routes, one after the other; empty if none is pulled
     """
 
     statuses: NDArray[np.uint8]
@@ -87,6 +110,7 @@ class RouteBatch:
     lower_bound_s: NDArray[np.float64]
     length_m: NDArray[np.float64]
     remaining_s: NDArray[np.float64]
+    legs: NDArray[np.uint32] = field(default_factory=lambda: np.empty(0, np.uint32))
 
     @staticmethod
     def none(starts: NDArray[np.int64], status: int) -> RouteBatch:
@@ -106,7 +130,8 @@ class RouteBatch:
             np.array([route.start for route in routes], np.int64),
             np.frombuffer(b"".join(route.directions for route in routes), np.uint8),
             ends,
-            *(np.array([getattr(route, name) for route in routes], np.float64) for name in _NUMBERS),
+            **{name: np.array([getattr(route, name) for route in routes], np.float64) for name in _NUMBERS},
+            legs=np.frombuffer(b"".join(_own_legs(routes)), "<u4"),
         )
 
     def __len__(self) -> int:
@@ -117,6 +142,7 @@ class RouteBatch:
             raise IndexError(index)
         index %= len(self)
         begin = self.ends[index - 1] if index else 0
+        legs = slice(*self._leg_ends[index : index + 2]) if self.legs.size else slice(0)
         return Route(
             status=STATUSES[self.statuses[index]],
             start=int(self.starts[index]),
@@ -125,7 +151,14 @@ class RouteBatch:
             lower_bound_s=float(self.lower_bound_s[index]),
             length_m=float(self.length_m[index]),
             remaining_s=float(self.remaining_s[index]),
+            legs=pack_column(self.legs[legs], "<u4"),
         )
+
+    @cached_property
+    def _leg_ends(self) -> list[int]:
+        """Where the legs of each route begin, and the end of all."""
+        ends = np.searchsorted(np.cumsum(self.legs, dtype=np.int64), self.ends, "right")
+        return [0, *ends.tolist()]
 
     def __iter__(self) -> Iterator[Route]:
         return (self[index] for index in range(len(self)))
@@ -147,6 +180,7 @@ class RouteBatch:
             starts=pack_column(self.starts, "<i8"),
             steps=pack_column(np.diff(self.ends, prepend=0), "<u4"),
             directions=pack_directions(self.directions),
+            legs=pack_column(self.legs, "<u4"),
             **{name: pack_column(getattr(self, name), "<f8") for name in _NUMBERS},
         )
 
@@ -162,6 +196,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     steps       uint32   number of steps given
     directions  of all routes, one after the other: eight steps in three bytes, the first in the lowest three bits
     cost_s, lower_bound_s, length_m, remaining_s  float64
+    legs        uint32   of all routes, one after the other; empty if none is pulled
     """
 
     statuses: Annotated[bytes, Meta(max_length=100_001), Column("<u1", least=0, most=len(STATUSES) - 1)]
@@ -172,18 +207,25 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     lower_bound_s: _Numbers
     length_m: _Numbers
     remaining_s: _Numbers
+    legs: Legs = b""
 
     def relate(self) -> None:
         if not numpy_loaded():
-            steps = sum(_listed(self.steps, "I"))
+            listed = _listed(self.steps, "I")
+            steps = sum(listed)
             check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
+            check_legs(listed, self.legs)
             for name in _NUMBERS:
                 numbers = _listed(getattr(self, name), "d")
                 if any(status == OK and math.isinf(n) for status, n in zip(self.statuses, numbers, strict=True)):
                     raise ValueError(f"{name} of a route whose status is ok is not finite")
             return
-        steps = int(column(self.steps, "<u4").sum(dtype=np.int64))
+        ends = np.cumsum(column(self.steps, "<u4"), dtype=np.int64)
+        steps = int(ends[-1]) if ends.size else 0
         check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
+        turns = np.cumsum(column(self.legs, "<u4"), dtype=np.int64)
+        if turns.size and (turns[-1] != steps or not np.isin(ends[ends > 0], turns).all()):
+            raise ValueError(_LEGS_FAULT)
         found = column(self.statuses, "u1") == OK
         for name in _NUMBERS:
             if np.isinf(column(getattr(self, name), "<f8"), where=found, out=np.zeros(len(found), bool)).any():
@@ -199,7 +241,8 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
             column(self.starts, "<i8"),
             unpack_directions(self.directions, many),
             ends,
-            *(column(getattr(self, name), "<f8") for name in _NUMBERS),
+            **{name: column(getattr(self, name), "<f8") for name in _NUMBERS},
+            legs=column(self.legs, "<u4"),
         )
 
     @cached_property
@@ -209,15 +252,17 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
         codes = _unpacked(self.directions)
         ends = accumulate(steps)
         numbers = zip(*(_listed(getattr(self, name), "d") for name in _NUMBERS), strict=True)
-        columns = zip(self.statuses, _listed(self.starts, "q"), steps, ends, numbers, strict=True)
+        legs = _split_legs(steps, self.legs)
+        columns = zip(self.statuses, _listed(self.starts, "q"), steps, ends, numbers, legs, strict=True)
         return [
             Route(
                 status=STATUSES[status],
                 start=start,
                 directions=codes[end - many : end],
                 **dict(zip(_NUMBERS, each, strict=True)),
+                legs=own,
             )
-            for status, start, many, end, each in columns
+            for status, start, many, end, each, own in columns
         ]
 
     def __len__(self) -> int:
@@ -231,6 +276,31 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
 
 
 _NUMBERS = ("cost_s", "lower_bound_s", "length_m", "remaining_s")
+_LEGS_FAULT = "legs do not end where the steps of their routes do"
+
+
+def check_legs(steps: Sequence[int], packed: bytes) -> None:
+    """Raise ValueError unless there are no legs at all, or those of each route go over all of its steps."""
+    legs = _listed(packed, "I") if packed else ()
+    if legs and (sum(legs) != sum(steps) or not {*accumulate(steps)} <= {0, *accumulate(legs)}):
+        raise ValueError(_LEGS_FAULT)
+
+
+def _split_legs(steps: Sequence[int], packed: bytes) -> Iterator[bytes]:
+    """Of checked columns the legs of each route."""
+    turns = list(accumulate(_listed(packed, "I"), initial=0))
+    begin = 0
+    for end in accumulate(steps):
+        behind = bisect_right(turns, end) - 1 if packed else 0
+        yield packed[4 * begin : 4 * behind]
+        begin = behind
+
+
+def _own_legs(routes: Sequence[Route]) -> Iterator[bytes]:
+    """Their legs; of one that is not pulled a leg for each step, where others are."""
+    if any(route.legs for route in routes):
+        for route in routes:
+            yield route.legs or b"\1\0\0\0" * len(route.directions)
 
 
 def pack_directions(codes: NDArray[np.uint8]) -> bytes:

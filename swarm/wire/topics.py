@@ -19,6 +19,7 @@ from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
+    Believed,
     CostReply,
     CostRequest,
     PlannerStatus,
@@ -285,6 +286,12 @@ STATUS = Topic(
     access(put="planner:target", hear="targets monitor tracker:target"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
+BELIEVED = Topic(
+    "believed", "target/{target}/believed", Believed, "where a target may be that is searched for",
+    "1 Hz during a search",
+    access(put="planner:target", hear="monitor"),
+    priority=Priority.BACKGROUND,
+)  # fmt: skip
 LEAD = Topic(
     "lead", "lead/{role}/{id}", Beat, "which of the processes with one job are ready, and which leads",
     "10 Hz, where there are standbys",
@@ -326,8 +333,8 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SHARED_COSTS, STANDING, TABLE, GRANTED, STORED, KNOWN,
-    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER,
-    ORDERS, OBEYED, STATS, NOTE,
+    LEAVE, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, BELIEVED, LEAD, ZONES,
+    GIVE_ORDER, ORDERS, OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

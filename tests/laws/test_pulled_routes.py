@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.effort import few
 
+from planner_service.pulled_routes import Puller
 from planner_service.route_finder import RouteFinder
+from swarm.config.scenario import PlannerConfig
+from swarm.errors import ProtocolError
+from swarm.grid import walk
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.planning import PushedRoute
+from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, Routes, RouteStatus
+from vehicle_agent.driving.motion import Motion
+from vehicle_agent.driving.route_follower import Follower
 
 Cell = tuple[int, int]
 
@@ -110,3 +119,115 @@ def test_a_route_that_a_change_has_shut_is_not_pulled() -> None:
         finder.pull(route)
     with pytest.raises(ValueError, match="unreachable"):
         finder.pull(finder.route(0, 4))
+
+
+def random_ground(random: np.random.Generator, rows: int, cols: int, lethal: float) -> NDArray[np.float32]:
+    pace = random.uniform(0.2, 3.0, (rows, cols)).astype(np.float32)
+    pace[random.random((rows, cols)) < lethal] = np.inf
+    pace[0, 0] = 1.0
+    return pace
+
+
+def found_batch(finder: RouteFinder, pace: NDArray[np.float32], random: np.random.Generator) -> RouteBatch:
+    starts = random.choice(np.flatnonzero(np.isfinite(pace)), 4)
+    return finder._tree.routes([*starts.tolist(), -1])
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2)), st.booleans(), st.sampled_from((4, 8)))
+def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
+    seed: int, lethal: float, corner_cutting: bool, neighbours: Literal[4, 8]
+) -> None:
+    random = np.random.default_rng(seed)
+    pace = random_ground(random, *random.integers(2, 30, 2).tolist(), lethal)
+    config = PlannerConfig(corner_cutting=corner_cutting, neighbours=neighbours)
+    finder = RouteFinder(pace, (0, 0), corner_cutting=corner_cutting, neighbours=neighbours)
+    batch = found_batch(finder, pace, random)
+    pulled = Puller(pace, 1.0, config).pull_batch(batch)
+    for before, route in zip(batch, pulled, strict=True):
+        assert (route.status, route.start, route.cost_s) == (before.status, before.start, before.cost_s)
+        if not before.directions:
+            assert not route.legs
+            continue
+        cells = [divmod(cell, pace.shape[1]) for cell in walk(finder.grid, route.start, route.directions)]
+        legs = [(cells[a], cells[b], cells[a : b + 1]) for a, b in itertools.pairwise(route.turns)]
+        assert cells[-1] == (0, 0)
+        assert neighbours == 8 or all(abs(a - c) + abs(b - d) == 1 for (a, b), (c, d) in itertools.pairwise(cells))
+        for start, end, along in legs:
+            assert along == [cell for cell, _ in crossed(start, end)[0]]
+            assert math.isfinite(twin_cost_s(pace, start, end, corner_cutting))
+        assert route.length_m == pytest.approx(sum(math.dist(a, b) for a, b, _ in legs), rel=1e-12)
+    assert encode_again(pulled) == list(pulled)
+
+
+def encode_again(batch: RouteBatch) -> list[Route]:
+    columns = batch.columns()
+    columns.relate()
+    assert columns.listed == list(columns.batch)
+    return columns.listed
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2)))
+def test_who_drives_a_pulled_route_takes_its_integral_and_is_in_its_cells_all_the_way(
+    seed: int, lethal: float
+) -> None:
+    random = np.random.default_rng(seed)
+    pace = random_ground(random, 24, 24, lethal)
+    finder = RouteFinder(pace, (0, 0))
+    route = finder.route(*divmod(int(random.choice(np.flatnonzero(np.isfinite(pace)))), 24))
+    if route.status is not RouteStatus.OK or len(route.cells) < 2:
+        return
+    batch = finder._tree.routes([finder.grid.cell(*route.cells[0].tolist())])
+    given_route = Puller(pace, 1.0, PlannerConfig()).pull_batch(batch)[0]
+    cells = walk(finder.grid, given_route.start, given_route.directions)
+    follower, motion = Follower(), Motion(finder.grid, cells[0])
+    assert follower.begin(cells, cells[:1], turns=given_route.turns)
+    took_s = 0.0
+    for cell in cells[1:]:
+        motion.set_out(cell, follower.point(cell, 24))
+        while not motion.at_rest:
+            occupied, tick_s = motion.cell, float(random.uniform(0.05, 1.0))
+            took_s += tick_s - motion.advance(tick_s, float(pace.item(occupied)))
+            east, south = motion.place_m()
+            row, col = divmod(motion.cell, 24)
+            assert max(abs(south - row - 0.5), abs(east - col - 0.5)) <= 0.5 + 1e-9
+        follower.moved(cell)
+    assert took_s == pytest.approx(finder.pull(route).cost_s, rel=1e-9)
+
+
+def test_a_vehicle_drives_through_the_middles_where_a_planner_lies_about_a_segment() -> None:
+    follower = Follower()
+    around = [0, 1, 2, 12, 22, 21, 20]  # in a grid of 10 columns; a segment from 0 to 20 crosses none but 10
+    assert follower.begin(around, [0], turns=(0, 6))
+    assert [follower.point(cell, 10) for cell in around] == [None] * 7
+
+
+@pytest.mark.parametrize("legs", [[3], [1, 2], [1], [2, 1], [0, 2], [2, 0]])
+def test_legs_that_do_not_end_with_their_route_are_refused(legs: list[int]) -> None:
+    fields = {"status": RouteStatus.OK, "start": 0, "cost_s": 1.0}
+    told = PushedRoute(
+        vehicle="a", target="t", incarnation=1, target_cell=2, map_version=0,
+        route=Route(**fields, directions=b"\2\2", legs=np.array([2], "<u4").tobytes()),
+    )  # fmt: skip
+    payload = encode(told)
+    assert decode(payload, PushedRoute) == told
+    good, bad = b"\xc4\x04\2\0\0\0", np.array(legs, "<u4").tobytes()
+    assert payload.count(good) == 1
+    with pytest.raises(ProtocolError):
+        decode(payload.replace(good, bytes([0xC4, len(bad)]) + bad), PushedRoute)
+    routes = RouteBatch.of([Route(**fields, directions=b"\2\2"), Route(status=RouteStatus.NO_TARGET, start=3)])
+    columns = routes.columns()
+    assert [columns.batch.statuses[n] for n in (0, 1)] == [OK, NO_TARGET]
+    with pytest.raises(ValueError, match="legs"):
+        Routes(**{name: getattr(columns, name) for name in Routes.__struct_fields__ if name != "legs"}, legs=bad)
+
+
+def test_a_route_that_is_not_pulled_beside_one_that_is_goes_step_by_step() -> None:
+    pulled = Route(
+        status=RouteStatus.OK, start=0, directions=b"\2\3", cost_s=1.0, legs=np.array([2], "<u4").tobytes()
+    )
+    other = Route(status=RouteStatus.OK, start=5, directions=b"\4\4\4", cost_s=1.0)
+    one, two = RouteBatch.of([pulled, other])
+    assert one == pulled
+    assert two.turns == (0, 1, 2, 3)

@@ -19,12 +19,15 @@ import pytest
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
+from shared_map.learning.words import ONE, Said, stated
 from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.tiles import beyond_region, beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
+from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
@@ -35,14 +38,21 @@ from swarm.wire.topics import DIGEST, MARKS
 SIDE = 256
 TILES = 64
 PER_TILE = 20
+GRID = GridSpec(SIDE, SIDE, 10.0)
+LEARNED = beyond_tile(GRID)
 
 
 def keeper_process(endpoint: str, path: str) -> None:
     network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
     setup = RoleSetup(
-        Scenario(network=network, map=MapConfig(digest_s=0.05)), "run", "keeper", "k", time.time_ns(), 0
+        Scenario(network=network, map=MapConfig(digest_s=0.05, learning=True)),
+        "run",
+        "keeper",
+        "k",
+        time.time_ns(),
+        0,
     )
-    terrain = terrain_of_pace(np.ones((SIDE, SIDE), np.float32))
+    terrain = terrain_of_pace(np.ones((SIDE, SIDE), np.float32), GRID.resolution_m)
     with KeeperStore(path) as store, open_bus(network) as bus:
         inbox = Inbox()
         Process(KeeperService(setup, terrain, bus, inbox.post, store), inbox, MonotonicClock(), tick_hz=50).run()
@@ -75,7 +85,15 @@ class Load:
                     "load.1", "all", tile, 1, self.put * SEQ_STEP, Statements(cells, kinds, paces, stamps)
                 )
                 self._bus.publish(MARKS, each, region=0, tile=tile, author="load.1")
+            self._learn()
             time.sleep(0.002)
+
+    def _learn(self) -> None:
+        """Say what was measured of two kinds of ground by now: sets of marks as all others, but about no cell."""
+        self.put += 1
+        said = {0: Said(self.put, ONE, ONE // 10), 7: Said(5, -ONE, 0)}
+        word = mark_set("load.1", "all", LEARNED, 1, self.put * SEQ_STEP, Statements(*stated(said, self.put)))
+        self._bus.publish(MARKS, word, region=beyond_region(GRID), tile=LEARNED, author="load.1")
 
 
 def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
@@ -88,7 +106,7 @@ def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
     spawning = multiprocessing.get_context("forkserver")
     spawning.set_forkserver_preload([__name__ if __name__ != "__main__" else "test_keeper_kill"])
     path = folder / "map.sqlite"
-    found = {"rounds": rounds, "sets_put": 0, "acknowledgements": 0, "lost": 0}
+    found = {"rounds": rounds, "sets_put": 0, "acknowledgements": 0, "words_acknowledged": 0, "lost": 0}
     with open_bus(network, mode="router"), open_bus(network) as bus:
         load = Load(bus)
         for _ in range(rounds):
@@ -111,6 +129,7 @@ def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
                 for each in store.load():
                     on_disk[each.tile] = each.seq
             found["acknowledgements"] += sum(acknowledged[t] != before.get(t) for t in acknowledged)
+            found["words_acknowledged"] += acknowledged.get(LEARNED) != before.get(LEARNED)
             found["lost"] += sum(on_disk.get(tile, -1) < seq for tile, seq in acknowledged.items())
         found["sets_put"] = load.put
     return found
@@ -121,6 +140,7 @@ def test_what_was_acknowledged_survives_kill_9_of_the_keeper_at_any_instant(tmp_
     found = kill_rounds(4, tmp_path)
     assert found["lost"] == 0
     assert found["acknowledgements"] >= 4 * TILES // 2
+    assert found["words_acknowledged"] >= 2
 
 
 if __name__ == "__main__":

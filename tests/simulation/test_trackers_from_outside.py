@@ -21,9 +21,10 @@ from swarm.config.scenario import TargetConfig
 from swarm.runtime.tracking import Tracking
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.topics import COST, POSE, ROUTE, STATUS
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import COST, POSE, ROUTE, SIGHTED, STATUS
 from vehicle_agent.service import AgentService
 
 EXTERNAL = msgspec.structs.replace(
@@ -194,6 +195,38 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
     tracking = simulation.report(30)["tracking"]
     assert tracking["lost"] == 1
     assert tracking["lost_at_end"] == []
+    assert laws.collisions == laws.lethal == []
+
+
+def test_a_target_whose_tracker_stays_lost_is_searched_for_until_it_or_a_vehicle_tells_where_it_is() -> None:
+    simulation = Simulation(seeded(1, EXTERNAL))
+    laws, ear = Laws(simulation), Ear(simulation)
+    OutsideTracker(simulation, "radar", 20, 3, 12)
+    simulation.run_until(30)
+    assert states(simulation) == {VehicleState.OUTDATED}
+    assert next(iter(ear.ask().routes)).status is RouteStatus.OK, "it may be back soon"
+    simulation.run_until(50)
+    reply = ear.ask()
+    assert next(iter(reply.routes)).status is RouteStatus.SEARCHING
+    assert reply.tracker_lost
+    assert VehicleState.SEARCHING in states(simulation)
+    assert VehicleState.OUTDATED not in states(simulation)
+    now_ns, grid = EPOCH_NS + int(simulation.now_s * NS_PER_S), simulation.terrain.grid
+    cell = grid.cell(24, grid.cols // 2)
+    x_m, y_m = grid.centre_m(cell)
+    seen = Sighted(
+        author="all.a0.9", group="all", target="x", seq=1, stamp_ns=now_ns, until_ns=now_ns + 5 * NS_PER_S,
+        cell=cell, x_m=x_m, y_m=y_m, uncertainty_m=1.0,
+    )  # fmt: skip
+    ear.bus.publish(SIGHTED, seen, target="x", author="all.a0.9")
+    simulation.run_until(simulation.now_s + 1)
+    assert ear.status is not None
+    assert ear.status.target_cell == cell
+    OutsideTracker(simulation, "radar", 22, 53, 62)
+    simulation.run_until(58)
+    assert next(iter(ear.ask().routes)).status is RouteStatus.OK
+    assert owners(simulation) == {"radar"}
+    assert not {VehicleState.OUTDATED, VehicleState.SEARCHING} & states(simulation)
     assert laws.collisions == laws.lethal == []
 
 

@@ -23,11 +23,11 @@ from swarm.liveness import Peer
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.planning import Believed, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
+from swarm.wire.topics import BELIEVED, BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
 
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
@@ -112,6 +112,8 @@ def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
             bus.publish(FOLLOWED, message, agent="a0", vehicle=message.vehicle)
         case Sighted():
             bus.publish(SIGHTED, message, target=message.target, author=message.author)
+        case Believed():
+            bus.publish(BELIEVED, message, target=message.target)
         case Body():
             bus.publish(BODY, message, id=message.id)
         case MarkSet():

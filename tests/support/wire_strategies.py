@@ -17,6 +17,7 @@ from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, Zone, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
+    Believed,
     CostReply,
     CostRequest,
     PlannerStatus,
@@ -287,6 +288,15 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         cost_to_go_s=st.lists(st.floats(0, width=32), max_size=5).map(lambda column: pack_column(column, "<f4")),
         pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
     ),
+    Believed: st.integers(0, 5).flatmap(
+        lambda many: st.builds(
+            Believed, target=ids, incarnation=naturals, stamp_ns=naturals, side_m=st.floats(0, 1e9),
+            cells=st.lists(cells, min_size=many, max_size=many),
+            shares=st.lists(st.floats(0, 1, width=32), min_size=many, max_size=many).map(
+                lambda column: pack_column(column, "<f4")
+            ),
+        )
+    ),
     PlannerStatus: st.builds(
         PlannerStatus, target=ids, incarnation=naturals, stamp_ns=naturals, strategy=texts,
         target_cell=optional_cells, map_version=counts, tree_age_ms=ages,
@@ -416,6 +426,10 @@ EXAMPLES: tuple[Message, ...] = (
     CostReply(
         target="t0", incarnation=7, target_cell=9, map_version=3, tree_age_ms=12.5,
         cost_to_go_s=pack_column([3.0, math.inf], "<f4"),
+    ),
+    Believed(
+        target="t0", incarnation=7, stamp_ns=10, side_m=300.0, cells=[9, 12],
+        shares=pack_column([0.75, 0.25], "<f4"),
     ),
     PlannerStatus(
         target="t0", incarnation=7, stamp_ns=10, strategy="auto", target_cell=9, map_version=3, tree_age_ms=12.5,

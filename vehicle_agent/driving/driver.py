@@ -16,6 +16,8 @@ class Driver:
 
     passable  whether the step between two neighbours is allowed now
     dynamics  how fast vehicles drive; as the ground allows if not given
+    pulled    whether routes are pulled: a step takes what each of both cells takes, as their segments are priced,
+              and not what the cell that it enters does
     measures  whether to note how fast they drove
 
     driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs taken out:
@@ -30,6 +32,7 @@ class Driver:
         passable: Callable[[int, int], bool],
         dynamics: PluginDynamics | None,
         *,
+        pulled: bool = False,
         measures: bool = False,
     ) -> None:
         self.entered: dict[int, None] = {}
@@ -42,6 +45,8 @@ class Driver:
         self._holdings = holdings
         self._passable = passable
         self._dynamics = dynamics
+        self._cols = local_map.grid.cols
+        self._pulled = pulled and local_map.climb is None
         self._left_s: dict[str, float] = {}
         self._rolling: set[str] = set()
         """Vehicles that did not stop when they came to the middle of the cell where they are."""
@@ -77,16 +82,18 @@ class Driver:
                 if len(path) < 2 or not self._passable(path[0], path[1]):
                     self._rolling.discard(vehicle.id)
                     return 0.0
-                motion.set_out(path[1])
+                motion.set_out(path[1], vehicle.route.point(path[1], self._cols) if self._pulled else None)
                 # A vehicle with dynamics of its own has its full pace between two cells before and behind.
                 freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
                 if self._measures and freely:
                     self._steps[vehicle.id] = (path[1], 0.0)
             before = motion.cell
-            pace_s_per_m = self._physics.item(motion.head)
+            pace_s_per_m = self._physics.item(before if self._pulled else motion.head)
             climbing = 1.0 if climb is None else climb.driven(motion.tail, motion.head)
             pace_s_per_m *= climbing
             had_s, head, length_m = left_s, motion.head, motion.length_m
+            if self._pulled:
+                length_m -= motion.border_m
             if self._dynamics is None:
                 left_s = motion.advance(left_s, pace_s_per_m)
             else:
@@ -94,7 +101,8 @@ class Driver:
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
                 if self._dynamics.slowed:  # by itself, not by the ground
                     self._steps.pop(vehicle.id, None)
-            self._measure(vehicle, head, had_s - left_s, length_m * climbing)
+            measured_s = had_s - left_s if before == head or not self._pulled else 0.0
+            self._measure(vehicle, head, measured_s, length_m * climbing)
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)
@@ -105,7 +113,8 @@ class Driver:
         return 0.0
 
     def _measure(self, vehicle: Vehicle, head: int, seconds: float, length_m: float) -> None:
-        """Part of the step to `head` was driven, or its end; as long as one on level ground of `length_m`."""
+        """Part of what is measured of the step to `head` was driven, or its end; all of that is as long as
+        `length_m` on level ground."""
         if vehicle.motion.at_rest:
             self._rolling.add(vehicle.id)
         step = self._steps.get(vehicle.id)

@@ -6,49 +6,51 @@ import math
 
 from swarm.grid import GridSpec
 
+Point = tuple[float, float]
+"""Row and col, whole numbers in the middles of cells."""
+
 
 class Motion:
-    """A step from the middle of cell `tail` to the middle of cell `head`; at rest both are the same cell.
+    """A step from a point of cell `tail` to a point of cell `head`: their middles, but on a pulled route. At rest
+    both are the same cell.
 
-    The vehicle is a point. It occupies `tail` up to half of the way, and `head` from there on.
+    The vehicle is a point. It occupies `tail` up to their border, or the corner that they share, and `head` from
+    there on.
 
     done_m       metres driven of the step
+    length_m     metres of the step; 0 at rest
+    border_m     metres of it up to the border
     heading_rad  clockwise from north
     """
 
-    __slots__ = ("_grid", "_length_m", "done_m", "head", "heading_rad", "tail")
+    __slots__ = ("_at", "_grid", "_to", "_via", "border_m", "done_m", "head", "heading_rad", "length_m", "tail")
 
     def __init__(self, grid: GridSpec, cell: int) -> None:
         self._grid = grid
-        self.tail = cell
-        self.head = cell
-        self.done_m = 0.0
-        self._length_m = 0.0
         self.heading_rad = 0.0
+        self._via: Point | None = None
+        """Where it passes the border, if the step is not from middle to middle."""
+        self.put(cell)
+
+    def put(self, cell: int) -> None:
+        """At rest in the middle of a cell."""
+        self.tail = self.head = cell
+        self._at = self._to = self._middle(cell)
+        self.done_m = self.length_m = self.border_m = 0.0
 
     @property
     def cell(self) -> int:
         """The one cell that the vehicle occupies."""
-        return self.tail if 2.0 * self.done_m < self._length_m else self.head
-
-    @property
-    def share(self) -> float:
-        """How much of the step is driven, 0 to 1."""
-        return self.done_m / self._length_m if self._length_m else 0.0
-
-    @property
-    def length_m(self) -> float:
-        """Metres of the step; 0 at rest."""
-        return self._length_m
+        return self.tail if self.done_m < self.border_m else self.head
 
     @property
     def left_m(self) -> float:
         """Metres of the step that are not driven yet."""
-        return self._length_m - self.done_m
+        return self.length_m - self.done_m
 
     @property
     def at_rest(self) -> bool:
-        """Whether it stands in the middle of a cell, so that it may set out in any direction."""
+        """Whether it stands where a step ends, so that it may set out in any direction."""
         return self.tail == self.head
 
     @property
@@ -56,47 +58,79 @@ class Motion:
         """The cell that it drives towards and does not occupy yet; None if there is none."""
         return None if self.cell == self.head else self.head
 
-    def set_out(self, cell: int) -> None:
-        """Begin a step to a neighbour cell. Raises ValueError if it is not at rest or the cell is no neighbour."""
+    def set_out(self, cell: int, to: Point | None = None) -> None:
+        """Begin a step to a neighbour cell. Raises ValueError if it is not at rest or the cell is no neighbour.
+
+        to  the point inside that cell where the step ends, as row and col; None is its middle
+        """
         rows = cell // self._grid.cols - self.head // self._grid.cols
         cols = cell % self._grid.cols - self.head % self._grid.cols
         if not self.at_rest or max(abs(rows), abs(cols)) != 1:
             raise ValueError(f"no step from cell {self.head} to {cell}")
+        begin, middle = self._at, self._middle(self.head)
+        end = self._to = self._middle(cell) if to is None else to
+        if to is None and begin == middle:
+            self._via = None
+            self.length_m = math.hypot(rows, cols) * self._grid.resolution_m
+            self.border_m = 0.5 * self.length_m
+        else:
+            self._via = _via(begin, end, (middle[0] + 0.5 * rows, middle[1] + 0.5 * cols), rows, cols)
+            self.border_m = math.dist(begin, self._via) * self._grid.resolution_m
+            self.length_m = self.border_m + math.dist(self._via, end) * self._grid.resolution_m
         self.head = cell
         self.done_m = 0.0
-        self._length_m = math.hypot(rows, cols) * self._grid.resolution_m
-        self.heading_rad = math.atan2(cols, -rows) % math.tau
+        self.heading_rad = math.atan2(end[1] - begin[1], begin[0] - end[0]) % math.tau
 
     def turn_back(self) -> None:
-        """Return to the middle of the cell that it occupies, if it has not entered the next one."""
+        """Return to where the step began, if it has not entered the next cell."""
         if self.entering is not None:
             self.tail, self.head = self.head, self.tail
-            self.done_m = self._length_m - self.done_m
+            self._at, self._to = self._to, self._at
+            self.done_m = self.length_m - self.done_m
+            self.border_m = self.length_m - self.border_m
             self.heading_rad = (self.heading_rad + math.pi) % math.tau
 
     def advance(self, seconds: float, pace_s_per_m: float) -> float:
-        """Drive for some seconds at a pace in s/m, at most to the border of `head` or, behind it, to its middle.
+        """Drive for some seconds at a pace in s/m, at most to the border of `head` or, behind it, to the end.
 
         Returns the seconds that are left.
         """
-        border_m = 0.5 * self._length_m
-        goal_m = border_m if self.done_m < border_m else self._length_m
+        goal_m = self.border_m if self.done_m < self.border_m else self.length_m
         needed_s = (goal_m - self.done_m) * pace_s_per_m
         if needed_s > seconds:
             self.done_m += seconds / pace_s_per_m
             return 0.0
         self.done_m = goal_m
-        if goal_m == self._length_m:
-            self.tail = self.head
-            self.done_m = self._length_m = 0.0
+        if goal_m == self.length_m:
+            self.tail, self._at = self.head, self._to
+            self.done_m = self.length_m = self.border_m = 0.0
         return seconds - needed_s
+
+    def stretch(self) -> tuple[Point, Point, float]:
+        """Where the straight stretch on which it is begins and ends, and how much of it is driven, 0 to 1."""
+        if self._via is None or not self.length_m:
+            return self._at, self._to, self.done_m / self.length_m if self.length_m else 0.0
+        if self.done_m < self.border_m:
+            return self._at, self._via, self.done_m / self.border_m
+        return self._via, self._to, (self.done_m - self.border_m) / (self.length_m - self.border_m)
 
     def place_m(self) -> tuple[float, float]:
         """(east, south) in metres from the north-west corner of the grid."""
-        cols, resolution_m = self._grid.cols, self._grid.resolution_m
-        share = self.share
-        row0, col0 = divmod(self.tail, cols)
-        row1, col1 = divmod(self.head, cols)
-        row = row0 + share * (row1 - row0)
-        col = col0 + share * (col1 - col0)
-        return (col + 0.5) * resolution_m, (row + 0.5) * resolution_m
+        (row0, col0), (row1, col1), share = self.stretch()
+        row, col = row0 + share * (row1 - row0), col0 + share * (col1 - col0)
+        return (col + 0.5) * self._grid.resolution_m, (row + 0.5) * self._grid.resolution_m
+
+    def _middle(self, cell: int) -> Point:
+        return float(cell // self._grid.cols), float(cell % self._grid.cols)
+
+
+def _via(begin: Point, end: Point, shared: Point, rows: int, cols: int) -> Point:
+    """Where a step passes from its cell into the next: on the edge that they share, of which `shared` is the
+    middle, or at their corner, which it is then."""
+    if rows and cols:
+        return shared
+    if rows:
+        share = (shared[0] - begin[0]) / (end[0] - begin[0])
+        return shared[0], begin[1] + share * (end[1] - begin[1])
+    share = (shared[1] - begin[1]) / (end[1] - begin[1])
+    return begin[0] + share * (end[0] - begin[0]), shared[1]

@@ -26,16 +26,13 @@ class Places:
         self.vehicles = list(vehicles)
         motions = [vehicle.motion for vehicle in self.vehicles]
         self.cells: NDArray[np.int64] = np.array([motion.cell for motion in motions], np.int64)
-        ends = np.array([(motion.tail, motion.head) for motion in motions], np.int64).reshape(-1, 2)
-        share = np.array([motion.share for motion in motions], np.float64)
-        rows, cols = np.divmod(ends, grid.cols)
+        stretches = [motion.stretch() for motion in motions]
+        begins = np.array([begin for begin, *_ in stretches], np.float64).reshape(-1, 2)
+        ends = np.array([end for _, end, _ in stretches], np.float64).reshape(-1, 2)
+        shares = np.array([share for *_, share in stretches], np.float64).reshape(-1, 1)
+        self.south_m: NDArray[np.float64]
+        self.east_m: NDArray[np.float64]
+        self.south_m, self.east_m = (begins + shares * (ends - begins) + 0.5).T * grid.resolution_m
         row, col = np.divmod(self.cells, grid.cols)
-        self.east_m: NDArray[np.float64] = (_between(cols, share) + 0.5) * grid.resolution_m
-        self.south_m: NDArray[np.float64] = (_between(rows, share) + 0.5) * grid.resolution_m
         self.heading_rad: NDArray[np.float64] = np.array([motion.heading_rad for motion in motions], np.float64)
         self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS
-
-
-def _between(ends: NDArray[np.int64], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    begin = ends[:, 0].astype(np.float64)
-    return begin + share * (ends[:, 1] - begin)

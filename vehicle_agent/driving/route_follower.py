@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 _SKIPPED_CELLS = 24
 """A vehicle that others push may come back to its route so far on."""
+_LEAST_PART = 1e-9
+"""Of a segment: it only touches a cell of which it crosses no more."""
 
 
 class Follower:
@@ -15,28 +19,38 @@ class Follower:
     version  how often it, or how far along it the vehicle is, has changed
     """
 
-    __slots__ = ("_at", "_bounds", "_cells", "changes", "partial", "version")
+    __slots__ = ("_at", "_bounds", "_cells", "_turn_cells", "_turns", "changes", "partial", "version")
 
     def __init__(self) -> None:
         self._cells: list[int] = []
         self._at = 0
+        self._turns: Sequence[int] = ()
+        """Of a pulled route the indices of the cells in which it turns, its first and last included; and those."""
+        self._turn_cells: Sequence[int] = ()
         self._bounds: tuple[int, int, int, int] | None = None
         self.changes = self.version = 0
         self.partial = False
         """Whether the route ends before its target, because the planner gave a part of it."""
 
-    def begin(self, cells: Sequence[int], path: Sequence[int], partial: bool = False) -> bool:
+    def begin(
+        self, cells: Sequence[int], path: Sequence[int], partial: bool = False, turns: Sequence[int] = ()
+    ) -> bool:
         """Follow a route from the first cell of a vehicle's path that it passes. False if it passes none; then
-        nothing changes."""
+        nothing changes.
+
+        turns  of a pulled route the indices of the cells in which it turns, its first and last included
+        """
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
             return False
         self._set(list(cells), at)
         self.partial = partial
+        self._turns, self._turn_cells = turns, [cells[turn] for turn in turns]
         return True
 
     def drop(self) -> None:
         self._set([], 0)
+        self._turns = self._turn_cells = ()
         self.partial = False
 
     def _set(self, cells: list[int], at: int) -> None:
@@ -65,6 +79,40 @@ class Follower:
             return []
         first = self._cells.index(cell, self._at) + 1
         return self._cells[first : first + max(count, 0)]
+
+    def point(self, cell: int, cols: int) -> tuple[float, float] | None:
+        """Where a pulled route leads through one of its next cells, as row and col: the middle of its segment's
+        part in it. None where it is the middle of the cell.
+
+        A cell that the segment does not cross, whatever a planner says, is driven through its middle.
+        """
+        if not self._turns or cell not in self._cells[self._at : self._at + _SKIPPED_CELLS]:
+            return None
+        index = self._cells.index(cell, self._at)
+        leg = bisect_left(self._turns, index)
+        if leg == len(self._turns) or self._turns[leg] == index:
+            return None
+        (row, col), start, end = (
+            divmod(cell, cols),
+            *(divmod(each, cols) for each in self._turn_cells[leg - 1 : leg + 1]),
+        )
+        first, last = 0.0, 1.0
+        for at, begin, until in zip((row, col), start, end, strict=True):
+            if begin != until:
+                borders = sorted(((at - 0.5 - begin) / (until - begin), (at + 0.5 - begin) / (until - begin)))
+                first, last = max(first, borders[0]), min(last, borders[1])
+            elif at != begin:
+                return None
+        if last - first < _LEAST_PART:
+            return None
+        share = 0.5 * (first + last)
+        return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+
+    def legs_ahead(self) -> list[int]:
+        """Of a pulled route over how many steps each of its segments goes, from the cell passed last on."""
+        last = len(self._cells) - 1
+        ends = [turn for turn in self._turns if self._at < turn < last] + [last] * (last > self._at)
+        return [end - begin for begin, end in pairwise((self._at, *ends))] if self._turns else []
 
     def near(self, count: int) -> list[int]:
         """The cell of the route that the vehicle passed last, and the next ones."""

@@ -48,6 +48,7 @@ class GivenRoute:
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
     searching      whether it leads to a place where the target may be, which nobody sees
+    turns          of a pulled route the indices of the cells in which it turns, its first and last included
     """
 
     target: str
@@ -57,6 +58,7 @@ class GivenRoute:
     partial: bool
     pushed: bool = False
     searching: bool = False
+    turns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,10 @@ class AskRoute:
 
 @dataclass(frozen=True, slots=True)
 class Follow:
-    """A vehicle has begun a route, from the cell on which it stands."""
+    """A vehicle has begun a route, from the cell on which it stands.
+
+    legs  of a pulled route over how many steps each of its segments goes
+    """
 
     vehicle: str
     target: str
@@ -80,6 +85,7 @@ class Follow:
     cost_s: float
     lower_bound_s: float
     searching: bool = False
+    legs: tuple[int, ...] = ()
 
 
 # --- the core -----------------------------------------------------------------------------------------------
@@ -208,7 +214,7 @@ class Vehicle:
             self.asked = None
         begun = None
         if given.target == self.target:
-            if self.route.begin(given.cells, path, given.partial):
+            if self.route.begin(given.cells, path, given.partial, given.turns):
                 begun = self._begin(given, path)
             else:
                 # It has driven on to where the new route does not pass: stop, so that the next answer fits.
@@ -254,8 +260,13 @@ class Vehicle:
         if self.state is VehicleState.STRANDED:
             self.state = VehicleState.FOLLOWING
         (start,) = self.route.near(1)
-        driven = (*path[: path.index(start)], start, *self.route.ahead())
-        return Follow(self.id, given.target, driven, given.cost_s, given.lower_bound_s, given.searching)
+        before = path[: path.index(start)]
+        driven = (*before, start, *self.route.ahead())
+        legs = self.route.legs_ahead()
+        legs = [1] * (len(before) * bool(legs)) + legs
+        return Follow(
+            self.id, given.target, driven, given.cost_s, given.lower_bound_s, given.searching, tuple(legs)
+        )
 
     def _need_route(self, reason: Reason, now_ns: int) -> None:
         self._need = reason

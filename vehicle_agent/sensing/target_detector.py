@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Iterable, Set
 
 import numpy as np
 
@@ -20,10 +20,16 @@ _RANGE_SHARE = 0.02
 """The uncertainty of a sighting is half a cell and this share of the distance."""
 SIGHTING_LASTS_S = 30.0
 """A sighting expires after this many seconds: by then a target may be anywhere within some hundred metres."""
+_IN_SIGHT_NS = 2 * _TELL_NS
+_RETELL_NS = NS_PER_S
+"""A planner that appears hears sightings after so long."""
 
 
 class TargetDetector:
     """The simulated sensor for targets: knows where all are, and reports those within its range.
+
+    Of each target it remembers the last sighting of all, if it was its own, for a planner that begins anew and
+    heard none. A target that was captured in sight is somewhere else, and its sighting is forgotten.
 
     range_m  of the sensor
     lasts_s  a sighting expires after so long
@@ -41,11 +47,42 @@ class TargetDetector:
         self._newest = Newest(silence_ns=POSE_SILENCE_NS)
         self._told_ns: dict[str, int] = {}
         self._seq = 0
+        self._last: dict[str, Sighted] = {}
+        """Target -> its last sighting of all, if that is this author's."""
+        self._retell_ns: dict[str, int] = {}
+        """Target -> when its last sighting is told again."""
 
     def set_truth(self, pose: TargetPose, now_ns: int) -> None:
         """Where a target truly is. Of each target the newest pose counts."""
         if self._newest.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
+            before = self._true.get(pose.target)
             self._true[pose.target] = pose
+            last = self._last.get(pose.target)
+            jumped = before is not None and before.jumps != pose.jumps
+            if jumped and last is not None and now_ns - last.stamp_ns <= _IN_SIGHT_NS:
+                del self._last[pose.target]
+
+    def lose(self, targets: Iterable[str]) -> None:
+        """Nobody knows any more where these are."""
+        for target in targets:
+            self._true.pop(target, None)
+
+    def hear(self, sighted: Sighted) -> None:
+        """Another author saw a target."""
+        last = self._last.get(sighted.target)
+        if last is not None and sighted.author != self._author and sighted.stamp_ns > last.stamp_ns:
+            del self._last[sighted.target]
+
+    def retell(self, target: str, now_ns: int) -> None:
+        """The planner of a target has begun anew."""
+        self._retell_ns[target] = now_ns + _RETELL_NS
+
+    def retold(self, now_ns: int) -> list[Sighted]:
+        """Last sightings to publish once more, as they were."""
+        due = [target for target, at_ns in self._retell_ns.items() if now_ns >= at_ns]
+        for target in due:
+            del self._retell_ns[target]
+        return [self._last[target] for target in due if target in self._last]
 
     def look(self, places: Places, now_ns: int) -> list[Sighted]:
         """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
@@ -64,7 +101,7 @@ class TargetDetector:
 
     def _sighted(self, pose: TargetPose, distance_m: float, now_ns: int) -> Sighted:
         self._seq += 1
-        return Sighted(
+        self._last[pose.target] = Sighted(
             author=self._author,
             group=self._group,
             target=pose.target,
@@ -76,6 +113,7 @@ class TargetDetector:
             y_m=pose.y_m,
             uncertainty_m=0.5 * self._grid.resolution_m + _RANGE_SHARE * distance_m,
         )
+        return self._last[pose.target]
 
 
 class UntrackedTargets:
@@ -84,7 +122,7 @@ class UntrackedTargets:
     reading  whose sightings count
     """
 
-    def __init__(self, targets: Collection[str], reading: MarkFilter) -> None:
+    def __init__(self, targets: Set[str], reading: MarkFilter) -> None:
         self.targets = targets
         self._sightings = Sightings(reading)
 

@@ -105,6 +105,10 @@ def learning(
     seeds: Annotated[str, typer.Option(help="Seeds A:B, B not among them.")] = "0:12",
     agents: Annotated[int, typer.Option(min=1, max=10, help="Authors that ten vehicles report to.")] = 1,
     right: Annotated[bool, typer.Option("--right", help="The prior is right: count false alarms.")] = False,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="The demo instead, with and without learning, as simulated.")
+    ] = False,
+    seconds: Annotated[float, typer.Option(min=1, help="--simulated: how long each run is.")] = 60.0,
     as_json: AsJson = False,
 ) -> None:
     """What vehicles learn of a class whose prior pace is wrong by three: error of the map and regret of routes.
@@ -112,7 +116,20 @@ def learning(
     \b
     swarm bench learning
     swarm bench learning --right --seeds 0:50
+    swarm bench learning --simulated --seeds 7:11
+
+    --simulated runs the whole demo, where grass is three times as slow as its prior says: captures, and how far
+    vehicles came. Two runs of some 40 s of CPU a seed.
     """
+    if simulated:
+        from launch_scripts.bench.learning_runs import run as run_demo
+        from launch_scripts.bench.learning_runs import tables as demo_tables
+        from launch_scripts.simulation.campaign import parse_seeds
+
+        with progress_of("learning") as progress:
+            report = run_demo(parse_seeds(seeds), seconds, progress)
+        show(report, as_json, demo_tables)
+        return
     from launch_scripts.bench.planning.learning import run_learning, tables
     from launch_scripts.simulation.campaign import parse_seeds
     from shared_map.terrain.terrain import build_terrain

@@ -95,8 +95,8 @@ class DescribedRoute:
 def metres_along(grid: GridSpec, cells: NDArray[np.int64], diagonal: float = np.sqrt(2.0)) -> NDArray[np.float64]:
     """float64 (n,): metres from the first cell to each; `diagonal` is the length of a diagonal step, in cells."""
     rows, cols = np.divmod(cells, grid.cols)
-    apart = np.abs(np.diff(rows)) + np.abs(np.diff(cols))
-    steps = np.where(apart == 2, diagonal, 1.0) * grid.resolution_m
+    down, right = np.abs(np.diff(rows)), np.abs(np.diff(cols))
+    steps = np.where((down == 1) & (right == 1), diagonal, np.hypot(down, right)) * grid.resolution_m
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 

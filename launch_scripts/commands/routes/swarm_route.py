@@ -66,11 +66,12 @@ class Answer:
         return cell if cell is not None and 0 <= cell < self.frame.grid.cells else None
 
     def path(self) -> list[int]:
-        """The cells of the route; none without one."""
+        """The cells of the route, of a pulled one those in which it turns; none without one."""
         if isinstance(self.reply, CostReply) or not _leads(self.reply.routes[0]):
             return []
         (route,) = self.reply.routes
-        return walk(self.frame.grid, route.start, route.directions)
+        cells = walk(self.frame.grid, route.start, route.directions)
+        return [cells[turn] for turn in route.turns] if route.turns else cells
 
 
 def _leads(route: Route) -> bool:
@@ -207,8 +208,12 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
     else:
         typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")
     rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
-    many = len(found.directions)
-    typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
+    many, turns = len(found.directions), len(found.turns)
+    if turns:
+        way = f"{turns - 1} straight segments through {many + 1} cells, {found.length_m:.0f} m"
+        typer.echo(f"{way}; time and proof are of the route over neighbours that was pulled straight{rest}")
+    else:
+        typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
     grown = (
         f"tree grown whole {reply.tree_age_ms / 1e3:.1f} s ago and kept up since, map version {reply.map_version}"
     )

@@ -28,10 +28,13 @@ _DOES = {
 
 
 def vehicle_details(
-    vehicles: VehicleColumns, groups: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
+    vehicles: VehicleColumns, who: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
 ) -> list[str]:
-    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts`. What matters comes first: a viewer
-    may cut off the end."""
+    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. What matters comes first: a
+    viewer may cut off the end.
+
+    who  vehicle -> what is said of whose it is
+    """
     target_ids = vehicles.target_ids
     lines = []
     for id, state, target in zip(vehicles.ids, vehicles.states.tolist(), vehicles.targets.tolist(), strict=True):
@@ -40,7 +43,7 @@ def vehicle_details(
         route = routes.get(id)
         if route is not None and route.target == chased and state != VehicleState.ARRIVED:
             line += f", route {(now_ns - route.begun_ns) / NS_PER_S:.0f} s old, {_proven(route.gap)}"
-        lines.append(f"{line}; {groups.get(id, '?')}")
+        lines.append(f"{line}; {who.get(id, '?')}")
     return lines
 
 

@@ -35,6 +35,7 @@ TARGET_COLOUR: Colour = (255, 255, 255)
 LOST_COLOUR: Colour = (120, 124, 130)
 BODY_COLOUR: Colour = (118, 84, 60)
 SIGHTED_COLOUR: Colour = (255, 255, 255)
+SEARCHED_COLOUR: Colour = (253, 174, 107)
 ROUTE_COLOUR: Colour = (205, 212, 220)
 ALARM_COLOUR: Colour = (255, 64, 48)
 HINT = "point at a vehicle or target to read who it is"

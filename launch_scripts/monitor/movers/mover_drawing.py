@@ -108,6 +108,11 @@ class MoverDrawing:
         self._rec.log("world/targets/balls", *parts)
         self.lines("world/targets/poles", poles, told)
 
+    def searched(self, positions: Floats, colours: Bytes, radii_m: Floats, details: list[str]) -> None:
+        """Balls, the more opaque the likelier a target is there."""
+        balls = rr.Points3D(positions, colors=colours, radii=radii_m)
+        self._rec.log("world/searched", balls, rr.AnyValues(searched=pa.array(details, pa.string())))
+
     def bodies(self, positions: Floats, radii_m: Floats, details: list[str]) -> None:
         """Discs as large as the bodies."""
         discs = rr.Ellipsoids3D(

@@ -13,6 +13,7 @@ from launch_scripts.monitor.movers.levels import level_for
 from launch_scripts.monitor.movers.looks import Looks
 from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
 from launch_scripts.monitor.movers.points import Points, alarm_tops, followed_point
+from launch_scripts.monitor.movers.searches import Searches, searched_points
 from launch_scripts.monitor.movers.strips import poles
 from launch_scripts.monitor.movers.targets_view import TargetsView
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
@@ -26,6 +27,7 @@ from swarm.config.scenario import Scenario
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.planning import Believed
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Fleet, Followed
 from vehicle_agent.bodies import Bodies
@@ -57,6 +59,7 @@ class MoversView:
         self._follow = scenario.monitor.follow
         self._targets = TargetsView(self._drawing, mesh, looks, trails_of(scenario, mesh, level))
         self._sightings = Sightings(filter)
+        self._searches = Searches()
         self._bodies = Bodies(mesh.grid)
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._details: dict[str, str] = {}
@@ -72,6 +75,7 @@ class MoversView:
         self._drawing.begin()
         self._vehicles.draw_anew()
         self._targets.draw_anew()
+        self._searches.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             middle = self._mesh.width_m / 2, self._mesh.depth_m / 2
             self._drawing.followed(followed_point(self._mesh, middle))
@@ -82,6 +86,8 @@ class MoversView:
                 self._fleets_new = True
             case Sighted() as sighted:
                 self._sightings.hear(sighted, now_ns)
+            case Believed() as believed:
+                self._searches.hear(believed, now_ns)
             case Body() as body:
                 self._bodies.hear(body, now_ns)
             case Followed() as followed:
@@ -110,13 +116,15 @@ class MoversView:
         if self._fleets_new:
             self._fleets_new = False
             vehicles = observed.driven(self._crew, now_ns)
-            self._vehicles.draw(vehicles, observed.groups, now_ns)
+            self._vehicles.draw(vehicles, observed.groups, observed.classes, now_ns)
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
         lost = self._recorder.tracked.lost(now_ns)
         # A target that an operator removed is in no table either.
         places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
         self._targets.draw(places_m, lost, self._sightings.best(now_ns), self._details, now_ns)
+        if (beliefs := self._searches.take_changed(now_ns)) is not None:
+            self._drawing.searched(*searched_points(self._mesh, beliefs))
         self._bodies.tick(now_ns)
         self._bodies.take_changed()
         self._bodies.complaints.clear()

@@ -19,6 +19,7 @@ from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_alo
 from launch_scripts.monitor.movers.strips import Strips, Trails
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.config.agents import plan_agents
+from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
 from swarm.wire.messages.vehicles import Followed
 
@@ -31,12 +32,13 @@ _Rows = NDArray[np.intp]
 class _Roll:
     """What is looked up anew only when vehicles come or go.
 
+    who     vehicle -> group, and class where that is not "ground"
     rows    of `Looks.vehicles`, by group
     own     places in `ids` of the scenario's vehicles; `guests` those of all others
     """
 
     ids: list[str]
-    groups: Mapping[str, str]
+    who: Mapping[str, str]
     rows: _Rows
     own: _Rows
     guests: _Rows
@@ -60,7 +62,7 @@ class VehiclesView:
         self._looks = looks
         self._target_ids = scenario.target_ids
         self._own_ids = frozenset(id for plan in plan_agents(scenario) for id in plan.vehicle_ids)
-        self._roll = self._enrolled([], {})
+        self._roll = self._enrolled([], {}, {})
         self._colours: Bytes | None = None
         """As drawn last; None if all is to be drawn anew."""
         self._routes: dict[str, RouteNow] = {}
@@ -93,7 +95,13 @@ class VehiclesView:
         self._routes[followed.vehicle] = RouteNow(followed.target, cells, gap, now_ns)
         return True
 
-    def draw(self, vehicles: VehicleColumns, groups: Callable[[], Mapping[str, str]], now_ns: int) -> None:
+    def draw(
+        self,
+        vehicles: VehicleColumns,
+        groups: Callable[[], Mapping[str, str]],
+        classes: Callable[[], Mapping[str, str]],
+        now_ns: int,
+    ) -> None:
         """Draws what is due; once for each frame in which something is new."""
         self._frame += 1
         trails_due = self._due.now("trails", now_ns)
@@ -102,7 +110,7 @@ class VehiclesView:
         if self._due.now("whole", now_ns):
             self.draw_anew()
         if vehicles.ids != self._roll.ids:
-            self._colours, self._roll = None, self._enrolled(vehicles.ids, groups())
+            self._colours, self._roll = None, self._enrolled(vehicles.ids, groups(), classes())
         points = vehicle_points(self._mesh, vehicles)
         colours = self._coloured(vehicles)
         self._draw_balls(vehicles, points, colours, now_ns)
@@ -113,10 +121,11 @@ class VehiclesView:
         if self._due.now("routes", now_ns):
             self._draw_routes(vehicles)
 
-    def _enrolled(self, ids: list[str], groups: Mapping[str, str]) -> _Roll:
+    def _enrolled(self, ids: list[str], groups: Mapping[str, str], classes: Mapping[str, str]) -> _Roll:
+        who = {id: group if classes[id] == GROUND else f"{group}, {classes[id]}" for id, group in groups.items()}
         own = np.array([id in self._own_ids for id in ids], np.bool_)
         rows = np.array(self._looks.rows([groups.get(id) for id in ids]), np.intp)
-        return _Roll(ids, groups, rows, np.flatnonzero(own), np.flatnonzero(~own))
+        return _Roll(ids, who, rows, np.flatnonzero(own), np.flatnonzero(~own))
 
     def _coloured(self, vehicles: VehicleColumns) -> Bytes:
         rows = self._roll.rows
@@ -130,7 +139,7 @@ class VehiclesView:
         self._colours = colours
         details = None
         if self._due.now("details", now_ns) or whole:
-            details = vehicle_details(vehicles, roll.groups, self._routes, now_ns)
+            details = vehicle_details(vehicles, roll.who, self._routes, now_ns)
         for entity, members in (("world/vehicles", roll.own), ("world/guests", roll.guests)):
             if not len(members) and not whole:
                 continue

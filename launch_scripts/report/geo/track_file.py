@@ -107,7 +107,7 @@ def packed_tracks(recorder: Recorder) -> bytes:
 
 
 def _route_columns(routes: list[tuple[int, Followed]]) -> dict[str, NDArray[Any]]:
-    """One row per route; and the directions of all, route by route."""
+    """One row per route; and the directions of all, and the legs of those that are pulled, route by route."""
     return {
         "routes_vehicle": np.array([route.vehicle for _, route in routes], np.str_),
         "routes_target": np.array([route.target for _, route in routes], np.str_),
@@ -117,6 +117,8 @@ def _route_columns(routes: list[tuple[int, Followed]]) -> dict[str, NDArray[Any]
         "routes_bound_s": np.array([route.lower_bound_s for _, route in routes], np.float64),
         "routes_steps": np.array([len(route.directions) for _, route in routes], np.int64),
         "routes_directions": np.frombuffer(b"".join(route.directions for _, route in routes), np.uint8),
+        "routes_legs": np.frombuffer(b"".join(route.legs for _, route in routes), "<u4"),
+        "routes_many_legs": np.array([len(route.legs) // 4 for _, route in routes], np.int64),
     }
 
 
@@ -209,14 +211,28 @@ def _routes(arrays: Any, grid: GridSpec) -> list[GivenRoute]:
     if min(columns[-1], default=0) < 0:
         raise ValueError("a route has less than no steps")
     directions = arrays["routes_directions"].astype(np.uint8)
+    legs = iter(_legs(arrays, len(columns[-1])))
     routes, at = [], 0
     for vehicle, target, time_ns, start, cost_s, bound_s, steps in zip(*columns, strict=True):
         cells = _walked(grid, start, directions[at : at + steps])
         at += steps
+        turns = np.concatenate(([0], np.cumsum(next(legs), dtype=np.int64)))
+        if cells is not None and turns[-1] == steps:  # a pulled route: straight from turn to turn
+            cells = cells[turns]
         if cells is not None and math.isfinite(cost_s):
             gap = cost_s / bound_s if bound_s > 0 else float("inf")
             routes.append(GivenRoute(vehicle, target, time_ns, cost_s, gap, cells))
     return routes
+
+
+def _legs(arrays: Any, many: int) -> list[NDArray[Any]]:
+    """Those of each route; none of one that is not pulled, as in files before there were any."""
+    if "routes_legs" not in arrays:
+        return [np.empty(0, np.int64)] * many
+    counts = _whole(arrays, "routes_many_legs")
+    if len(counts) != many or min(counts, default=0) < 0:
+        raise ValueError("the legs of routes are not theirs")
+    return np.split(_whole(arrays, "routes_legs"), np.cumsum(counts))[:many]
 
 
 def _walked(grid: GridSpec, start: int, directions: NDArray[np.uint8]) -> NDArray[np.int64] | None:

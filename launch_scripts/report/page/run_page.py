@@ -177,6 +177,7 @@ _COLUMNS = {
     "captures": "captures",
     "vehicles": "vehicles",
     "group": "group",
+    "class": "class",
     "routes": "routes",
     "distance_m": "driven, km",
     "waiting_s": "waited, s",
@@ -192,7 +193,7 @@ _COLUMNS = {
     "target_at_end": "going for",
 }
 """Column -> its heading, in order."""
-_TEXTS = ("group", "state_at_end", "target_at_end")
+_TEXTS = ("group", "class", "state_at_end", "target_at_end")
 
 
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:

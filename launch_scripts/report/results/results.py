@@ -13,6 +13,7 @@ from launch_scripts.report.results.certified_gap import gap_of, gaps_of, gaps_to
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, plan_agents
+from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, UNPROVEN_OF, merged
 from swarm.wire.messages.vehicles import VehicleState
@@ -104,16 +105,19 @@ def _by_target(observed: Observed, scenario: Scenario) -> dict[str, Any]:
 
 def _by_vehicle(observed: Observed, driven: Driven, scenario: Scenario) -> dict[str, Any]:
     planned = {plan.id: plan.group.name for plan in plan_agents(scenario)}
+    classes = {group.name: group.vehicle_class for group in scenario.groups}
     captures, gaps = observed.counts_by(CAPTURES_BY), gaps_of(observed)
-    row_of = {id: n for n, id in enumerate(driven.ids)}
+    row_of, told = {id: n for n, id in enumerate(driven.ids)}, observed.classes()
     vehicles = observed.vehicles()
     last = {id: n for n, id in enumerate(vehicles.ids)}
     rows: dict[str, Any] = {}
     for id in _all([], sorted(driven.ids), captures, gaps):
         gap, n, at = gaps.get(id), row_of.get(id), last.get(id)
         chased = -1 if at is None else int(vehicles.targets[at])
+        group = planned.get(agent_of(id)) or driven.groups.get(id, "")
         rows[id] = {
-            "group": planned.get(agent_of(id)) or driven.groups.get(id, ""),
+            "group": group,
+            "class": told.get(id) or classes.get(group, GROUND),
             "captures": captures.get(id, 0),
             "distance_m": 0.0 if n is None else float(driven.distance_m[n]),
             "waiting_s": 0.0 if n is None else float(driven.waiting_s[n]),
@@ -129,6 +133,7 @@ def _by_vehicle(observed: Observed, driven: Driven, scenario: Scenario) -> dict[
 def _by_group(observed: Observed, by_vehicle: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
     proven, unproven = observed.histograms_by(GAPS_OF), observed.counts_by(UNPROVEN_OF)
     members: dict[str, list[str]] = {group.name: [] for group in scenario.groups}
+    classes = {group.name: group.vehicle_class for group in scenario.groups}
     for id, row in by_vehicle.items():
         members.setdefault(row["group"], []).append(id)
     rows: dict[str, Any] = {}
@@ -141,6 +146,7 @@ def _by_group(observed: Observed, by_vehicle: Mapping[str, Any], scenario: Scena
             for name in ("captures", "distance_m", "waiting_s", "standing_s")
         }
         rows[group] = {
+            "class": classes.get(group, GROUND),
             "vehicles": len(ids),
             **sums,
             "routes": gap.routes,

@@ -49,7 +49,11 @@ KINDS: Mapping[str, AlarmKind] = {
     "silent": AlarmKind("silent", True, "A process is there and has told nothing for 4 s: it hangs or is cut off."),
     "keeper-behind": AlarmKind("keeper behind", True, "Marks wait to be stored, as on a full disk."),
     "quota": AlarmKind("quarantined", False, "An author writes more marks than its quota; they are delayed."),
-    "target-lost": AlarmKind("target lost", False, "Nobody tracks the target; routes lead to where it was."),
+    "target-lost": AlarmKind(
+        "target lost",
+        False,
+        "Nobody tracks the target; routes lead to where it was, and it is searched for after 30 s.",
+    ),
     "behind": AlarmKind("behind", False, "A process skips ticks: the machine is too slow for what it does."),
     "restarted": AlarmKind("restarted", False, "A process was started again after it had ended."),
 }

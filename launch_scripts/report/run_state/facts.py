@@ -12,6 +12,7 @@ from typing import Any
 from launch_scripts.report.results.certified_gap import CertifiedGap, gap_text, percent
 from launch_scripts.report.run_state.alarms import Alarm
 from launch_scripts.report.run_state.state import RunState, TargetLine
+from swarm.config.classes import GROUND
 
 NONE = "-"
 """What is shown where nothing is known."""
@@ -120,6 +121,7 @@ FACTS: tuple[Fact, ...] = (
     Fact("elapsed_s", "time", "s", lambda s: s.elapsed_s, seconds, "Time since the run began, start-up included."),
     Fact("vehicles_driven", "vehicles", "", _vehicles, of_all, "Vehicles that an agent drives, of all of the run."),
     Fact("states", "of these", "", lambda s: s.states, each, "What the vehicles do."),
+    Fact("classes", "classes", "", lambda s: s.classes, each, "The vehicles by class."),
     Fact("following", "assigned", "", lambda s: s.following, count, "Vehicles that have a target."),
     Fact("captures", "captures", "", lambda s: s.captures, count, "How often targets were caught."),
     Fact("marks", "marks", "", lambda s: s.marks, count, "Cells that vehicles found other than the map said."),
@@ -214,6 +216,8 @@ MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", 
 def lines(state: RunState) -> list[str]:
     """The facts of a run but its time, in lines for people: `label text` with two spaces between facts."""
     found = ["  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in names) for names in LINES]
+    if list(state.classes) not in ([], [GROUND]):
+        found.insert(1, f"{fact('classes').label} {fact('classes').shown(state)}")
     found += [f"{fact(name).label} {fact(name).shown(state)}" for name in IF_ANY if fact(name).of(state)]
     wrong = [name for name in MUST_BE_ZERO if fact(name).of(state)]
     if wrong:

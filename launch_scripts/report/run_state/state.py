@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from launch_scripts.report.run_state.plan import RunPlan
 from launch_scripts.report.tracked_targets import TrackedTargets
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
+from swarm.config.classes import GROUND
 from swarm.grid import GridSpec
 from swarm.order_book import OrderBook
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
@@ -67,6 +69,7 @@ class RunState:
 
     elapsed_s       time of the run, since it began
     states          vehicles that somebody drives, by VehicleState
+    classes         the same by class, "ground" first
     alive           processes that are as they should be: alive, or ended because they were asked to
     expected        processes that the run needs
     crew            role -> (alive, expected)
@@ -79,6 +82,7 @@ class RunState:
     elapsed_s: float
     targets: tuple[TargetLine, ...]
     states: dict[str, int]
+    classes: dict[str, int]
     vehicles: int
     vehicles_planned: int
     following: int
@@ -109,6 +113,11 @@ class RunState:
         return tuple(alarm for alarm in self.alarms if alarm.lasts)
 
 
+def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int]:
+    counts = Counter(classes[id] for id in ids)
+    return {name: counts[name] for name in sorted(counts, key=lambda name: (name != GROUND, name))}
+
+
 def state_of(
     observed: Observed, tracked: TrackedTargets, plan: RunPlan, book: OrderBook, now_ns: int, began_ns: int | None
 ) -> RunState:
@@ -126,6 +135,7 @@ def state_of(
         elapsed_s=0.0 if began_ns is None else max(now_ns - began_ns, 0) / NS_PER_S,
         targets=lines,
         states=by_state(vehicles.count_states()),
+        classes=_by_class(vehicles.ids, observed.classes()),
         vehicles=len(vehicles),
         vehicles_planned=plan.vehicles,
         following=int(np.count_nonzero(vehicles.targets >= 0)),

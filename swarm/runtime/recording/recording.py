@@ -106,6 +106,7 @@ class Recording(Boundary):
                 restarts=setup.restarts,
                 before=b"" if setup.before is None else content_of(setup.before),
                 versions=versions(),
+                anew=setup.anew,
             )
         )
         self._writer.flush()  # a process that is killed at once is named, too

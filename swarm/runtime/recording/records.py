@@ -69,6 +69,7 @@ class Head(Record, frozen=True, tag=0):
     restarts: int
     before: bytes
     versions: dict[_Version, _Version]
+    anew: bool = False
 
 
 class LoopFigures(msgspec.Struct, frozen=True, array_like=True):

@@ -15,6 +15,7 @@ from swarm.wire.fields import (
     Cell,
     Column,
     Count,
+    Distance,
     Gap,
     GridSide,
     Id,
@@ -116,6 +117,27 @@ class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
     pose_age_s: AgeSeconds | None = None
     tracker_lost: bool = False
     vehicle_class: Id = GROUND
+
+
+MOST_BELIEVED = 512
+"""Places in one `Believed`."""
+
+
+class Believed(Message, frozen=True, kw_only=True, tag=schema_of("believed")):
+    """Where a planner believes its target to be that nobody sees. The newest replaces the older; without cells the
+    search is over.
+
+    side_m  of the square blocks of ground that it tells of
+    cells   near the middle of each block, the likeliest blocks first
+    shares  float32, probability of each
+    """
+
+    target: Id
+    incarnation: Incarnation
+    stamp_ns: StampNs
+    side_m: Distance
+    cells: Annotated[list[Cell], Meta(max_length=MOST_BELIEVED)]
+    shares: Annotated[bytes, Column("<f4", per="cells", least=0, most=1)]
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):

@@ -16,6 +16,7 @@ from swarm.wire.fields import (
     Directions,
     FiniteCost,
     Id,
+    Legs,
     Natural,
     Region,
     StampNs,
@@ -28,6 +29,7 @@ from swarm.wire.messages.base import Message, schema_of
 from swarm.wire.routes import Route as Route
 from swarm.wire.routes import Routes as Routes
 from swarm.wire.routes import RouteStatus as RouteStatus
+from swarm.wire.routes import check_legs
 from swarm.wire.statements import FOREVER as FOREVER
 from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
 from swarm.wire.statements import TILE_AREA as TILE_AREA
@@ -145,7 +147,10 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
-    """The route that a vehicle has just begun to follow, for those who watch."""
+    """The route that a vehicle has just begun to follow, for those who watch.
+
+    legs  of a pulled route, as in `Route`
+    """
 
     vehicle: VehicleId
     target: Id
@@ -153,3 +158,7 @@ class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
     directions: Directions
     cost_s: FiniteCost
     lower_bound_s: FiniteCost
+    legs: Legs = b""
+
+    def relate(self) -> None:
+        check_legs([len(self.directions)], self.legs)

@@ -36,7 +36,7 @@ from swarm.errors import BusError, StoreError
 from swarm.liveness import Peer
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.planning import Believed, PlannerStatus
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Fleet, Followed
@@ -221,6 +221,19 @@ def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
     rig.run(3)
     rig.close()
     assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies/discs"] == 4, "none, here, there, none"
+
+
+def test_where_a_target_is_believed_to_be_is_drawn_until_it_is_seen(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+    told = Believed(
+        target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
+    )
+    rig.play([(NS_PER_S // 2, told), (2 * NS_PER_S, msgspec.structs.replace(told, cells=[], shares=b""))])
+    rig.run(3)
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/searched"] == 3, "none, there, none"
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(

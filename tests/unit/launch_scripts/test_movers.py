@@ -21,6 +21,7 @@ from launch_scripts.monitor.movers.levels import LEVELS, level_for
 from launch_scripts.monitor.movers.looks import ALARM_COLOUR, HUES, LOST_COLOUR, Looks, shaded
 from launch_scripts.monitor.movers.points import cell_at, label_places, target_points, vehicle_points
 from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along
+from launch_scripts.monitor.movers.searches import SILENT_NS, Searches, searched_points
 from launch_scripts.monitor.movers.strips import Trails, poles, rings
 from launch_scripts.report.results.certified_gap import CertifiedGap
 from launch_scripts.report.run_state.alarms import KINDS, Alarm
@@ -32,6 +33,8 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import MonitorConfig
 from swarm.errors import ConfigError
 from swarm.grid import walk
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import Believed
 from swarm.wire.messages.vehicles import VehicleState
 
 
@@ -210,6 +213,37 @@ def test_targets_stand_on_poles_above_the_ground_with_their_names_on_top() -> No
     pole = poles(mesh, targets).line(0)
     assert pole[:, :2].tolist() == [[50.0, -60.0], [50.0, -60.0]]
     assert pole[0, 2] < pole[1, 2] < label_places(mesh, targets)[0, 2]
+
+
+def believed(cells: list[int], shares: list[float], target: str = "t0") -> Believed:
+    return Believed(
+        target=target, incarnation=1, stamp_ns=0, side_m=40.0, cells=cells, shares=pack_column(shares, "<f4")
+    )
+
+
+def test_the_likelier_a_target_is_somewhere_the_less_transparent_is_that_drawn_on_the_ground() -> None:
+    mesh = TerrainMesh(hill(20, 30))
+    positions, colours, radii_m, details = searched_points(
+        mesh, {"t0": believed([65, 10 * 30, 20 * 30], [0.5, 0.1, 0.2])}
+    )
+    assert len(positions) == len(colours) == len(radii_m) == 2, "a cell outside of the map is not drawn"
+    assert colours[0, 3] > colours[1, 3] > 0
+    assert details == ["t0 may be here: 50.0%", "t0 may be here: 10.0%"]
+    ground = mesh.place(np.array([55.0, 5.0], np.float32), np.array([25.0, 105.0], np.float32), 0.1 * mesh.scale_m)
+    assert np.allclose(positions, ground)
+    assert len(searched_points(mesh, {})[0]) == 0
+
+
+def test_a_search_is_drawn_until_it_is_over_or_its_planner_is_silent() -> None:
+    searches = Searches()
+    assert searches.take_changed(0) is None
+    searches.hear(believed([1], [1.0]), 0)
+    searches.hear(believed([2], [1.0], "t1"), NS_PER_S)
+    assert set(searches.take_changed(NS_PER_S) or ()) == {"t0", "t1"}
+    assert searches.take_changed(2 * NS_PER_S) is None
+    assert set(searches.take_changed(SILENT_NS) or ()) == {"t1"}
+    searches.hear(believed([], [], "t1"), SILENT_NS)
+    assert searches.take_changed(SILENT_NS) == {}
 
 
 def test_nobody_there_is_nothing_to_draw() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -23,6 +24,8 @@ from launch_scripts.world.targets import (
 )
 from launch_scripts.world.telling import Telling
 from launch_scripts.world.walks import Walk
+from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.homes import homes_of
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
@@ -201,6 +204,29 @@ def test_a_driver_waits_longer_for_a_planner_that_is_alive_but_silent() -> None:
     assert list(world.poses()) == ["t0", "t1", "t2"]
 
 
+def test_in_a_run_that_begins_all_targets_are_placed_at_once() -> None:
+    world = World(TargetConfig(count=2), still(name="s"))
+    world.world.planner_up("t0", True)
+    assert world.poses() == {}
+    world.world.begin_anew()
+    assert sorted(world.poses()) == ["s", "t0", "t1"]
+
+
+def test_where_targets_may_start_is_the_same_whoever_found_it() -> None:
+    pace = flat()
+    pace[:, 30] = np.inf
+    plan, terrain = scenario(TargetConfig(count=9)), terrain_of_pace(pace, RES)
+    found = homes_of(terrain.pace_s_per_m, pace)
+    assert found.sum() == pace[:, :30].size
+    poses = []
+    for homes in (None, found, ~found & np.isfinite(pace)):
+        world = TargetWorld(plan, terrain, pace, 1, homes=homes)
+        world.begin_anew()
+        poses.append([action.pose.cell for action in world.tick(0) if isinstance(action, Publish)])
+    assert len(poses[0]) == 9
+    assert poses[0] == poses[1] != poses[2]
+
+
 def test_nonsense_from_a_planner_places_nobody() -> None:
     pace = flat()
     pace[0, 0] = np.inf
@@ -372,6 +398,22 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
     counts = ear.of(Stats)[-1].counts
     assert [counts[name] for name in ("captures", "collisions", "lethal_entries")] == [1, 1, 1]
     assert 0 < counts["poses"] <= len(ear.of(TargetPose))
+
+
+@pytest.mark.parametrize("anew", [True, False])
+def test_a_service_with_which_the_run_begins_waits_for_what_is_ordered_but_for_no_planner(
+    anew: bool,
+) -> None:
+    plan = scenario(still())
+    model = SwarmModel(terrain=terrain_of_pace(flat(), RES), scenario=plan)
+    ear = Ear(model)
+    setup = replace(model.setup("targets", "0"), anew=anew)
+    model.start("targets", lambda bus, post: TargetsService(setup, model.terrain, flat(), bus, post), phase_ns=0)
+    model.run(0.3)
+    assert ear.of(TargetPose) == []
+    model.keeper("0", KeeperStore(":memory:"))
+    model.run(0.5)
+    assert bool(ear.of(TargetPose)) == anew
 
 
 def test_counts_are_declared_before_anything_happens() -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from planner_service.kernels.compile import KERNELS
 
 def test_every_kernel_of_a_planner_is_built() -> None:
     built = [name_of(kernel) for kernel in all_kernels()]
-    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first", "pull"})
+    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first", "pull_routes"})
 
 
 _KERNELS = "\n\n\n".join(f'@kernel("(i8,)")\ndef k{n}(x):\n    return x + {n}' for n in range(6))
@@ -161,3 +162,26 @@ def test_what_only_the_other_kind_of_map_needs_is_not_compiled() -> None:
     assert len(alike) == len(directed) + 1
     assert {name for name in alike & directed if name.startswith("grow")} == set()
     assert not any("directed" in name for name in alike)
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        ([], [*first_kernels(False), *later_kernels(False)]),
+        (["--directed"], [*first_kernels(True), *later_kernels(True)]),
+        (["--all"], all_kernels()),
+    ],
+)
+def test_a_builder_by_hand_builds_for_one_kind_of_map_or_for_both(
+    options: list[str], wanted: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[Any] = []
+    monkeypatch.setattr(kernel_build, "build", built.extend)
+    monkeypatch.setattr(kernel_build, "is_loaded", lambda _: False)
+    monkeypatch.setattr(os, "nice", lambda _: 0)
+    monkeypatch.setattr(sys, "argv", ["kernel_build", *options])
+    kernel_build.main()
+    assert [*map(name_of, built)] == [*map(name_of, wanted)]
+    monkeypatch.setattr(kernel_build, "can_build", lambda: False)  # nobody would find what is built
+    kernel_build.main()
+    assert len(built) == len(wanted)

@@ -6,17 +6,22 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 from support.planner_swarm import Ear
 from support.swarm_model import SwarmModel
 
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.bus.bus import Event, Heard
 from swarm.bus.scheduler import InlineWorker
+from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
-from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.fields import column
+from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest
+from swarm.wire.messages.targets import Sighted
 from swarm.wire.routes import Route, RouteStatus
-from swarm.wire.topics import ROUTE
+from swarm.wire.topics import BELIEVED, ROUTE, SIGHTED
 
 _TEXT = """
 seed = 3
@@ -89,3 +94,66 @@ def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_grou
     assert {f"v-{name}": cell for name, cell in ends.items()} == search.searcher.goals
     rows, cols = np.divmod(np.array(list(ends.values())), world.ground.grid.cols)
     assert math.hypot(rows[1] - rows[0], cols[1] - cols[0]) * world.ground.grid.resolution_m > 120.0
+
+
+def test_a_planner_that_begins_anew_searches_from_an_earlier_sighting_that_it_is_told_again() -> None:
+    world = World()
+    world.run(7)
+    search = world.service._planner.target_search
+    assert search is not None
+    belief = search.searcher.belief
+    assert belief is not None
+    assert (belief.reachable == belief.blocks.open).all(), "nothing is known yet"
+    free = np.flatnonzero(np.isfinite(world.ground.pace_s_per_m))
+    cell = int(free[len(free) // 2])
+    for author, age_s, where in (
+        ("all.a1.1", 200, int(free[0])),
+        ("all.a0.1", 40, cell),
+        ("all.a2.1", 40, 48 * 48),
+    ):
+        stamp_ns = world.scheduler.clock.now_ns() - age_s * NS_PER_S
+        sighted = Sighted(
+            author=author, group="all", target="h", seq=1, stamp_ns=stamp_ns, until_ns=stamp_ns + 30 * NS_PER_S,
+            cell=where, x_m=0.0, y_m=0.0, uncertainty_m=1.0,
+        )  # fmt: skip
+        world.ear.bus.publish(SIGHTED, sighted, target="h", author=author)
+    world.run(1)
+    belief = search.searcher.belief
+    assert belief is not None
+    assert search.active
+    assert belief.elapsed_s >= 40.0
+    assert belief.reachable[belief.blocks.of_cell(cell)]
+    assert belief.reachable.sum() < belief.blocks.open.sum()
+
+
+def test_a_planner_tells_what_it_believes_while_it_searches_and_once_that_it_does_no_more() -> None:
+    world = World()
+    heard: list[Believed] = []
+
+    def hear(event: Event) -> None:
+        assert isinstance(event, Heard)
+        assert isinstance(event.message, Believed)
+        heard.append(event.message)
+
+    world.ear.bus.subscribe(BELIEVED, hear)
+    world.run(4)
+    assert not heard
+    world.run(4)
+    assert 2 <= len(heard) <= 4
+    shares = column(heard[-1].shares, "<f4")
+    assert 0 < len(shares) <= MOST_BELIEVED
+    assert (np.diff(shares) <= 0).all()
+    assert shares.sum() == pytest.approx(1, abs=1e-3)
+    assert len(set(heard[-1].cells)) == len(shares)
+    assert max(heard[-1].cells) < world.ground.grid.cells
+    now_ns = world.scheduler.clock.now_ns()
+    sighted = Sighted(
+        author="all.a0.1", group="all", target="h", seq=1, stamp_ns=now_ns, until_ns=now_ns + 30 * NS_PER_S,
+        cell=heard[-1].cells[0], x_m=0.0, y_m=0.0, uncertainty_m=1.0,
+    )  # fmt: skip
+    world.ear.bus.publish(SIGHTED, sighted, target="h", author="all.a0.1")
+    world.run(2)
+    assert heard[-1].cells == []
+    many = len(heard)
+    world.run(3)
+    assert len(heard) == many

@@ -53,6 +53,9 @@ class Watch:
         return [told.text for told in self.told]
 
 
+LEADS = "routes lead to where it was, and after 30 s it is searched for"
+
+
 def test_a_pose_outside_is_counted_said_once_and_not_used() -> None:
     here = Watch()
     here.hear()
@@ -154,9 +157,9 @@ def test_losing_and_regaining_are_said_each_time_with_the_reason() -> None:
         "tracker-lost", "tracker-back", "tracker-lost", "tracker-back", "tracker-changed"
     ]  # fmt: skip
     assert here.sentences() == [
-        "target t0: tracker radar has been silent for longer than its lease of 2 s; routes lead to where it was",
+        "target t0: tracker radar has been silent for longer than its lease of 2 s; " + LEADS,
         "target t0: tracker radar tracks it again, after 2.5 s in which nobody knew where it was",
-        "target t0: tracker radar has handed it over, and nobody else tracks it; routes lead to where it was",
+        "target t0: tracker radar has handed it over, and nobody else tracks it; " + LEADS,
         "target t0: tracker camera tracks it again, after 0.3 s in which nobody knew where it was",
         "target t0: tracker camera tracks it now, before that tracker radar did",
     ]

@@ -11,6 +11,8 @@ from support.map_strategies import GRID, Acknowledged, set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import Keeper, KeeperStore
+from shared_map.learning.words import ONE, Said, told
+from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.errors import StoreError
@@ -241,6 +243,32 @@ def test_an_author_that_lives_is_never_taken_for_dead() -> None:
     assert own is not None
     assert (own.epoch, len(own.cells)) == (1, 2)
     assert keeper.counters.counts["sets_folded"] == 0
+
+
+def test_what_a_dead_author_learned_stays_as_it_was_said_while_its_marks_are_compacted() -> None:
+    swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5, learning=True)))
+    store = KeeperStore(":memory:")
+    keeper, other = swarm.keeper("k", store), swarm.writer("a2.1")
+    author, dead = swarm.writer("a1.1"), swarm.writer("a3.1")
+    said = {0: Said(400, ONE, ONE // 10)}
+    author.sync.publish(author.replica.write_learned(said, swarm.now_ns))
+    for each in (author, dead):
+        swarm.run(1)
+        each.sync.publish(each.replica.write(np.arange(8), MarkKind.LETHAL, 0.0, swarm.now_ns))
+    for name in ("a1.1", "a3.1"):
+        swarm.kill(name)
+    for n in range(30):  # the one that lives goes on
+        other.sync.publish(other.replica.write([n], MarkKind.PACE, 2.0, swarm.now_ns))
+        swarm.run(1)
+    assert keeper.counters.counts["sets_folded"] > 0
+    late = swarm.listener("late")
+    swarm.run(2)
+    beyond = beyond_tile(swarm.terrain.grid)
+    for held in (keeper.replica.held, other.replica.held, late.replica.held):
+        word = held.get(beyond, "a1.1")
+        assert word is not None
+        assert told(word) == said
+    assert [told(each) for each in store.load() if each.tile == beyond] == [said]
 
 
 def test_a_keeper_refuses_the_store_of_another_terrain() -> None:

@@ -1,4 +1,4 @@
-"""Made-up terrains that are kept from run to run: the right one or none."""
+"""Built-in terrains that are kept from run to run: the right one or none."""
 
 from __future__ import annotations
 
@@ -48,6 +48,16 @@ def test_a_terrain_is_made_once_and_is_the_same_ever_after(tmp_path: Path, built
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     np.testing.assert_array_equal(truth_again, truth)
     assert os.path.samefile(tmp_path / "one" / "pace.npy", tmp_path / "two" / "pace.npy")
+
+
+def test_the_terrain_that_comes_with_a_library_is_kept_until_that_is_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    key = kept.kept_key(Scenario())
+    assert key is not None
+    version = kept.version
+    monkeypatch.setattr(kept, "version", lambda name: "0" if name == "matplotlib" else version(name))
+    assert kept.kept_key(Scenario()) not in (key, None)
 
 
 OTHERS = {
@@ -133,7 +143,7 @@ def test_what_is_kept_is_bounded_and_the_longest_unused_goes_first(
 def test_what_is_made_from_files_is_not_kept() -> None:
     mask = ZoneConfig(kind="road", mask="roads.png")
     for scenario in (
-        Scenario(),
+        Scenario(terrain=TerrainConfig(source="ridge.tif")),
         msgspec.structs.replace(SMALL, cost=CostConfig(zones=(mask,))),
         msgspec.structs.replace(SMALL, terrain=msgspec.structs.replace(SMALL.terrain, photo="photo.tif")),
     ):

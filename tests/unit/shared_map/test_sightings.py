@@ -108,6 +108,34 @@ def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     assert len(detector.look(Places(GRID, [near]), 500_000_000)) == 1
 
 
+def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_unless_it_was_a_capture() -> None:
+    detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0)
+    near = Places(GRID, [Vehicle("v", GRID, GRID.cell(10, 15))])
+
+    def stand(cell: int, seq: int, at_s: int, jumps: int = 0) -> None:
+        x_m, y_m = GRID.centre_m(cell)
+        pose = TargetPose(target="t", incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m, jumps=jumps)
+        detector.set_truth(pose, at_s * NS_PER_S)
+
+    def retold(at_s: int) -> list[Sighted]:
+        detector.retell("t", at_s * NS_PER_S)
+        assert detector.retold(at_s * NS_PER_S) == []
+        return detector.retold((at_s + 1) * NS_PER_S)
+
+    assert retold(0) == []
+    stand(GRID.cell(10, 10), 1, 2)
+    told = detector.look(near, 2 * NS_PER_S)
+    stand(0, 2, 10)
+    assert retold(60) == told
+    assert detector.retold(99 * NS_PER_S) == [], "once"
+    detector.hear(sighted(3 * NS_PER_S, author="red.a1.1"))
+    assert retold(100) == [], "another knows better"
+    stand(GRID.cell(10, 10), 3, 110)
+    assert detector.look(near, 110 * NS_PER_S)
+    stand(0, 4, 111, jumps=1)
+    assert retold(120) == [], "it was captured"
+
+
 def test_the_store_keeps_where_each_target_was_seen_last() -> None:
     with KeeperStore(":memory:") as store:
         store.save_sightings([sighted(5, cell=1), sighted(5, target="u")])

@@ -233,6 +233,19 @@ def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_w
     assert routes.newest.cells[-1] == GRID.cell(33, 33)
 
 
+def test_a_vehicle_asks_by_its_class_and_is_told_once_if_there_is_none(world: Swarm) -> None:
+    program = Program(world)
+    rover = program.swarm.vehicle("walker", vehicle_class="boat")
+    rover.at(*GRID.centre_m(GRID.cell(30, 3)))
+    rover.follow("t")
+    world.run(2.5)
+    assert len(program.problems) == 1
+    assert "gets no route to t: " in program.problems[0]
+    assert "there is no class 'boat'" in program.problems[0]
+    with pytest.raises(ConfigError, match="vehicle_class"):
+        program.swarm.vehicle("other", vehicle_class="no class")
+
+
 # --- marks --------------------------------------------------------------------------------------------------------
 
 

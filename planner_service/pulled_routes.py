@@ -1,0 +1,83 @@
+"""Routes of a planner, pulled straight (`kernels.pull`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Floats
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import STEP_COL, STEP_ROW
+from swarm.wire.routes import RouteBatch
+
+DIRECTION_OF: NDArray[np.uint8] = np.zeros((3, 3), np.uint8)
+"""(rows + 1, cols + 1) of a step -> its direction code."""
+DIRECTION_OF[np.array(STEP_ROW) + 1, np.array(STEP_COL) + 1] = np.arange(8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pulled:
+    """Routes along the cells that their segments cross.
+
+    directions  uint8   of all routes, one after the other; ends: int64 (n,), where each stops in it
+    legs        uint32  over how many steps each segment goes
+    """
+
+    directions: NDArray[np.uint8]
+    ends: NDArray[np.int64]
+    legs: NDArray[np.uint32]
+
+
+class Puller:
+    """Pulls routes over neighbours straight.
+
+    pace          (rows, cols) float32, s/m; inf is lethal. It is read at each call
+    resolution_m  side of a cell
+    config        which corners a segment may pass: where a diagonal step may
+    """
+
+    def __init__(self, pace: Floats, resolution_m: float, config: PlannerConfig) -> None:
+        # Compiled only for those who pull: nobody else waits for it at a first start.
+        from planner_service.kernels.compile import load
+        from planner_service.kernels.pull import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
+
+        self._metres = resolution_m
+        self._pace, self._cols = pace.reshape(-1), pace.shape[1]
+        self._corners = ALL_CORNERS if config.corner_cutting else OPEN_CORNERS
+        if config.neighbours == 4:
+            self._corners = NO_CORNERS
+        self._kernel = pull_routes
+        load(pull_routes)
+
+    def pull(
+        self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
+    ) -> tuple[Pulled, NDArray[np.float64]]:
+        """Routes as in `RouteBatch` -> those pulled, and (3, n) float64: the integral of the pace along each one,
+        and along the route that it was, s; its length, m.
+
+        The integral is inf of a route that meets what is shut by now: each of its steps is a segment then.
+        """
+        many, steps = starts.size, directions.size
+        longest = int(np.diff(ends, prepend=0).max(initial=0)) + 1
+        scratch = (np.empty(longest, np.int64), np.empty((2, longest)), *np.empty((2, longest), np.int64))
+        out = np.empty(2 * steps, np.uint8), np.empty(many, np.int64)
+        legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
+        prices = np.empty((3, many))
+        self._kernel(
+            self._pace, self._cols, self._corners, (starts, directions, ends), scratch, (*out, legs, turned), prices
+        )
+        done = int(out[1][-1]) if many else 0
+        return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
+
+    def pull_batch(self, routes: RouteBatch) -> RouteBatch:
+        """The same routes along their segments. Costs and bounds stay those of the routes over neighbours."""
+        if not routes.directions.size:
+            return routes
+        pulled, prices = self.pull(routes.starts, np.ascontiguousarray(routes.directions), routes.ends)
+        length_m = np.where(np.isfinite(prices[0]), prices[2], routes.length_m)
+        return replace(
+            routes,
+            directions=pulled.directions, ends=pulled.ends, legs=pulled.legs, length_m=length_m
+        )  # fmt: skip
