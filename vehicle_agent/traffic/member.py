@@ -241,7 +241,7 @@ class Member:
                 self.stored = table
                 self._told = [*self._told[-_TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
-            # What both others have on file needs no more than its number: at rest, tables were a quarter of all bytes.
+            # What both others have on file needs no more than its number: at rest tables were a fifth of all bytes.
             answered = now_ns - self._acked_ns < 2 * BEAT_NS
             known = self._others and all(self._has.get(member) == table.stamp for member in self._others)
             actions.append(self.on_file if known and answered else table)
