@@ -212,7 +212,7 @@ STANDING = Topic(
 TABLE = Topic(
     "table", "table/{plot}/{member}/{agent}", Table,
     "which cells the warden of a plot has granted, for one of its members; a member that is asked promises an "
-    "epoch and answers with what it has stored", "on change, at least 5 Hz where vehicles are",
+    "epoch and answers with what it has stored", "on change, and at 5 Hz until both others have it on file",
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
     request=Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
@@ -223,7 +223,7 @@ GRANTED = Topic(
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{member}/{agent}", Stored, "which table a member has on file, for another one",
-    "per table by one member, 5 Hz by the other",
+    "per table by one member, 5 Hz by the other; 5 Hz by the warden, instead of a table that both have on file",
     access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(

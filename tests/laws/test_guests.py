@@ -206,8 +206,9 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
 
 FIRST = {
     "a_first_cell_is_taken_from_a_table_that_is_about_to_free_it": 66,
-    "a_robot_that_is_replaced_says_that_it_has_ended": 23,
-    "a_cell_that_was_shut_for_a_guest_is_anybodys": 67,
+    "a_robot_that_is_replaced_says_that_it_has_ended": 3,
+    "a_robot_drives_on_though_it_is_replaced": 4,
+    "a_cell_that_was_shut_for_a_guest_is_anybodys": 3,
 }
 """Histories tried before the others, as they collided last: what is rare is found soon."""
 

@@ -257,8 +257,8 @@ FIRST = {
     "stores_after_a_promise": 39,
     "an_older_life_goes_on": 14,
     "forgets_where_an_older_life_may_stand": 14,
-    "seats_a_file_that_is_not_the_first": 18,
-    "acts_on_a_table_that_is_not_the_newest": 37,
+    "seats_a_file_that_is_not_the_first": 56,
+    "acts_on_a_table_that_is_not_the_newest": 33,
 }
 """Histories tried before the others, as they collided last: what is rare is found soon."""
 

@@ -178,7 +178,7 @@ class RightOfWay:
         return [] if member is None else [*member.hear_table(table, now_ns)]
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[Action]:
-        member = self._members.get(stored.plot)
+        member = self._member(stored.plot, now_ns)
         return [] if member is None else [*member.hear_stored(stored, now_ns)]
 
     def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:

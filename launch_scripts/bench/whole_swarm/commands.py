@@ -34,6 +34,10 @@ def swarm(
         int | None, typer.Option(help="Cells a side.", show_default="262 cells for each vehicle")
     ] = None,
     tick_hz: Annotated[float, typer.Option(help="Ticks a second of agents and planners.")] = 5.0,
+    time_scale: Annotated[
+        float,
+        typer.Option(min=1e-3, max=100, help="Seconds on the terrain per second; 0.001 for a swarm at rest."),
+    ] = 2.0,
     seconds: Annotated[
         float | None,
         typer.Option(min=1, max=3600, help="How long to measure.", show_default="30, simulated 10"),
@@ -49,6 +53,7 @@ def swarm(
     swarm bench swarm --vehicles 1000
     swarm bench swarm --series --write docs/scale-figures.md
     swarm bench swarm --vehicles 100,200,400,1000 --per-agent 25 --simulated
+    swarm bench swarm --vehicles 1000 --time-scale 0.001 --simulated     # what is told though nothing changes
 
     Starts the processes of `swarm up` on a free port of this machine, waits until every vehicle has a route,
     measures, and ends them: the scenario is `thousand` with a map that grows with the vehicles. With several sizes
@@ -65,7 +70,15 @@ def swarm(
         raise ConfigError(f"--series is --vehicles {','.join(map(str, SERIES))}: give one of the two")
     many = SERIES if series else numbers_of(vehicles, "vehicles")
     sizes = [
-        size_of(each, targets, agents=agents, per_agent=per_agent, side=size, tick_hz=tick_hz, seed=seed)
+        size_of(
+            *(each, targets),
+            agents=agents,
+            per_agent=per_agent,
+            side=size,
+            tick_hz=tick_hz,
+            seed=seed,
+            time_scale=time_scale,
+        )
         for each in many
     ]
     if write is not None:
@@ -82,6 +95,7 @@ def swarm(
             "per-agent": per_agent,
             "size": size,
             "tick-hz": f"{tick_hz:g}" if tick_hz != 5 else None,
+            "time-scale": f"{time_scale:g}" if time_scale != 2 else None,
             "seconds": f"{seconds:g}",
         }
         words = [f"--{name} {value}" for name, value in options.items() if value is not None]

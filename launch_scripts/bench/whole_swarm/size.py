@@ -22,7 +22,7 @@ _LEAST_SIDE, _MOST_SIDE = 32, 16_384
 _SCENARIO = """
 name = "scale"
 seed = {seed}
-time_scale = 2             # 10 m/s on cells of 20 m: 1 cell a second on open ground
+time_scale = {time_scale:g}             # with 2, 10 m/s on cells of 20 m: 1 cell a second on open ground
 
 [terrain]
 source = "synthetic"
@@ -85,6 +85,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     per_agent  vehicles of each, the last may have fewer
     side       cells a side of the square map
     tick_hz    of agents and planners
+    time_scale seconds on the terrain per second
     """
 
     vehicles: int
@@ -94,6 +95,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     side: int
     tick_hz: float
     seed: int
+    time_scale: float = 2.0
 
 
 def size_of(
@@ -105,6 +107,7 @@ def size_of(
     side: int | None = None,
     tick_hz: float = 5.0,
     seed: int = 5,
+    time_scale: float = 2.0,
 ) -> Size:
     """The size with everything that is not given. Raises ConfigError, which names the option.
 
@@ -142,6 +145,7 @@ def size_of(
         per_agent=per_agent,
         side=side,
         tick_hz=tick_hz,
+        time_scale=time_scale,
         seed=seed,
     )
 

@@ -241,6 +241,65 @@ def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_beat(
     assert warden.tick(3 * BEAT_NS).hosts["a1"] == (1, 4)  # type: ignore[union-attr]
 
 
+def warden_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
+    """A member that has just become warden, and the table that it told, which nobody has stored yet."""
+    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0)
+    member.hear_standing(standing("a0", [9], seq=1), 2 * S)
+    claim = member.tick(2 * S)[0]
+    assert isinstance(claim, Save)
+    member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
+    member.hear_standing(standing("a0", [9], seq=2), 2 * S)
+    (_, table) = member.tick(2 * S)
+    assert isinstance(table, Table)
+    return member, table
+
+
+def test_a_table_is_told_again_by_its_number_only_once_both_others_have_stored_it() -> None:
+    member, table = warden_that_told({"a0": ["a0-00"]})
+    now_ns = 2 * S
+    number = Stored(plot=0, agent=MEMBERS[0], epoch=table.epoch, seq=table.seq)
+    for stored, told in (
+        ((table.seq, None), table),  # the second has not said anything
+        ((table.seq, table.seq), number),
+        ((table.seq, table.seq - 1), table),  # it has lost its table, or its word was late: the whole does no harm
+        ((None, table.seq), number),
+    ):
+        now_ns += BEAT_NS
+        member.hear_standing(standing("a0", [9], seq=now_ns), now_ns)
+        for other, seq in zip(MEMBERS[1:], stored, strict=True):
+            if seq is not None:
+                member.hear_stored(Stored(plot=0, agent=other, epoch=table.epoch, seq=seq), now_ns)
+        assert [each for each in member.tick(now_ns) if not isinstance(each, Granted)] == [told]
+    now_ns += 2 * BEAT_NS
+    member.hear_standing(standing("a0", [9], seq=now_ns), now_ns)
+    assert member.tick(now_ns) == [table]  # nobody has answered the number
+
+
+def test_a_number_is_answered_as_the_table_that_it_stands_for() -> None:
+    first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0) for n in (2, 0))  # of epoch 1
+    same = Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=4)
+    lags = [Stored(plot=0, agent=MEMBERS[2], epoch=0, seq=0)]
+    assert first.hear_stored(same, S) == lags  # it has to be told the whole
+    assert [first.hear_table(table_of(1, 4), S)[-1]] == first.hear_stored(same, S) == [first.on_file]
+    second.hear_table(table_of(1, 4), S)
+    assert second.tick(S) == [second.on_file]
+    second.hear_stored(first.on_file, 2 * S)
+    assert second.hear_stored(same, 2 * S) == []
+    assert second.tick(2 * S) == [second.on_file]
+    assert second.hear_claim(2, 2 * S + BEAT_NS) == []  # who tells a number leads, as who tells a table
+    assert first.hear_stored(Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=3), S) == []  # it came late
+
+
+def test_a_number_of_a_later_epoch_ends_a_warden_and_one_of_an_earlier_epoch_is_told_so() -> None:
+    member, table = warden_that_told({"a0": ["a0-00"]})
+    later = next(epoch for epoch in range(table.epoch + 1, table.epoch + 3) if PLOTS.warden(0, epoch) == MEMBERS[1])
+    assert member.hear_stored(Stored(plot=0, agent=MEMBERS[1], epoch=later, seq=7), 2 * S) == [member.on_file]
+    assert member.warden is None
+    member = member_of(promised=5)
+    old = Stored(plot=0, agent=MEMBERS[1], epoch=1, seq=7)
+    assert member.hear_stored(old, S) == [Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=0)]
+
+
 def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
     member = member_of()
     member.hear_standing(standing("a1", [9], seq=1), 2 * S)
