@@ -13,9 +13,11 @@ from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
 from shared_map.prepared_classes import load_classes
 from shared_map.terrain.kept import kept_key
-from shared_map.terrain.terrain import load_terrain
+from shared_map.terrain.terrain import Terrain, load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
+from swarm.config.classes import aloft_classes
+from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
@@ -28,6 +30,11 @@ from swarm.runtime.turns import Turns
 log = logging.getLogger(__name__)
 
 
+def _climbs(scenario: Scenario, terrain: Terrain) -> bool:
+    """Whether steps cost by what they climb, for any class."""
+    return terrain.climb is not None or bool(aloft_classes(scenario))
+
+
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Plan for one target, as its planner or a standby, until SIGTERM, SIGINT or the end of the launcher."""
     scenario = setup.scenario
@@ -37,7 +44,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
-    kernels = KernelLoader(directed=terrain.climb is not None, whole=is_slow_to_grow(terrain.grid))
+    kernels = KernelLoader(directed=_climbs(scenario, terrain), whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
     prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
     clock = MonotonicClock()

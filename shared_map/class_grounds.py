@@ -11,6 +11,7 @@ import msgspec
 
 from shared_map.arrays import Bools, Floats
 from shared_map.class_maps import read_by
+from shared_map.terrain.air_terrain import air_terrain
 from shared_map.terrain.homes import homes_of
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.classes import GROUND, ClassConfig, class_named, driven_classes
@@ -78,6 +79,8 @@ def class_grounds(
 
 def least_pace(own: ClassConfig | None) -> float:
     """The pace below which no vehicle of a class comes, s/m."""
+    if own is not None and own.air is not None:
+        return 1 / own.air.speed_m_per_s
     return PACE_LEAST if own is None or own.max_speed_m_per_s is None else 1 / own.max_speed_m_per_s
 
 
@@ -94,6 +97,8 @@ def _truth(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> Flo
     if prepared is not None:
         return prepared.truth
     own = _terrain(scenario, common, name)
+    if own.flight_m is not None:  # nothing is hidden in the air
+        return own.ground_s_per_m
     own_prior, prior = own.ground_s_per_m.reshape(-1), common.ground_s_per_m.reshape(-1)
     read: Floats = read_by(own_prior, prior, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
     return read
@@ -104,7 +109,9 @@ def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
     if own is None:
         return common
     made, key = _MADE.setdefault(common, {}), _key(scenario, name)
-    if key not in made:
+    if key not in made and own.air is not None:
+        made[key] = air_terrain(common, own.air, f"class {name}")
+    elif key not in made:
         try:
             terrain = build_terrain(scenario, vehicle_class=name)
         except TerrainError as error:

@@ -52,6 +52,8 @@ def read_marks(
     own, common  the terrain of that class, and of "ground"
     """
     where = np.asarray(cells, np.int64)
+    if own.flight_m is not None:  # whatever lies on the ground
+        return np.full(kinds.shape, np.uint8(MarkKind.CLEAR)), own.ground_s_per_m.reshape(-1)[where]
     own_prior = own.ground_s_per_m.reshape(-1)[where]
     prior = common.ground_s_per_m.reshape(-1)[where]
     stated = np.where(kinds == MarkKind.PACE, paces, prior).astype(np.float32)
@@ -69,7 +71,11 @@ class ClassMaps:
 
     def __init__(self, common: CostMap, terrains: Mapping[str, Terrain]) -> None:
         self.common = common
-        self.of = {name: CostMap(terrain, learning=common.keys is not None) for name, terrain in terrains.items()}
+        learns = common.keys is not None
+        self.of = {
+            name: CostMap(terrain, learning=learns and terrain.flight_m is None)
+            for name, terrain in terrains.items()
+        }
 
     def learn(self, words: Sequence[MarkSet]) -> bool:
         """As `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""

@@ -86,6 +86,8 @@ def _save(folder: Path, key: str, ground: ClassGround) -> None:
         arrays["ground"] = terrain.ground_s_per_m
     if terrain.climb is not None:
         arrays["climb"] = terrain.climb.factors
+    if terrain.flight_m is not None:
+        arrays["flight"] = terrain.flight_m
     meta = {
         "format": FORMAT,
         "key": key,
@@ -119,10 +121,12 @@ def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str
         raise TerrainError(f"prepared class {folder / _META} is damaged ({error}); delete the folder") from error
     shape = (common.grid.rows, common.grid.cols)
     pace = read_array(folder, "pace", shape, np.float32)
+    flight_m = read_array(folder, "flight", shape, np.float32) if "flight" in arrays else None
     climb = None
     if steepest is not None:
         factors = read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
-        climb = Climb(common.grid, common.elevation_m, factors, float(steepest))
+        heights_m = common.elevation_m if flight_m is None else flight_m
+        climb = Climb(common.grid, heights_m, factors, float(steepest))
     terrain = replace(
         common,
         pace_s_per_m=pace,
@@ -130,6 +134,7 @@ def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str
         digest=digest,
         vehicle_radius_m=radius_m,
         climb=climb,
+        flight_m=flight_m,
         notes=notes,
         least_s_per_m=least_pace(class_named(scenario, name)),
     )

@@ -41,7 +41,9 @@ class RightOfWaySync:
     placed  called with the vehicles that have found their places
     warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
             "promises", for the file of promises
+    spawns    of the agents of the layer: agent -> vehicle -> cell
     vehicles  of an agent that is not in `spawns`
+    layer     as of `Plots`
     """
 
     def __init__(
@@ -55,8 +57,9 @@ class RightOfWaySync:
         placed: Callable[[Sequence[str]], None],
         warn: Callable[[str, str], None],
         vehicles: Collection[str] = (),
+        layer: int = 0,
     ) -> None:
-        plots = Plots(grid, list(spawns))
+        plots = Plots(grid, list(spawns), layer=layer)
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved, vehicles=vehicles)
         self._id = setup.id
         self._store = store
@@ -159,7 +162,7 @@ class RightOfWaySync:
         self.core.silent = not self._store.ready
 
     def _ask_known(self) -> None:
-        request = KnownRequest(agent=self._id, disk=self._store.own.disk)
+        request = KnownRequest(agent=self._id, disk=self._store.own.disk, layer=self.core.plots.layer)
         self._asking = True
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 
@@ -178,7 +181,7 @@ class RightOfWaySync:
         if not asked.fields["plot"].isdecimal():
             return
         plot, plots = int(asked.fields["plot"]), self.core.plots
-        if plot < plots.count and asked.fields["member"] == plots.warden(plot, epoch):
+        if plot in plots.all and asked.fields["member"] == plots.warden(plot, epoch):
             self._answer(asked, self.core.hear_claim(plot, epoch, now_ns))
 
     def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:

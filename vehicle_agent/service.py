@@ -18,7 +18,7 @@ from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
-from swarm.config.classes import GROUND, class_named, of_class
+from swarm.config.classes import GROUND, class_named, flies, of_class
 from swarm.config.plugin_names import assignment_key
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -128,8 +128,11 @@ class AgentService:
             group,
             as_class.vehicles.sense_range_m,
         )
+        self._flies = flies(scenario, self._class)
+        layer_of = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
+        around = {agent: cells for agent, cells in spawns.items() if layer_of[agent] is self._flies}
         self._right_of_way = RightOfWaySync(
-            setup, grid, spawns, store, bus, post, self._place, self._warn, plan.vehicle_ids
+            setup, grid, around, store, bus, post, self._place, self._warn, plan.vehicle_ids, int(self._flies)
         )
         bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)
@@ -381,6 +384,8 @@ class AgentService:
         bodies = self._agent.bodies
         for heard in self._bus.collected(BODY):
             assert isinstance(heard.message, Body)
+            if self._flies:  # bodies are on the ground
+                continue
             bodies.hear(heard.message, now_ns)
             age_ns = now_ns - heard.message.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
@@ -400,7 +405,7 @@ class AgentService:
             self._hear_target_bodies(pose, now_ns)
 
     def _hear_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
-        for body in self._target_bodies.bodies_of(pose, now_ns):
+        for body in () if self._flies else self._target_bodies.bodies_of(pose, now_ns):
             self._agent.bodies.hear(body, now_ns)
 
     def _planners(self) -> dict[str, int]:

@@ -25,6 +25,7 @@ from shared_map.class_grounds import class_truths
 from shared_map.terrain.terrain import build_terrain, build_truth
 from swarm.bus.endpoints import listening
 from swarm.config.agents import plan_agents
+from swarm.config.classes import aloft_classes
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ProtocolError
 from swarm.wire.codec import decode
@@ -80,7 +81,9 @@ class Siege:
         scenario = with_port(find_scenario(options.scenario), 0)
         self._scenario: Scenario = scenario
         terrain = build_terrain(scenario)
-        self._referee = Referee(class_truths(scenario, terrain, build_truth(scenario, terrain)), terrain.grid)
+        self._referee = Referee(
+            class_truths(scenario, terrain, build_truth(scenario, terrain)), terrain.grid, aloft_classes(scenario)
+        )
         vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
         self._recovery = Recovery(vehicles)
         self._names = [spec.name for spec in processes_of(scenario)]

@@ -14,9 +14,12 @@ from launch_scripts.monitor.ground.zones import scenario_areas
 from launch_scripts.monitor.service import FRAME_HZ, MonitorService
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from shared_map.class_grounds import class_terrains
+from shared_map.prepared_classes import load_classes
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
+from swarm.config.classes import aloft_classes
 from swarm.config.ground import HiddenConfig
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
@@ -26,7 +29,11 @@ from swarm.runtime.role import RoleSetup
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
     config = setup.scenario.monitor
-    mesh = TerrainMesh(load_terrain(setup), config.height_factor)
+    seen = load_terrain(setup)
+    load_classes(setup, seen)
+    aloft = class_terrains(setup.scenario, seen, aloft_classes(setup.scenario))
+    mesh = TerrainMesh(seen, config.height_factor, aloft)
+    del seen, aloft
     terrain = load_terrain(setup)  # mapped anew: of what the mesh has read most is not read again
     knows_truth = setup.scenario.terrain.hidden != HiddenConfig()
     layers = shown_layers(setup.scenario, knows_truth=knows_truth)

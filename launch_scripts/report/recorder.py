@@ -25,6 +25,7 @@ from launch_scripts.report.samples import Sample, Samples, at_once, buckets_of, 
 from launch_scripts.report.tracks import TrackKey, Tracks
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
+from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
@@ -207,6 +208,7 @@ class Recorder:
             "seconds": seconds,
             "time_scale": self.scenario.time_scale,
             "vehicles": self.scenario.vehicle_count,
+            "aloft": [each.name for each in self.scenario.groups if flies(self.scenario, each.vehicle_class)],
             "targets": len(self.scenario.target_ids),
             "processes": state.expected,
             "startup_s": startup_s,

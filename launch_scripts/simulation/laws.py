@@ -15,6 +15,7 @@ from shared_map.class_grounds import class_grounds, class_truths
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Event, Heard
 from swarm.config.agents import plan_agents
+from swarm.config.classes import flies
 from swarm.wire.messages.marks import DIGEST_ROW, Digest
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.topics import DIGEST
@@ -66,6 +67,12 @@ class Laws:
         """Agent -> the node on which its newest life began."""
         self._passable = {name: np.isfinite(each.truth).ravel() for name, each in grounds.items()}
         """Class of vehicles -> the cells that it may enter, in truth."""
+        self._aloft = {
+            id
+            for plan in plan_agents(simulation.scenario)
+            if flies(simulation.scenario, plan.group.vehicle_class)
+            for id in plan.vehicle_ids
+        }
         simulation.after_tick.append(self._look)
         simulation.after_boot.append(self._began)
         bus = simulation.network.bus(OBSERVER, simulation.scenario.network.namespace)
@@ -90,11 +97,12 @@ class Laws:
             self._unmoved.pop(id, None)
         if agent.holdings.replaced:
             bodies.clear()  # the younger life drives them
-        on: dict[int, str] = {}
+        on: dict[tuple[int, bool], str] = {}
         for each in (self._unmoved, *self._bodies.values()):
             for id, cell in each.items():
-                if on.setdefault(cell, id) != id:
-                    self.collisions.append((now_s, *sorted((on[cell], id)), cell))  # type: ignore[arg-type]
+                place = cell, id in self._aloft
+                if on.setdefault(place, id) != id:
+                    self.collisions.append((now_s, *sorted((on[place], id)), cell))  # type: ignore[arg-type]
 
     def _hear(self, event: Event) -> None:
         assert isinstance(event, Heard)

@@ -7,7 +7,7 @@ A report of a vehicle holds from its stamp until the vehicle's next report. Wher
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,9 +62,14 @@ class Referee:
     """Turns reports into broken laws. Repeated and late reports change nothing.
 
     truths  class of vehicles -> float32 (rows, cols), s/m; inf is lethal. One that is not there is as "ground"
+    aloft   classes that fly: they meet each other, and nothing that drives
     """
 
-    def __init__(self, truths: Mapping[str, NDArray[np.float32]], grid: GridSpec) -> None:
+    def __init__(
+        self, truths: Mapping[str, NDArray[np.float32]], grid: GridSpec, aloft: Collection[str] = ()
+    ) -> None:
+        self._aloft = frozenset(aloft)
+        self._air = Referee(truths, grid) if aloft else None
         self._truths = {name: truth.reshape(-1) for name, truth in truths.items()}
         self._cells = grid.cells
         self._vehicles: dict[str, _Vehicle] = {}
@@ -76,7 +81,8 @@ class Referee:
     @property
     def cells(self) -> NDArray[np.int64]:
         """Last known cell of every vehicle."""
-        return np.fromiter((vehicle.stay.cell for vehicle in self._vehicles.values()), dtype=np.int64)
+        own = np.fromiter((vehicle.stay.cell for vehicle in self._vehicles.values()), dtype=np.int64)
+        return own if self._air is None else np.concatenate((own, self._air.cells))
 
     def hear_body(self, body: Body, now_ns: int) -> None:
         """Take in where a body is."""
@@ -84,6 +90,8 @@ class Referee:
 
     def hear(self, fleet: Fleet) -> list[Broken]:
         """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
+        if self._air is not None and fleet.vehicle_class in self._aloft:
+            return self._air.hear(fleet)
         broken: list[Broken] = []
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
             if cell < self._cells:

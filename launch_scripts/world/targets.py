@@ -21,6 +21,7 @@ from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
+from swarm.config.classes import aloft_classes
 from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
@@ -115,7 +116,9 @@ class TargetWorld:
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace, terrain.climb, None if halves else homes)
-        self._referee = Referee(class_truths(scenario, terrain, truth_s_per_m), terrain.grid)
+        self._referee = Referee(
+            class_truths(scenario, terrain, truth_s_per_m), terrain.grid, aloft_classes(scenario)
+        )
         self._target_bodies = TargetBodies(scenario, terrain.grid)
         self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation

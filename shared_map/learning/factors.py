@@ -1,8 +1,9 @@
 """From what authors have measured to one factor for each kind of ground, in integers.
 
 A kind of ground is a class and a bin of slopes of five degrees. An author says of a kind on how many cells it has
-driven, and the mean and the variance of y = ln(driven pace / prior pace) there. Every replica that holds the same
-words has the same factors, bit for bit: no step of `log_factors` rounds as a machine likes.
+driven, and the mean and the variance of y = ln(driven pace / prior pace) there, of the middle half of the cells.
+Every replica that holds the same words has the same factors, bit for bit: no step of `log_factors` rounds as a
+machine likes.
 
 The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section 2.5).
 """
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats
+from shared_map.learning.middle import Middle, rounded
 from shared_map.learning.words import KEYS, MOST, MOST_CELLS, ONE, Said
 from shared_map.terrain.layers import TerrainClass, slope_deg
 from swarm.wire.messages.marks import owner_of
@@ -64,8 +66,8 @@ def log_steps(said: Sequence[Said]) -> int:
     cells, mean, variance = estimate(said)
     if cells < _FEWEST_CELLS or mean * mean * cells <= _GATE * variance * ONE:
         return 0
-    shrunk = _round_div(mean * _PRIOR_VARIANCE * cells, _PRIOR_VARIANCE * cells + variance)
-    return max(-MOST_STEPS, min(MOST_STEPS, _round_div(shrunk, STEPS_PER_10TH)))
+    shrunk = rounded(mean * _PRIOR_VARIANCE * cells, _PRIOR_VARIANCE * cells + variance)
+    return max(-MOST_STEPS, min(MOST_STEPS, rounded(shrunk, STEPS_PER_10TH)))
 
 
 def estimate(said: Sequence[Said]) -> Said:
@@ -110,7 +112,7 @@ def factors_of(words: Sequence[Mapping[int, Said]]) -> Floats:
         first = kind * SLOPE_BINS
         factors[first : first + SLOPE_BINS] = FACTORS[log_steps(said) + MOST_STEPS]
     for key, said in by_key.items():
-        if sum(each.cells for each in said) >= _FEWEST_CELLS:
+        if estimate(said).cells >= _FEWEST_CELLS:  # those that count: a few words of one cell each are not enough
             factors[key] = FACTORS[log_steps(said) + MOST_STEPS]
     return factors
 
@@ -156,13 +158,13 @@ def _within(mean: int) -> int:
 def _together(parts: Sequence[Said], weights: Sequence[int]) -> Said:
     """Mean and variance of what several words measured, each of which counts for so many cells."""
     cells = sum(weights)
-    mean = _round_div(sum(w * part.mean for w, part in zip(weights, parts, strict=True)), cells)
+    mean = rounded(sum(w * part.mean for w, part in zip(weights, parts, strict=True)), cells)
     off = (w * (part.variance + (part.mean - mean) ** 2 // ONE) for w, part in zip(weights, parts, strict=True))
     return Said(cells, mean, sum(off) // cells)
 
 
 class Measured:
-    """What one author has measured: exact sums. A cell counts once, the first time that it is driven.
+    """What one author has measured. A cell counts once, the first time that it is driven.
 
     version  grows with every cell that counts
     """
@@ -171,7 +173,7 @@ class Measured:
         self.version = 0
         self._keys = keys.reshape(-1)
         self._driven = np.zeros(len(self._keys), np.bool_)
-        self._sums: dict[int, list[int]] = {}  # key -> cells, sum of y, sum of y * y
+        self._middles: dict[int, Middle] = {}  # by key
 
     def add(self, cell: int, driven_s_per_m: float, prior_s_per_m: float) -> None:
         """A cell was driven at this pace. What is no pace, or lethal by the prior, says nothing."""
@@ -179,23 +181,15 @@ class Measured:
             return
         self._driven[cell] = True
         y = max(-MOST, min(MOST, round(math.log(driven_s_per_m / prior_s_per_m) * ONE)))
-        sums = self._sums.setdefault(int(self._keys[cell]), [0, 0, 0])
-        if sums[0] < MOST_CELLS:
-            sums[0] += 1
-            sums[1] += y
-            sums[2] += y * y
+        middle = self._middles.setdefault(int(self._keys[cell]), Middle())
+        if middle.cells < MOST_CELLS:
+            middle.add(y)
             self.version += 1
 
     @property
     def said(self) -> dict[int, Said]:
         """Key -> what to say of it."""
-        return {key: _said(*sums) for key, sums in sorted(self._sums.items())}
-
-
-def _said(cells: int, total: int, squares: int) -> Said:
-    mean = _round_div(total, cells)
-    # Of the rounded mean, so never negative but by rounding.
-    return Said(cells, mean, max(0, (squares * cells - total * total) // (cells * cells * ONE)))
+        return {key: middle.said for key, middle in sorted(self._middles.items())}
 
 
 def _median(values: Sequence[int]) -> int:
@@ -203,12 +197,6 @@ def _median(values: Sequence[int]) -> int:
     ordered = sorted(values)
     low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return min(low, high, key=abs)
-
-
-def _round_div(number: int, by: int) -> int:
-    """The nearest integer, halves away from 0, the same for both signs."""
-    half = (2 * abs(number) + by) // (2 * by)
-    return half if number >= 0 else -half
 
 
 def _powers() -> NDArray[np.float32]:

@@ -17,6 +17,9 @@ from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import ENTRIES, Climb
 from swarm.grid import GridSpec
 
+_GRADES = 0.1, 0.5
+_GRADE_OF_RELIEF = 1.8
+"""Of the relief over the shorter side: steep terrain needs a steep surface, over gentle one it only costs."""
 _ROOM = 1.02
 """How far beyond the grade of a surface the table of factors reaches: rounding makes steps a hair steeper."""
 
@@ -46,11 +49,13 @@ class AirGround:
     height_m      float32 (rows, cols), above the same zero as the terrain; NaN where nobody flies
     pace_s_per_m  float32 (rows, cols); inf where nobody flies
     climb         the factor of a step by its rise
+    grade         of the surface
     """
 
     height_m: Floats
     pace_s_per_m: Floats
     climb: Climb
+    grade: float
 
 
 def air_ground(
@@ -72,7 +77,7 @@ def air_ground(
     rises = np.linspace(-steepest, steepest, 2 * ENTRIES + 1)
     metres_s = np.where(rises > 0, rises * flight.climb_s_per_m, -rises * flight.descent_s_per_m)
     factors = (1.0 + flight.speed_mps * metres_s).astype(np.float32)
-    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest))
+    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest), flight.grade)
 
 
 def clearance_floor(elevation_m: Floats, clearance_m: float) -> NDArray[np.float64]:
@@ -122,3 +127,11 @@ def _along_the_row(heights: NDArray[np.float64], step_m: float) -> None:
     for way in (slice(None), slice(None, None, -1)):
         there = heights[way]
         np.maximum(there, np.maximum.accumulate(there + fallen) - fallen, out=there)
+
+
+def grade_of(elevation_m: Floats, resolution_m: float) -> float:
+    """The grade of a surface over a terrain: 0.1 over gentle ones, up to 0.5 where relief is 0.28 of the side."""
+    relief_m = float(np.nanmax(elevation_m) - np.nanmin(elevation_m)) if np.isfinite(elevation_m).any() else 0.0
+    low, high = _GRADES
+    side_m = min(elevation_m.shape) * resolution_m
+    return float(min(max(_GRADE_OF_RELIEF * relief_m / side_m, low), high))

@@ -68,6 +68,7 @@ class Terrain:
     digest            16 hex digits of grid, prior pace and cost rules (and heights, where steps cost by them)
     climb             what a step costs for what it climbs; None if it costs the same both ways
     least_s_per_m     no vehicle is quicker, whatever is marked or learned
+    flight_m          float32  of what flies, the height of the surface on which it does; None of what drives
     notes             sentences about where it came from and what was done to it
     zones             what each zone did to it; empty of a prepared one
     """
@@ -82,6 +83,7 @@ class Terrain:
     vehicle_radius_m: float = 0.0
     climb: Climb | None = None
     least_s_per_m: float = PACE_LEAST
+    flight_m: Floats | None = None
     notes: tuple[str, ...] = field(default=())
     zones: tuple[ZoneFacts, ...] = field(default=())
 

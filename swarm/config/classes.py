@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from swarm.config.cost_rules import PRESETS, check_cost
 from swarm.config.explain import choice
-from swarm.config.ground import CostConfig
+from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.config.values import Name, Positive, Section
 from swarm.errors import ConfigError
 
@@ -26,6 +26,26 @@ SHARED = ("zones", "layers", "directional")
 """Settings of `[cost]` that hold for every class."""
 
 
+class AirConfig(Section, frozen=True, kw_only=True):
+    """What makes a class fly: over a surface that keeps its clearance and is no steeper than it can climb.
+
+    speed_m_per_s    in level flight
+    clearance_m      it is never lower over the highest ground of a cell and its eight neighbours
+    climb_m_per_s    a metre of climb takes this much longer: 1 / climb_m_per_s
+    descent_m_per_s  the same of a metre of descent
+    grade            steepest rise and fall of the surface, metres per metre; by the terrain's relief if not given
+    no_fly           zones of kind forbidden, each with a polygon. Other zones, marks and what is hidden do not
+                     concern what flies
+    """
+
+    speed_m_per_s: Annotated[float, Meta(ge=0.1, le=340)] = 15.0
+    clearance_m: Annotated[float, Meta(ge=0, le=10_000)] = 60.0
+    climb_m_per_s: Annotated[float, Meta(ge=0.01, le=1000)] = 3.0
+    descent_m_per_s: Annotated[float, Meta(ge=0.01, le=1000)] = 10.0
+    grade: Annotated[float, Meta(ge=0.01, le=2)] | None = None
+    no_fly: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
+
+
 class ClassConfig(Section, frozen=True, kw_only=True):
     """A class of vehicles beside "ground", that of `[cost]` and `[vehicles]`: groups name theirs, and queries may.
 
@@ -37,6 +57,8 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     accel_m_per_s2       it speeds up no quicker, and brakes no harder before turns and where it has to stop
     turn_rate_deg_per_s  it turns no quicker, so it takes turns slowly. With this or `accel_m_per_s2` it drives by
                          these, not by `vehicles.dynamics`
+    air                  it flies: then `cost` and `max_speed_m_per_s` say nothing, and it neither meets nor waits
+                         for what drives
     """
 
     name: Name
@@ -45,6 +67,7 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     sense_range_m: Positive | None = None
     accel_m_per_s2: Annotated[float, Meta(ge=0.001, le=1000)] | None = None
     turn_rate_deg_per_s: Annotated[float, Meta(ge=0.1, le=36_000)] | None = None
+    air: AirConfig | None = None
 
 
 def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
@@ -93,6 +116,13 @@ def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
             check_cost(each.cost, f"{source}: classes[{n}]")
         except ConfigError as error:
             yield str(error)
+        for k, zone in enumerate(each.air.no_fly if each.air is not None else ()):
+            drawn = zone.polygon is not None or zone.polygon_m is not None
+            if zone.kind != "forbidden" or not drawn or zone.file is not None or zone.mask is not None:
+                yield (
+                    f'{source}: classes[{n}].air.no_fly[{k}]: expected kind = "forbidden" and a polygon,'
+                    f" found kind {zone.kind!r}{'' if drawn else ' and no polygon'}"
+                )
     for group in scenario.groups:
         if group.vehicle_class not in (GROUND, *names):
             known = choice(group.vehicle_class, [GROUND, *names], " there are ")
@@ -114,6 +144,17 @@ def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
             return each
     known = [GROUND, *(each.name for each in scenario.classes)]
     raise ConfigError(f"scenario {scenario.name} has no class {name!r}{choice(name, known, ' there are ')}")
+
+
+def aloft_classes(scenario: Scenario) -> list[str]:
+    """The classes that fly."""
+    return [each.name for each in scenario.classes if each.air is not None]
+
+
+def flies(scenario: Scenario, name: str) -> bool:
+    """Whether vehicles of a class fly. Raises ConfigError on an unknown class."""
+    own = class_named(scenario, name)
+    return own is not None and own.air is not None
 
 
 def of_class(scenario: Scenario, name: str) -> Scenario:

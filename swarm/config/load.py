@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from swarm.config.classes import class_faults, with_class_costs
+from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import choice, explain, located, nearest
 from swarm.config.ground import ZoneConfig
@@ -128,7 +128,7 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     for plugin in plugins_of(scenario):
         yield from _said(check_name, plugin, source)
     yield from _said(check_cost, scenario.cost, source)
-    if scenario.cost.directional:
+    if scenario.cost.directional or aloft_classes(scenario):
         yield from _said(_check_directional, scenario.planner, source)
     yield from class_faults(scenario, source)
     yield from _group_faults(scenario, source)

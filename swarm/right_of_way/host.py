@@ -56,7 +56,7 @@ class Host:
         self._told_by.add(agent)
         if not is_far_ahead(life, self._known_life):
             self._known_life = max(self._known_life, life)
-        self.holdings.watch([plot for plot in plots if plot < self.plots.count])
+        self.holdings.watch([plot for plot in plots if plot in self.plots.all])
 
     @property
     def informed(self) -> bool:
@@ -64,7 +64,7 @@ class Host:
         answered that one of them has the newest usable table."""
         if self._told_by.issuperset(self.plots.agents):
             return True
-        every = map(self.plots.members, range(self.plots.count))
+        every = map(self.plots.members, self.plots.all)
         return all(len(self._told_by.intersection(of)) > len(of) - self.plots.majority for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:

@@ -17,9 +17,17 @@ class Plots:
 
     The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998); of fewer
     than three agents one, because two of two are harder to keep alive than one.
+
+    What drives and what flies are two layers, with plots and agents of their own: nobody in one asks, holds or
+    waits for anything in the other.
+
+    agents  those of the layer
+    layer   0 is the ground, 1 the air
+
+    all  the numbers of the layer's plots
     """
 
-    def __init__(self, grid: GridSpec, agents: Sequence[str], side: int = PLOT_CELLS) -> None:
+    def __init__(self, grid: GridSpec, agents: Sequence[str], side: int = PLOT_CELLS, layer: int = 0) -> None:
         self.grid = grid
         self.agents = tuple(agents)
         self._side = side
@@ -27,6 +35,9 @@ class Plots:
         self._across = -(-grid.cols // side)
         self._members: dict[int, tuple[str, ...]] = {}
         self.count = self._across * -(-grid.rows // side)
+        self.layer = layer
+        self._first = layer * self.count
+        self.all = range(self._first, self._first + self.count)
         self.majority = 2 if len(self.agents) >= _MEMBERS else 1
 
     def of(self, cell: int) -> int:
@@ -34,7 +45,7 @@ class Plots:
         if not 0 <= cell < self._cells:
             return -1
         cols, side = self._cols, self._side
-        return cell // cols // side * self._across + cell % cols // side
+        return self._first + cell // cols // side * self._across + cell % cols // side
 
     def members(self, plot: int) -> tuple[str, ...]:
         members = self._members.get(plot)

@@ -119,8 +119,8 @@ Tile = Annotated[int, Meta(ge=0, lt=1 << 22)]
 """A tile of the largest grid."""
 Region = Annotated[int, Meta(ge=0, lt=1 << 16)]
 """A region of the largest grid."""
-Plot = Annotated[int, Meta(ge=0, lt=1 << 20)]
-"""A plot of the largest grid."""
+Plot = Annotated[int, Meta(ge=0, lt=1 << 21)]
+"""A plot of the largest grid, on the ground or in the air."""
 
 ZERO_BUCKET = -20_000
 """Histogram bucket of zero and below; the smallest float has a higher one."""

@@ -17,13 +17,15 @@ from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, nodes_of
 from launch_scripts.world.service import TargetsService
 from shared_map.class_grounds import ClassGround, class_grounds
-from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.agents import agent_of, plan_agents
+from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
+from swarm.config.agents import added_agent, agent_of, plan_agents
 from swarm.config.classes import ClassConfig
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.runtime.stats import CAPTURES_BY
+from swarm.wire.messages.orders import ZoneOrder
+from vehicle_agent.placement import spawn_cells
 from vehicle_agent.service import AgentService
 
 SECONDS = 12.0
@@ -167,3 +169,29 @@ def places_of(service: object) -> list[tuple[str, int, float]]:
     if not isinstance(service, AgentService):
         return []
     return [(id, each.cell, each.motion.done_m) for id, each in service.agent.vehicles.items()]
+
+
+def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_them_join() -> None:
+    scenario, terrain = made()
+    spawns = spawn_cells(scenario, terrain.grid, class_grounds(scenario, terrain, build_truth(scenario, terrain)))
+    steep = np.isinf(terrain.ground_s_per_m).ravel()
+    stands = next(cell for agent in ("a2", "a3") for cell in spawns[agent].values() if steep[cell])
+    row, col = terrain.grid.row_col(stands)
+    corners = [(row + south, col + east) for south, east in ((-5, -5), (-5, 5), (5, 5), (5, -5))]
+    zone = [(min(max(r, 0), 63), min(max(c, 0), 63)) for r, c in corners]
+    simulation = Simulation(scenario, terrain=terrain)
+    laws = Laws(simulation)
+    simulation.order(1.0, ZoneOrder(action="add", name="z", polygon=zone))
+    simulation.run_until(2.0)
+    walkers = [simulation.nodes[f"agent-{id}"].service for id in ("a2", "a3")]
+    assert all(np.isinf(each._maps.own.pace_s_per_m.item(stands)) for each in walkers)  # type: ignore[union-attr]
+    added = simulation.add(added_agent(scenario, "more", "walkers", 3))
+    simulation.run_until(14.0)
+    in_zone = np.zeros((64, 64), bool)
+    in_zone[zone[0][0] + 1 : zone[2][0] - 1, zone[0][1] + 1 : zone[2][1] - 1] = True
+    services = [node.service for node in simulation.nodes.values() if isinstance(node.service, AgentService)]
+    places = {id: each.cell for service in services for id, each in service.agent.vehicles.items()}
+    assert len(places) == 19
+    assert not in_zone.ravel()[list(places.values())].any()
+    assert (laws.lethal, laws.collisions) == ([], [])
+    assert added.service.agent.plan.group.vehicle_class == "walker"  # type: ignore[union-attr]

@@ -6,10 +6,13 @@ from collections import Counter
 
 import numpy as np
 
+from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.simulate import Simulation
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
+from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.service import AgentService
 
@@ -57,3 +60,32 @@ def test_a_target_that_was_never_seen_is_searched_for_captured_and_searched_for_
     assert apart, "several vehicles look at one place"
     assert states[VehicleState.SEARCHING] > 10
     assert not states[VehicleState.STRANDED]
+
+
+def test_a_planner_that_begins_anew_is_told_by_agents_where_its_target_was_last() -> None:
+    blind = parse_scenario(_SCENARIO.replace("sense_range_m = 40", "sense_range_m = 0.5"))
+    simulation = Simulation(
+        blind,
+        faults=FaultPlan(crashes=(Crash(8.0, "planner-h"),)),
+        terrain=terrain_of_pace(np.full((60, 60), 0.3, np.float32), 10.0),
+    )
+    simulation.run_until(7.0)
+    agent = next(node.service for node in simulation.nodes.values() if isinstance(node.service, AgentService))
+    now_ns = simulation.scheduler.clock.now_ns()
+    seen = Sighted(
+        author=agent._author, group=agent._agent.plan.group.name, target="h", seq=1,
+        stamp_ns=now_ns - 40 * NS_PER_S, until_ns=now_ns - 10 * NS_PER_S,
+        cell=1234, x_m=0.0, y_m=0.0, uncertainty_m=1.0,
+    )  # fmt: skip
+    agent._detector._last["h"] = seen
+    before = simulation.nodes["planner-h"].service
+    simulation.run_until(20.0)
+    planner = simulation.nodes["planner-h"].service
+    assert isinstance(planner, PlannerService)
+    assert planner is not before
+    search = planner._planner.target_search
+    assert search is not None
+    assert search.active
+    assert search._remembered is not None
+    assert search._remembered.cell == 1234
+    assert search._begun_from is search._remembered

@@ -97,7 +97,7 @@ class RightOfWay:
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
         first. A guest never has a seat: of its file nothing is noted, and it is told who has one.
         """
-        if request.agent == self.agent or self.silent or self._is_guest:
+        if request.agent == self.agent or self.silent or self._is_guest or request.layer != self.plots.layer:
             return []
         if request.agent not in self._spawns or not request.disk:
             life, plots = self._known(request.agent)
@@ -129,7 +129,7 @@ class RightOfWay:
         self._host.hear_known(self.agent, *self._known(self.agent))
         lives = self._host.begin(self.own.lives, chance)
         home = map(self.plots.of, self._spawns.get(self.agent, {}).values())
-        self.holdings.watch([plot for plot in home if plot < self.plots.count])
+        self.holdings.watch([plot for plot in home if plot in self.plots.all])
         self.own = replace(self.own, lives=lives)
         return [self.own]
 
@@ -220,7 +220,7 @@ class RightOfWay:
         if self.silent:
             return None
         known = self._members.get(plot)
-        if known is not None or not 0 <= plot < self.plots.count:
+        if known is not None or plot not in self.plots.all:
             return known
         members = self.plots.members(plot)
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):

@@ -18,7 +18,7 @@ from launch_scripts.bench.tables import table
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.arrays import Floats
-from shared_map.terrain.air_floor import AirGround, Flight, air_ground, clearance_floor
+from shared_map.terrain.air_floor import AirGround, Flight, air_ground, clearance_floor, grade_of
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import PlannerConfig, Scenario
@@ -32,18 +32,21 @@ _EVERY = 2
 
 
 def run(
-    source: str, cells: int, roots: int, starts: int, clearance_routes: int, flight: Flight, seed: int
+    source: str, cells: int, roots: int, starts: int, clearance_routes: int, grade: float | None, seed: int
 ) -> dict[str, Any]:
     """Costs of routes over those of the stack; the clearance along many; a tree beside scipy's and a level one.
 
     source  a built-in terrain or a file
     cells   a side of the crop
+    grade   of the surface; by the crop's relief if None
     """
     terrain = build_terrain(Scenario(seed=seed, terrain=TerrainConfig(source=source)))
     heights: Floats = terrain.elevation_m[: _EVERY * cells : _EVERY, : _EVERY * cells : _EVERY].copy()
     heights[np.isnan(heights)] = np.nanmax(heights)
     rows, cols = heights.shape
     grid = GridSpec(rows, cols, terrain.grid.resolution_m * _EVERY)
+    chosen = grade_of(heights, grid.resolution_m) if grade is None else grade
+    flight = Flight(speed_mps=15.0, grade=chosen)
     flown = air_ground(grid, heights, flight)
     rng = np.random.default_rng(seed)
     ratios = np.concatenate(

@@ -272,7 +272,10 @@ def certificates(
 def air(
     dem: Annotated[str, typer.Option(help="A built-in terrain, or an elevation file.")] = "jacksboro",
     cells: Annotated[int, typer.Option(min=16, max=160, help="A side of the crop.")] = 100,
-    grade: Annotated[float, typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface.")] = 0.15,
+    grade: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface; by relief if not given."),
+    ] = None,
     routes: Annotated[int, typer.Option(min=1, help="Routes whose clearance is looked at.")] = 100_000,
     seed: Seed = 1,
     as_json: AsJson = False,
@@ -286,9 +289,8 @@ def air(
     The status is 1 where a flight comes nearer to the ground than its clearance.
     """
     from launch_scripts.bench.planning.air import run, tables
-    from shared_map.terrain.air_floor import Flight
 
-    report = run(dem, cells, 2, 150, routes, Flight(speed_mps=15.0, grade=grade), seed)
+    report = run(dem, cells, 2, 150, routes, grade, seed)
     show(report, as_json, tables)
     if report["clearance_broken"]:
         raise typer.Exit(1)

@@ -7,7 +7,9 @@ stretched so that gentle land still looks like land.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,9 +51,15 @@ class TerrainMesh:
     texel      cells of the terrain along one pixel of the photo
     stretch    how many times as high as they are heights are drawn
     heights_m  float32, of that level, stretched; over the lowest
+    aloft_m    class that flies -> how high over each cell of the terrain, float32 (rows, cols), stretched
     """
 
-    def __init__(self, terrain: Terrain, height_factor: float | None = None) -> None:
+    def __init__(
+        self,
+        terrain: Terrain,
+        height_factor: float | None = None,
+        aloft: Mapping[str, Terrain] = MappingProxyType({}),
+    ) -> None:
         self.grid = terrain.grid
         self.seen = seen = level_of(terrain, _MOST_TEXELS)
         self.texel = seen.side
@@ -66,6 +74,11 @@ class TerrainMesh:
         wanted = _RELIEF * max(self.width_m, self.depth_m) / relief_m if relief_m > 0 else 1.0
         self.stretch = height_factor or min(max(wanted, 1.0), 8.0)
         self.heights_m = heights * np.float32(self.stretch)
+        self.aloft_m: dict[str, Floats] = {}
+        for name, own in aloft.items():
+            assert own.flight_m is not None
+            over_m = np.nan_to_num(own.flight_m - terrain.elevation_m)
+            self.aloft_m[name] = (over_m * np.float32(self.stretch)).astype(np.float32)
         self.step = self.texel * max(2, math.ceil(math.sqrt(seen.grid.cells / _MOST_VERTICES)))
         self.tile_cells = max(MESH_TILE * self.texel // self.step, 1) * self.step
         self.tile_cols = -(-self.grid.cols // self.tile_cells)

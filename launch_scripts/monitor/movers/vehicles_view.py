@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +35,7 @@ class _Roll:
     who     vehicle -> group, and class where that is not "ground"
     rows    of `Looks.vehicles`, by group
     own     places in `ids` of the scenario's vehicles; `guests` those of all others
+    aloft   of each class that flies the places of its vehicles in `ids`, and `TerrainMesh.aloft_m`
     """
 
     ids: list[str]
@@ -42,11 +43,13 @@ class _Roll:
     rows: _Rows
     own: _Rows
     guests: _Rows
+    aloft: tuple[tuple[_Rows, NDArray[np.float32]], ...] = ()
 
 
 def trails_of(scenario: Scenario, mesh: TerrainMesh, level: Level) -> Trails:
     """Trails that break where something jumped further than anything drives."""
-    quickest_m_per_s = scenario.time_scale * max(scenario.cost.road_speed_m_per_s, 1.0)
+    flown = (each.air.speed_m_per_s for each in scenario.classes if each.air is not None)
+    quickest_m_per_s = scenario.time_scale * max(scenario.cost.road_speed_m_per_s, 1.0, *flown)
     return Trails(max(8 * level.trail_every_s * quickest_m_per_s, 4 * mesh.grid.resolution_m))
 
 
@@ -112,6 +115,9 @@ class VehiclesView:
         if vehicles.ids != self._roll.ids:
             self._colours, self._roll = None, self._enrolled(vehicles.ids, groups(), classes())
         points = vehicle_points(self._mesh, vehicles)
+        for rows, over_m in self._roll.aloft:
+            cells = [cell_at(self._mesh.grid, *place) for place in _places(vehicles, rows)]
+            points.positions[rows, 2] += over_m.reshape(-1)[cells]
         colours = self._coloured(vehicles)
         self._draw_balls(vehicles, points, colours, now_ns)
         if trails_due:
@@ -125,7 +131,11 @@ class VehiclesView:
         who = {id: group if classes[id] == GROUND else f"{group}, {classes[id]}" for id, group in groups.items()}
         own = np.array([id in self._own_ids for id in ids], np.bool_)
         rows = np.array(self._looks.rows([groups.get(id) for id in ids]), np.intp)
-        return _Roll(ids, who, rows, np.flatnonzero(own), np.flatnonzero(~own))
+        aloft = tuple(
+            (np.flatnonzero([classes.get(id) == name for id in ids]), over_m)
+            for name, over_m in self._mesh.aloft_m.items()
+        )
+        return _Roll(ids, who, rows, np.flatnonzero(own), np.flatnonzero(~own), aloft)
 
     def _coloured(self, vehicles: VehicleColumns) -> Bytes:
         rows = self._roll.rows
@@ -174,3 +184,7 @@ class VehiclesView:
         if self._routes_drawn.get(target) != strips:
             self._routes_drawn[target] = strips
             self._drawing.lines(f"world/routes/{target}", strips)
+
+
+def _places(vehicles: VehicleColumns, rows: _Rows) -> Iterator[tuple[float, float]]:
+    return zip(vehicles.east_m[rows].tolist(), vehicles.south_m[rows].tolist(), strict=True)

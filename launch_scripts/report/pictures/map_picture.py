@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,8 @@ from swarm.wire.statements import MarkKind
 
 _SHOWN_LABELS = 30
 _MARK_PIXELS = 1 << 20
+_FLIES = "^"
+"""Marker of vehicles that fly."""
 Points = NDArray[np.float64]
 
 
@@ -53,7 +55,7 @@ def draw_map(axes: Axes, ground: GroundPicture, tracks: RunTracks, report: Mappi
     _draw_coordinates(axes, grid)
     _draw_scale_bar(axes, width_km, height_km)
     _draw_north(axes)
-    handles = _legend(ground, groups)
+    handles = _legend(ground, groups, report.get("aloft", ()))
     axes.legend(
         handles=handles, loc="upper left", bbox_to_anchor=(0, -0.022), ncol=-(-len(handles) // 2), handlelength=1.5,
         columnspacing=1.4, borderaxespad=0.3, handletextpad=0.5, borderpad=0, labelspacing=0.35,
@@ -107,10 +109,14 @@ def _draw_vehicles(axes: Axes, tracks: RunTracks, groups: Mapping[str, str], rep
         colour = groups.get(group, GROUPS[0])
         _draw_strips(axes, lines, colour, 1.1 * thin, 1.9 * thin, zorder=3)
         starts, ends = (np.array([line[n] for line in lines]) for n in (0, -1))
+        shape, size = (_FLIES, 46) if group in report.get("aloft", ()) else ("o", 26)
         axes.scatter(
             starts[:, 0], starts[:, 1], s=13 * thin**2, c="white", edgecolors=colour, linewidths=0.8, zorder=4
         )
-        axes.scatter(ends[:, 0], ends[:, 1], s=26 * thin**2, c=colour, edgecolors="white", linewidths=0.7, zorder=5)
+        axes.scatter(
+            ends[:, 0], ends[:, 1], s=size * thin**2, c=colour, marker=shape, edgecolors="white", linewidths=0.7,
+            zorder=5,
+        )  # fmt: skip
 
 
 def _draw_targets(axes: Axes, tracks: RunTracks) -> None:
@@ -215,10 +221,10 @@ def _draw_north(axes: Axes) -> None:
     )  # fmt: skip
 
 
-def _legend(ground: GroundPicture, groups: Mapping[str, str]) -> list[Any]:
+def _legend(ground: GroundPicture, groups: Mapping[str, str], aloft: Collection[str]) -> list[Any]:
     handles: list[Any] = [
-        Line2D([], [], color=colour, linewidth=1.6, marker="o", markersize=5, markerfacecolor=colour,
-               markeredgecolor="white", markeredgewidth=0.6,
+        Line2D([], [], color=colour, linewidth=1.6, marker=_FLIES if group in aloft else "o", markersize=5,
+               markerfacecolor=colour, markeredgecolor="white", markeredgewidth=0.6,
                label="vehicle" if len(groups) == 1 else f"vehicle of {group}")
         for group, colour in list(groups.items())[: len(GROUPS)]
     ]  # fmt: skip

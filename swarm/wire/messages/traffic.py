@@ -145,10 +145,11 @@ class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
     """A new life of an agent or a guest asks all agents what they know of it. `disk` names the file that it keeps;
-    a guest's is 0, and nobody notes it."""
+    a guest's is 0, and nobody notes it. Only agents of its layer answer: 0 is the ground, 1 the air."""
 
     agent: Id
     disk: Natural
+    layer: Annotated[int, Meta(ge=0, le=1)] = 0
 
 
 class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from shared_map.cost_map import CostMap
 from shared_map.learning.factors import FACTORS, MOST_STEPS, Measured, factors_of, log_steps
+from shared_map.learning.middle import Middle
 from shared_map.learning.words import MOST, MOST_CELLS, ONE, Said, told
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
@@ -206,7 +207,48 @@ def test_a_cell_counts_once_and_what_is_no_pace_not_at_all() -> None:
     assert measured.said == {0: Said(1, round(np.log(3) * ONE), 0)}
 
 
+def test_a_slope_of_which_too_little_counts_has_the_factor_of_its_class() -> None:
+    level, steep = 0, 3
+    words = [{level: THRICE, steep: THRICE._replace(cells=4)}, {level: THRICE, steep: THRICE._replace(cells=1)}]
+    factors = factors_of(words)
+    assert factors[steep] == factors[level] > 2.5
+    assert factors_of([words[0], {steep: Said(100, 0, ONE // 10)}])[steep] == 1, (
+        "it is known to be as the prior says"
+    )
+
+
 @pytest.mark.parametrize("cells", [4, 5, 20, 400])
 def test_only_what_is_significant_is_learned(cells: int) -> None:
     assert (log_steps([Said(cells, THRICE.mean, ONE // 10)]) > 8) == (cells >= 5)
     assert log_steps([Said(cells, ONE // 20, ONE // 10)]) == 0
+
+
+@given(st.lists(st.integers(-ONE, ONE), min_size=4, max_size=60), st.data())
+def test_what_lies_on_less_than_a_quarter_of_the_cells_does_not_tell_of_their_kind(
+    typical: list[int], data: st.DataObject
+) -> None:
+    few = data.draw(st.lists(st.integers(-MOST, MOST), max_size=(len(typical) - 1) // 3))
+    middles = []
+    for order in (typical + few, data.draw(st.permutations(typical + few))):
+        middle = Middle()
+        for y in order:
+            middle.add(y)
+        middles.append(middle.said)
+    assert middles[0] == middles[1], "in whatever order they are driven"
+    bin_width = ONE // 64
+    assert min(typical) - bin_width <= middles[0].mean <= max(typical) + bin_width
+    assert middles[0].cells == len(typical + few)
+    assert 0 <= middles[0].variance <= MOST * MOST // ONE
+
+
+@given(st.lists(st.integers(-MOST, MOST), min_size=1, max_size=80))
+def test_the_middle_half_is_that_of_the_sorted_numbers(numbers: list[int]) -> None:
+    middle = Middle()
+    for y in numbers:
+        middle.add(y)
+    cut = len(numbers) // 4
+    kept = sorted(numbers)[cut : len(numbers) - cut]
+    assert abs(middle.said.mean - sum(kept) / len(kept)) <= ONE // 64 + 1
+    held = np.clip(np.sort(np.array(numbers, np.float64)), kept[0], kept[-1]) / ONE
+    variance = min(held.var() * (len(numbers) / len(kept)) ** 2, 25.0)
+    assert middle.said.variance / ONE == pytest.approx(variance, rel=0.02, abs=0.05)
