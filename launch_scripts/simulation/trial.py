@@ -16,6 +16,7 @@ from launch_scripts.simulation.simulate import SIMULATED_ROLES, Simulation
 from launch_scripts.simulation.worlds import world
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import Scenario
+from swarm.runtime.garbage import collected_rarely
 
 SECONDS = 30.0
 """Faults in the first 18, quiet in the rest: a wait of ten seconds has its place in it."""
@@ -76,7 +77,8 @@ def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | N
     began_s = time.perf_counter()
     trial = Trial(simulation)
     try:
-        broken = trial.run(seconds)
+        with collected_rarely():
+            broken = trial.run(seconds)
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"

@@ -18,6 +18,7 @@ from launch_scripts.bench.isolated import TimeLimit
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.tables import Progress, table
 from launch_scripts.simulation.campaign import in_processes
+from swarm.runtime.garbage import collected_rarely
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 
@@ -91,8 +92,9 @@ def try_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tupl
         drives.hear(event.message)
 
     simulation.network.bus("crowd-0", scenario.network.namespace).subscribe(FLEET, hear)
-    while simulation.now_s < seconds and not limit.is_up:
-        simulation.run_until(min(simulation.now_s + 0.5, seconds))
+    with collected_rarely():
+        while simulation.now_s < seconds and not limit.is_up:
+            simulation.run_until(min(simulation.now_s + 0.5, seconds))
     report = simulation.report(simulation.now_s)
     waits_s = [STEP_S * ticks for ticks in drives.longest_wait.values()]
     confined_s = [STEP_S * ticks for ticks in drives.longest_confined.values()]

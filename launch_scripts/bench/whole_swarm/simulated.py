@@ -17,6 +17,7 @@ import msgspec
 from launch_scripts.bench.isolated import TimeLimit, measure
 from launch_scripts.bench.whole_swarm.size import Size, scenario_of, size_of
 from launch_scripts.parent_death import end_with_parent
+from swarm.runtime.garbage import collected_rarely
 
 WARM_UP_S = 1.0
 """Simulated seconds before the measured ones: all processes start in them."""
@@ -58,12 +59,13 @@ def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
         while simulation.now_s < until_s and not limit.is_up:
             simulation.run_until(min(simulation.now_s + _STEP_S, until_s))
 
-    run_until(WARM_UP_S)
-    simulation.network.trace = lambda _, source, destination, topic, payload: delivered.add(topic, payload)
-    from_s, wall_s, cpu_s = simulation.now_s, time.perf_counter(), time.process_time()
-    run_until(WARM_UP_S + seconds)
-    passed_s = simulation.now_s - from_s
-    cpu_s, wall_s = time.process_time() - cpu_s, time.perf_counter() - wall_s
+    with collected_rarely():  # as `simulate` does
+        run_until(WARM_UP_S)
+        simulation.network.trace = lambda _, source, destination, topic, payload: delivered.add(topic, payload)
+        from_s, wall_s, cpu_s = simulation.now_s, time.perf_counter(), time.process_time()
+        run_until(WARM_UP_S + seconds)
+        passed_s = simulation.now_s - from_s
+        cpu_s, wall_s = time.process_time() - cpu_s, time.perf_counter() - wall_s
     report = simulation.report(simulation.now_s)
     not_measured = []
     if passed_s < seconds - 1e-6:
