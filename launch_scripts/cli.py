@@ -104,7 +104,7 @@ def _root(
 @app.command(rich_help_panel=RUN)
 @spread
 def demo(run: RunOptions) -> None:
-    """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
+    """Run the whole swarm on real mountains: 99 rovers, a drone, 10 targets, 19 processes.
 
     The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
     report.html, report.json, report.png and a log file per process.

@@ -60,6 +60,9 @@ class Capture:
     south_m: float
 
 
+_ON_THE_WAY = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
+
+
 class Recorder:
     """Samples, tracks, captures and notes of a run, in memory which does not grow with the rate of messages."""
 
@@ -145,7 +148,7 @@ class Recorder:
                 self.ready_ns = now_ns
 
     def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
-        moving = np.isin(vehicles.states, (VehicleState.FOLLOWING, VehicleState.ARRIVED))
+        moving = np.isin(vehicles.states, _ON_THE_WAY)
         if len(self.routed) < self.scenario.vehicle_count:
             self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
         if self._track_ids != vehicles.ids:

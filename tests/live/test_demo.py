@@ -29,7 +29,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
     assert {name: report[name] for name in printed} == printed
     assert (report["scenario"], report["vehicles"], report["targets"]) == ("jacksboro", 100, 10)
-    assert (report["processes"], report["restarts"]) == (16, 0)
+    assert (report["processes"], report["restarts"]) == (17, 0)
     assert report["seconds"] == pytest.approx(15, abs=1.5)
     assert report["vehicles_routed"] == 100
     assert (report["collisions"], report["lethal_entries"], report["lost"]) == (0, 0, 0)
@@ -40,7 +40,15 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     assert 1.0 <= report["gap"]["mean"] <= report["gap"]["max"] < 1.5
     assert report["payloads_dropped"] == 0
     assert len(read_tracks(run_dir / TRACKS_FILE).routes) >= 100, "routes that vehicles began are kept"
-    for name in ("run.rrd", "report.png", "router-0.log", "monitor-0.log", "agent-a3.log", "planner-t9.log"):
+    for name in (
+        "run.rrd",
+        "report.png",
+        "router-0.log",
+        "monitor-0.log",
+        "agent-a3.log",
+        "agent-a4.log",
+        "planner-ghost.log",
+    ):
         assert (run_dir / name).stat().st_size > 0, name
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
+import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 from launch_scripts.report.pictures.hillshade import hillshade
 from launch_scripts.report.pictures.palette import BLACK, FORBIDDEN, LETHAL_GROUND
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Terrain, build_truth
 from shared_map.terrain.zones import zone_mask
+from swarm.config.ground import HiddenConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
@@ -57,7 +59,7 @@ def ground_picture(terrain: Terrain, scenario: Scenario, truth: NDArray[np.float
     seen = level_of(terrain, _MOST_CELLS)
     lethal = any_in_blocks(np.isinf(terrain.pace_s_per_m), seen.side)
     forbidden = any_in_blocks(forbidden_cells(scenario, terrain), seen.side)
-    hidden = any_in_blocks(hidden_cells(terrain, truth), seen.side)
+    hidden = any_in_blocks(hidden_cells(scenario, terrain, truth), seen.side)
     with mpl.rc_context({"hatch.linewidth": 0.5}):
         figure, axes = _canvas(seen)
         axes.imshow(_photo(seen), extent=(0, seen.grid.cols, seen.grid.rows, 0), interpolation="bilinear")
@@ -84,11 +86,21 @@ def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:
     return cells & np.isinf(terrain.pace_s_per_m)
 
 
-def hidden_cells(terrain: Terrain, truth: NDArray[np.float32] | None) -> Bools:
-    """Where the truth differs from what the map knew at the beginning."""
+def hidden_cells(scenario: Scenario, terrain: Terrain, truth: NDArray[np.float32] | None) -> Bools:
+    """Where the truth differs from what the map knew at the beginning, but for what a whole class of ground is
+    slower or quicker by: that would outline every meadow."""
     if truth is None:
         return np.zeros(terrain.pace_s_per_m.shape, np.bool_)
-    differs: Bools = (truth != terrain.ground_s_per_m) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
+    known = terrain.ground_s_per_m
+    if scenario.terrain.hidden.class_factor:
+        only_classes = HiddenConfig(class_factor=scenario.terrain.hidden.class_factor)
+        known = build_truth(
+            msgspec.structs.replace(
+                scenario, terrain=msgspec.structs.replace(scenario.terrain, hidden=only_classes)
+            ),
+            terrain,
+        )
+    differs: Bools = (truth != known) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
     return differs
 
 
