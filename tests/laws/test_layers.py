@@ -1,4 +1,4 @@
-"""What drives and what flies never ask, hold or wait for each other: nobody of one layer takes part in the other."""
+"""What drives and what flies never ask, hold or wait for each other: no process of one layer is in the other."""
 
 from __future__ import annotations
 
