@@ -6,6 +6,7 @@ and sends all to the same place, drawing spreads them without negotiation. Times
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -132,9 +133,9 @@ class Searcher:
         any cell of it, by the cheapest way."""
         self._ways.grow(cell)
         # A way is priced by the cells that it enters, and this one is driven the other way round: the cell where it
-        # begins is not entered.
+        # begins is not entered, and each other one by the step behind it, which may be a straight one.
         first_s = self._ways.step_s(cell)
-        arrival_s: Floats = np.maximum(blocks.lowest(self._ways.costs_s) - first_s, 0.0)
+        arrival_s: Floats = np.maximum(blocks.lowest(self._ways.costs_s) - first_s, 0.0) / np.float32(math.sqrt(2))
         arrival_s[arrival_s > 0.0] *= min(self._slowness, _STANDS)
         return arrival_s
 

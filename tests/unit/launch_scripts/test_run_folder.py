@@ -87,7 +87,7 @@ def test_every_setting_that_has_a_value_is_written(tmp_path: Path) -> None:
     written = scenario_text(Scenario(), tmp_path)
 
     def keys(struct: msgspec.Struct) -> set[str]:
-        values = {field: getattr(struct, field) for field in struct.__struct_fields__}
+        values = {each.encode_name: getattr(struct, each.name) for each in msgspec.structs.fields(struct)}
         inner = [value for value in values.values() if isinstance(value, msgspec.Struct)]
         inner += [each for value in values.values() if isinstance(value, tuple) for each in value]
         own = {key for key, value in values.items() if value is not None}

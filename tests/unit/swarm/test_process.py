@@ -369,7 +369,7 @@ class Idle:
 process = Process(Idle(), Inbox(), MonotonicClock(), tick_hz=0.001)
 process.stop_on_signals()
 if sys.argv[1] != "signal":
-    end_with(sys.stdin.read, process.stop, grace_s=0.5)
+    end_with(sys.stdin.read, process.stop, grace_s=1.5)  # a wake that comes between look and wait costs 0.5 s
 process.run()
 """
 
