@@ -135,6 +135,7 @@ def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str
         vehicle_radius_m=radius_m,
         climb=climb,
         flight_m=flight_m,
+        zones=common.zones if flight_m is None else (),
         notes=notes,
         least_s_per_m=least_pace(class_named(scenario, name)),
     )

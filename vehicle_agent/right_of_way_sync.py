@@ -43,7 +43,7 @@ class RightOfWaySync:
             "promises", for the file of promises
     spawns    of the agents of the layer: agent -> vehicle -> cell
     vehicles  of an agent that is not in `spawns`
-    layer     as of `Plots`
+    layer, others  as of `Plots`
     """
 
     def __init__(
@@ -58,8 +58,9 @@ class RightOfWaySync:
         warn: Callable[[str, str], None],
         vehicles: Collection[str] = (),
         layer: int = 0,
+        others: Collection[str] = (),
     ) -> None:
-        plots = Plots(grid, list(spawns), layer=layer)
+        plots = Plots(grid, list(spawns), layer=layer, others=others)
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved, vehicles=vehicles)
         self._id = setup.id
         self._store = store

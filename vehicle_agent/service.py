@@ -132,7 +132,17 @@ class AgentService:
         layer_of = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
         around = {agent: cells for agent, cells in spawns.items() if layer_of[agent] is self._flies}
         self._right_of_way = RightOfWaySync(
-            setup, grid, around, store, bus, post, self._place, self._warn, plan.vehicle_ids, int(self._flies)
+            setup,
+            grid,
+            around,
+            store,
+            bus,
+            post,
+            self._place,
+            self._warn,
+            plan.vehicle_ids,
+            int(self._flies),
+            spawns.keys() - around.keys(),
         )
         bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)

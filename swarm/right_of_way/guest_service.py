@@ -19,6 +19,8 @@ from swarm.wire.fields import check_id
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest
 from swarm.wire.topics import GRANTED, KNOWN, STANDING
 
+_NOBODY_NS = 10 * NS_PER_S
+"""A guest that nobody has answered for so long is told so."""
 _ANSWERS_S = 0.3
 """A new life waits so long for the agents' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
@@ -66,6 +68,7 @@ class GuestService:
         self._asking = False
         self._ask_due_ns = 0
         self._tokens: set[Peer] = set()
+        self._began_ns = 0
         self._cell: int | None = None
         """Where to enter, once there is a guest."""
 
@@ -73,6 +76,7 @@ class GuestService:
         self._bus.watch_alive(self._post, role=_ROLE)
         self._bus.subscribe(GRANTED, self._post, host=self.name)
         self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
+        self._began_ns = now_ns
         self._ask(now_ns)
 
     def stop(self) -> None:
@@ -122,6 +126,10 @@ class GuestService:
         settled = self.guest is not None and self.guest.settled
         if not settled and not self._asking and now_ns >= self._ask_due_ns:
             self._ask(now_ns)
+        if self.guest is None and now_ns - self._began_ns > _NOBODY_NS:
+            self._warn_once(
+                (f"no agent answers {self.name}: a guest needs one that drives in this run, and a name of its own",)
+            )
         self.tell(now_ns)
         if self.guest is not None:
             self._warn_once((*self.guest.refused, *self.guest.unled(now_ns)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from hashlib import blake2s
 
 from swarm.grid import REGION_CELLS, GridSpec
@@ -23,11 +23,19 @@ class Plots:
 
     agents  those of the layer
     layer   0 is the ground, 1 the air
+    others  the agents of the other layer: no guest may take their names
 
     all  the numbers of the layer's plots
     """
 
-    def __init__(self, grid: GridSpec, agents: Sequence[str], side: int = PLOT_CELLS, layer: int = 0) -> None:
+    def __init__(
+        self,
+        grid: GridSpec,
+        agents: Sequence[str],
+        side: int = PLOT_CELLS,
+        layer: int = 0,
+        others: Collection[str] = (),
+    ) -> None:
         self.grid = grid
         self.agents = tuple(agents)
         self._side = side
@@ -36,6 +44,7 @@ class Plots:
         self._members: dict[int, tuple[str, ...]] = {}
         self.count = self._across * -(-grid.rows // side)
         self.layer = layer
+        self.others = frozenset(others)
         self._first = layer * self.count
         self.all = range(self._first, self._first + self.count)
         self.majority = 2 if len(self.agents) >= _MEMBERS else 1

@@ -36,9 +36,10 @@ def test_no_plot_and_no_member_is_in_two_layers(
 
 @given(st.integers(0, 1), st.integers(0, 1), st.sampled_from(["a1", "a2", "stranger"]), st.integers(0, 3))
 def test_only_those_of_its_layer_answer_a_new_life(layer: int, asked: int, who: str, disk: int) -> None:
-    spawns = {"a0": {"a0-00": 1}, "a1": {"a1-00": 5}, "a2": {"a2-00": 7}}
-    plots = Plots(GridSpec(20, 20, 10.0), list(spawns), layer=layer)
+    """And nobody answers a guest that bears the name of an agent of the other layer, a2."""
+    spawns = {"a0": {"a0-00": 1}, "a1": {"a1-00": 5}}
+    plots = Plots(GridSpec(20, 20, 10.0), list(spawns), layer=layer, others=["a2"])
     rights = RightOfWay("a0", plots, spawns, OwnRecord(disk=7), {})
     rights.begin(3)
     answers = rights.answer_known(KnownRequest(agent=who, disk=disk, layer=asked))
-    assert bool(answers) is (layer == asked)
+    assert bool(answers) is (layer == asked and who != "a2")

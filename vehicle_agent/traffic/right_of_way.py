@@ -97,7 +97,9 @@ class RightOfWay:
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
         first. A guest never has a seat: of its file nothing is noted, and it is told who has one.
         """
-        if request.agent == self.agent or self.silent or self._is_guest or request.layer != self.plots.layer:
+        if request.layer != self.plots.layer or request.agent in self.plots.others:
+            return []
+        if request.agent == self.agent or self.silent or self._is_guest:
             return []
         if request.agent not in self._spawns or not request.disk:
             life, plots = self._known(request.agent)

@@ -164,6 +164,7 @@ def cost(
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain cost mine.toml --out cost.tif
     """
+    from shared_map.class_grounds import class_terrains
     from shared_map.terrain.terrain import build_terrain
 
     check_target(out, "--out", *TIFF)
@@ -171,7 +172,7 @@ def cost(
     loaded = _scenario(scenario, preset)
     with progress() as tell:
         started = time.perf_counter()
-        terrain = build_terrain(loaded, tell, vehicle_class)
+        terrain = class_terrains(loaded, build_terrain(loaded, tell), [vehicle_class])[vehicle_class]
         seconds = time.perf_counter() - started
         if out is not None:
             _write_cost(terrain, out, tell)

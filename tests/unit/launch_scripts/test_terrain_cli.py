@@ -80,6 +80,17 @@ def test_cost_writes_a_geotiff_with_overviews_and_a_picture(made: Path, tmp_path
     assert (tmp_path / "cost.png").stat().st_size > 50_000
 
 
+def test_cost_of_a_class_that_flies_is_that_of_its_surface(tmp_path: Path) -> None:
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text(
+        'name = "mine"\n[terrain]\nsource = "synthetic"\nrows = 32\ncols = 32\n'
+        '[[classes]]\nname = "drone"\n[classes.air]\nspeed_m_per_s = 20.0\n'
+    )
+    said = run("cost", scenario, "--class", "drone")
+    assert "0.0% lethal, pace 0.05 to 0.05 s/m" in said
+    assert "flies at" in said
+
+
 @pytest.mark.parametrize("shape", [(70, 90), (1, 1), (9, 400), (400, 9)])
 def test_a_picture_of_any_shape_with_voids_and_coarsened(
     shape: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
