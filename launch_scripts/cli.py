@@ -106,12 +106,12 @@ def _root(
 def demo(run: RunOptions) -> None:
     """Run the whole swarm on real mountains: 99 rovers, a drone, 10 targets, 19 processes.
 
-    The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
+    The same as `swarm up demo`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
     report.html, report.json, report.png and a log file per process.
 
     swarm demo --seconds 20 --port 0
     """
-    _up("jacksboro", run)
+    _up("demo", run)
 
 
 @app.command(rich_help_panel=RUN)

@@ -28,7 +28,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     (run_dir,) = folders_of_runs(tmp_path)
     printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
     assert {name: report[name] for name in printed} == printed
-    assert (report["scenario"], report["vehicles"], report["targets"]) == ("jacksboro", 100, 10)
+    assert (report["scenario"], report["vehicles"], report["targets"]) == ("demo", 100, 10)
     assert (report["processes"], report["restarts"]) == (17, 0)
     assert report["seconds"] == pytest.approx(15, abs=1.5)
     assert report["vehicles_routed"] == 100
