@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from planner_service.kernels import (
+    arrivals,
     bucket_queue,
     cell_costs,
     directed_buckets,
@@ -81,6 +82,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     pieces_mend.merge_parents,
     pieces_mend.drop_lost,
     pieces.costs_at,
+    arrivals.arrivals,
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 

@@ -6,7 +6,6 @@ and sends all to the same place, drawing spreads them without negotiation. Times
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -131,11 +130,7 @@ class Searcher:
     def _arrivals(self, blocks: Blocks, cell: int) -> Floats:
         """float32 (rows, cols), s after the target was on a cell when it can be in each block at the earliest: on
         any cell of it, by the cheapest way."""
-        self._ways.grow(cell)
-        # A way is priced by the cells that it enters, and this one is driven the other way round: the cell where it
-        # begins is not entered, and each other one by the step behind it, which may be a straight one.
-        first_s = self._ways.step_s(cell)
-        arrival_s: Floats = np.maximum(blocks.lowest(self._ways.costs_s) - first_s, 0.0) / np.float32(math.sqrt(2))
+        arrival_s = blocks.lowest(self._ways.arrivals_s(cell))
         arrival_s[arrival_s > 0.0] *= min(self._slowness, _STANDS)
         return arrival_s
 

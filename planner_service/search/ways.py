@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.layout import NONE
+from planner_service.kernels.arrivals import arrivals
+from planner_service.kernels.layout import NONE, step_offsets
 from planner_service.kernels.route_walk import OK, price_routes
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Floats
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import SEARCHING, RouteBatch
+
+_MOST_CELLS = 1 << 21
+"""Of a map over which arrivals are found exactly, in some tenths of a second, once each time a target is lost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +74,25 @@ class Ways:
         back.climbs = (self._depths, *climbs[1:])
         return back
 
-    def step_s(self, cell: int) -> float:
-        """s: what a diagonal step into a passable cell takes."""
-        return float(self._costs.cell_cost[self._costs.pad(cell)] * self._costs.diagonal)
+    def arrivals_s(self, cell: int) -> Floats:
+        """float32 (rows, cols), s: nobody who begins on a passable cell can be on another one sooner.
+
+        Over large maps, and where uphill is not downhill, a lower bound from the ways back: each of their cells is
+        priced by another step, at most a diagonal one for a straight one, and the cell where one begins is entered.
+        """
+        costs, grid = self._costs, self.grid
+        if costs.climbs is None and costs.size <= _MOST_CELLS:
+            cost = np.empty(costs.size, np.float32)
+            keys, items = np.empty(costs.size, np.float32), np.empty(costs.size, np.int64)
+            heap = keys, items, np.full(costs.size, -1, np.int32)
+            offsets = step_offsets(costs.stride)
+            arrivals(costs.cell_cost, offsets, float(costs.diagonal), costs.pad(cell), cost, heap)
+            sooner_s: Floats = cost.reshape(grid.rows + 2, costs.stride)[1:-1, 1:-1]
+            return sooner_s
+        self.grow(cell)
+        first_s = float(costs.cell_cost[costs.pad(cell)] * costs.diagonal)
+        bound_s: Floats = np.maximum(self.costs_s - np.float32(first_s), 0.0) / np.float32(math.sqrt(2))
+        return bound_s
 
     @property
     def costs_s(self) -> Floats:
