@@ -130,7 +130,14 @@ class Searcher:
     def _arrivals(self, blocks: Blocks, cell: int) -> Floats:
         """float32 (rows, cols), s after the target was on a cell when it can be in each block at the earliest: on
         any cell of it, by the cheapest way."""
-        arrival_s = blocks.lowest(self._ways.arrivals_s(cell))
+        # It was somewhere in the cell, half a step on its way into the next at most, and it is in another one half
+        # a step before its middle.
+        paces = self._ways.diagonal_steps_s
+        row, col = divmod(cell, self._ways.grid.cols)
+        around = paces[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2]
+        begun_s = 0.5 * float(around[np.isfinite(around)].max())
+        sooner_s = self._ways.arrivals_s(cell) - np.where(np.isfinite(paces), 0.5 * paces, 0.0) - begun_s
+        arrival_s = np.maximum(blocks.lowest(sooner_s.astype(np.float32)), np.float32(0.0))
         arrival_s[arrival_s > 0.0] *= min(self._slowness, _STANDS)
         return arrival_s
 

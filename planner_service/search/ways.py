@@ -74,6 +74,14 @@ class Ways:
         back.climbs = (self._depths, *climbs[1:])
         return back
 
+    @property
+    def diagonal_steps_s(self) -> Floats:
+        """float32 (rows, cols), s: what a diagonal step into each cell takes; inf into a lethal one."""
+        costs = self._costs
+        into = costs.cell_cost.reshape(self.grid.rows + 2, costs.stride)[1:-1, 1:-1]
+        steps_s: Floats = into * np.float32(costs.diagonal)
+        return steps_s
+
     def arrivals_s(self, cell: int) -> Floats:
         """float32 (rows, cols), s: nobody who begins on a passable cell can be on another one sooner.
 
