@@ -47,6 +47,7 @@ MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
 MOST_PULLED_STEPS = MOST_STEPS >> 3
+"""The same of routes that are pulled, which cross twice as many cells at most and may have a leg for each step."""
 GOOD_GAP = 1.05
 """Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
 good already."""

@@ -9,12 +9,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.routes import RouteBatch
-
-DIRECTION_OF: NDArray[np.uint8] = np.zeros((3, 3), np.uint8)
-"""(rows + 1, cols + 1) of a step -> its direction code."""
-DIRECTION_OF[np.array(STEP_ROW) + 1, np.array(STEP_COL) + 1] = np.arange(8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,10 +36,11 @@ class Puller:
     def __init__(self, pace: Floats, resolution_m: float, config: PlannerConfig) -> None:
         # Compiled only for those who pull: nobody else waits for it at a first start.
         from planner_service.kernels.compile import load
+        from planner_service.kernels.layout import step_offsets
         from planner_service.kernels.pull import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 
         self._metres = resolution_m
-        self._pace, self._cols = pace.reshape(-1), pace.shape[1]
+        self._pace, self._offsets = pace.reshape(-1), step_offsets(pace.shape[1])
         self._corners = ALL_CORNERS if config.corner_cutting else OPEN_CORNERS
         if config.neighbours == 4:
             self._corners = NO_CORNERS
@@ -66,7 +62,13 @@ class Puller:
         legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
         prices = np.empty((3, many))
         self._kernel(
-            self._pace, self._cols, self._corners, (starts, directions, ends), scratch, (*out, legs, turned), prices
+            self._pace,
+            self._offsets,
+            self._corners,
+            (starts, directions, ends),
+            scratch,
+            (*out, legs, turned),
+            prices,
         )
         done = int(out[1][-1]) if many else 0
         return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres

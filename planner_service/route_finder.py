@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.pulled_routes import DIRECTION_OF, Puller
+from planner_service.pulled_routes import Puller
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.routes import Route, RouteStatus, directions_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,17 +148,20 @@ class RouteFinder:
             raise ValueError(
                 f"route is {route.status.value!r}, expected 'ok': only a route to the target is pulled"
             )
-        puller = Puller(self._pace, self.grid.resolution_m, self._config)
-        start = self.grid.cell(*route.cells[0].tolist())
-        codes = DIRECTION_OF[tuple(np.diff(route.cells, axis=0).T + 1)]
-        pulled, prices = puller.pull(np.array([start]), codes, np.array([codes.size]))
+        at = route.cells @ np.array((self.grid.cols, 1), np.int64)
+        codes = np.frombuffer(bytearray(directions_of(at, self.grid.cols)), np.uint8)
+        pulled, prices = self._puller.pull(at[:1], codes, np.array([codes.size]))
         if not np.isfinite(prices[0, 0]):
             raise ValueError("the route passes a cell or a corner that is shut by now: ask for it again")
-        cells = walk(self.grid, start, pulled.directions.tobytes())
-        at = np.concatenate(((0,), np.cumsum(pulled.legs, dtype=np.int64)))
-        turns = np.stack(np.divmod(np.array(cells)[at], self.grid.cols), axis=1)
+        crossed = np.array(walk(self.grid, int(at[0]), pulled.directions.tobytes()))
+        turned = np.concatenate(((0,), np.cumsum(pulled.legs, dtype=np.int64)))
+        turns = np.stack(np.divmod(crossed[turned], self.grid.cols), axis=1)
         cost_s, grid_cost_s, length_m = prices[:, 0].tolist()
         return PulledRoute(turns, cost_s, grid_cost_s, length_m)
+
+    @cached_property
+    def _puller(self) -> Puller:
+        return Puller(self._pace, self.grid.resolution_m, self._config)
 
     def cost_to_go_s(self) -> NDArray[np.float32]:
         """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""

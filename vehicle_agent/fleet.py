@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm.config.classes import GROUND
-from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet
 from vehicle_agent.driving.places import Places
 
@@ -63,14 +61,3 @@ class FleetReport:
             targets=bytes(chased),
             vehicle_class=self._vehicle_class,
         )
-
-
-def directions_of(cells: Sequence[int], cols: int) -> bytes:
-    """The direction code (0..7, clockwise from north) of each step between neighbouring cells, one byte each."""
-    rows, east = np.divmod(np.array(cells, np.int64), cols)
-    codes: NDArray[np.uint8] = _CODES[np.diff(rows) + 1, np.diff(east) + 1]
-    return codes.tobytes()
-
-
-_CODES = np.zeros((3, 3), np.uint8)
-_CODES[np.array(STEP_ROW) + 1, np.array(STEP_COL) + 1] = np.arange(8)

@@ -35,6 +35,7 @@ from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, SharedCosts, VehicleState
+from swarm.wire.routes import directions_of
 from swarm.wire.topics import (
     BODY,
     CHASERS,
@@ -58,7 +59,7 @@ from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynam
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
-from vehicle_agent.fleet import FleetReport, directions_of
+from vehicle_agent.fleet import FleetReport
 from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore

@@ -4,6 +4,7 @@ A segment costs the integral of the pace of the cells that it crosses, found by 
 traversal algorithm" (1987), with crossings compared as integers. Arrays, of n routes over a map of rows x cols, of
 which the longest has m cells:
     pace       float32  (rows * cols,)  s for a metre; inf is lethal
+    offsets    int64    (8,)     of `layout.step_offsets(cols)`
     routes     (starts int64 (n,), directions uint8 (sum of steps,), ends int64 (n,)), as `RouteBatch`
     cells      int64    (m,)     those of one route, neighbours of each other
     costs      float64  (2, m)   in paces times cells, from its first cell to each: along the route, and pulled
@@ -29,13 +30,10 @@ LOOK_BACK = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 NO_CORNERS, OPEN_CORNERS, ALL_CORNERS = range(3)
 """Through an exact corner a segment passes never, between two passable cells only, or always."""
 
-_ROW_STEP = (-1, -1, 0, 1, 1, 1, 0, -1)
-_COL_STEP = (0, 1, 1, 1, 0, -1, -1, -1)
-
 
 @helper
 def segment_cost(pace, cols, corners, start, end, limit):
-    """float64: a segment's cost, in paces times cells; inf if it is not below `limit`, or meets a lethal cell, or a
+    """float64: a segment's cost, in paces times cells; inf if it is not below `limit`, or meets a lethal cell, or
     an exact corner that it may not pass."""
     down, right = end // cols - start // cols, end % cols - start % cols
     rows_left, cols_left = abs(down), abs(right)
@@ -147,12 +145,13 @@ def _lay_out(cols, start, end, directions, at):
 
 
 @kernel(
-    "void(f4[::1], i8, i8, Tuple((i8[::1], u1[::1], i8[::1])), Tuple((i8[::1], f8[:, ::1], i8[::1], i8[::1])), "
-    "Tuple((u1[::1], i8[::1], u4[::1], i8[::1])), f8[:, ::1])"
+    "void(f4[::1], i8[::1], i8, Tuple((i8[::1], u1[::1], i8[::1])), "
+    "Tuple((i8[::1], f8[:, ::1], i8[::1], i8[::1])), Tuple((u1[::1], i8[::1], u4[::1], i8[::1])), f8[:, ::1])"
 )
-def pull_routes(pace, cols, corners, routes, scratch, pulled, prices):
+def pull_routes(pace, offsets, corners, routes, scratch, pulled, prices):
     """Write `pulled` and `prices`. A route that meets a lethal cell costs inf and stays as it is, each step a
     segment."""
+    cols = offsets[4]
     starts, directions, ends = routes
     cells, costs, _, turns = scratch
     out, out_ends, legs, many_legs = pulled
@@ -162,8 +161,7 @@ def pull_routes(pace, cols, corners, routes, scratch, pulled, prices):
         size = ends[n] - begin + 1
         cells[0] = starts[n]
         for i in range(1, size):
-            code = directions[begin + i - 1]
-            cells[i] = cells[i - 1] + _ROW_STEP[code] * cols + _COL_STEP[code]
+            cells[i] = cells[i - 1] + offsets[directions[begin + i - 1]]
         prices[0, n] = prices[1, n] = prices[2, n] = 0.0
         if size > 1:
             count = _pull(pace, cols, corners, scratch, size)

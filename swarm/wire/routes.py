@@ -7,12 +7,13 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import accumulate
 from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
+from swarm.grid import STEP_COL, STEP_ROW
 from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import (
     Bounded,
@@ -301,6 +302,20 @@ def _own_legs(routes: Sequence[Route]) -> Iterator[bytes]:
     if any(route.legs for route in routes):
         for route in routes:
             yield route.legs or b"\1\0\0\0" * len(route.directions)
+
+
+def directions_of(cells: Sequence[int] | NDArray[np.int64], cols: int) -> bytes:
+    """The direction code (0..7, clockwise from north) of each step between neighbouring cells, one byte each."""
+    rows, east = np.divmod(np.asarray(cells, np.int64), cols)
+    codes: NDArray[np.uint8] = _codes()[np.diff(rows) + 1, np.diff(east) + 1]
+    return codes.tobytes()
+
+
+@cache
+def _codes() -> NDArray[np.uint8]:
+    codes = np.zeros((3, 3), np.uint8)
+    codes[np.array(STEP_ROW) + 1, np.array(STEP_COL) + 1] = np.arange(8)
+    return codes
 
 
 def pack_directions(codes: NDArray[np.uint8]) -> bytes:

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.grid import GridSpec, walk
+from swarm.wire.routes import directions_of
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.driving.route_follower import Follower
-from vehicle_agent.fleet import directions_of
 
 GRID = GridSpec(10, 10, 10.0)
 
