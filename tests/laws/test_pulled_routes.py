@@ -22,6 +22,7 @@ from swarm.grid import walk
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, Routes, RouteStatus
+from vehicle_agent.driving.dynamics import PluginDynamics, Stretch
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.driving.route_follower import Follower
 
@@ -194,6 +195,38 @@ def test_who_drives_a_pulled_route_takes_its_integral_and_is_in_its_cells_all_th
             assert max(abs(south - row - 0.5), abs(east - col - 0.5)) <= 0.5 + 1e-9
         follower.moved(cell)
     assert took_s == pytest.approx(finder.pull(route).cost_s, rel=1e-9)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2)))
+def test_dynamics_know_how_long_a_pulled_route_is_and_where_it_turns(seed: int, lethal: float) -> None:
+    """On cells that a segment crosses there is no turn, and no more way than the segment is long."""
+    random = np.random.default_rng(seed)
+    pace = random_ground(random, 24, 24, lethal)
+    finder = RouteFinder(pace, (0, 0), resolution_m=5.0)
+    start = int(random.choice(np.flatnonzero(np.isfinite(pace))))
+    pulled = Puller(pace, 5.0, PlannerConfig()).pull_batch(finder._tree.routes([start]))[0]
+    if pulled.status is not RouteStatus.OK or not 1 < len(pulled.directions) <= 20:  # what a vehicle looks ahead
+        return
+    cells = walk(finder.grid, start, pulled.directions)
+    follower, motion = Follower(), Motion(finder.grid, start)
+    assert follower.begin(cells, cells[:1], turns=pulled.turns)
+    asked: list[Stretch] = []
+
+    class Says:
+        def speed(self, stretch: Stretch) -> float:
+            asked.append(stretch)
+            return 1.0
+
+    dynamics = PluginDynamics(Says(), finder.grid, None)
+    motion.set_out(cells[1], follower.point(cells[1], 24))
+    dynamics.begin(0.1)
+    dynamics.advance("v", motion, cells, 0.1, 0.1, lambda cell: follower.point(cell, 24))
+    assert asked[0].ahead_m == pytest.approx(pulled.length_m, rel=1e-12)
+    corners = [np.divmod(np.array(cells)[turn], 24) for turn in pulled.turns]
+    assert len(asked[0].turns) == len(corners) - 2
+    legs_m = [5.0 * math.dist(a, b) for a, b in itertools.pairwise(corners)]
+    assert [at_m for at_m, _ in asked[0].turns] == pytest.approx(list(itertools.accumulate(legs_m))[:-1])
 
 
 def test_a_vehicle_drives_through_the_middles_where_a_planner_lies_about_a_segment() -> None:

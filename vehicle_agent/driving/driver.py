@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from itertools import pairwise
 
 from swarm.right_of_way.holdings import Holdings
 from vehicle_agent.driving.dynamics import PluginDynamics
+from vehicle_agent.driving.motion import Point
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.local_map import LocalMap
 
@@ -82,7 +84,7 @@ class Driver:
                 if len(path) < 2 or not self._passable(path[0], path[1]):
                     self._rolling.discard(vehicle.id)
                     return 0.0
-                motion.set_out(path[1], vehicle.route.point(path[1], self._cols) if self._pulled else None)
+                motion.set_out(path[1], self._passes(vehicle, path[1]))
                 # A vehicle with dynamics of its own has its full pace between two cells before and behind.
                 freely = self._dynamics is None or (len(path) > 2 and vehicle.id in self._rolling)
                 if self._measures and freely:
@@ -98,7 +100,8 @@ class Driver:
                 left_s = motion.advance(left_s, pace_s_per_m)
             else:
                 path = self._holdings.path(vehicle.id)
-                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
+                passes = partial(self._passes, vehicle)
+                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground
                     self._steps.pop(vehicle.id, None)
             measured_s = had_s - left_s if before == head or not self._pulled else 0.0
@@ -111,6 +114,10 @@ class Driver:
                 # Even with no time left it has to look before it drives on.
                 return left_s
         return 0.0
+
+    def _passes(self, vehicle: Vehicle, cell: int) -> Point | None:
+        """Where a vehicle passes one of its next cells; None is the middle."""
+        return vehicle.route.point(cell, self._cols) if self._pulled else None
 
     def _measure(self, vehicle: Vehicle, head: int, seconds: float, length_m: float) -> None:
         """Part of what is measured of the step to `head` was driven, or its end; all of that is as long as

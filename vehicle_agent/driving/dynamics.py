@@ -6,7 +6,7 @@ Which cells a vehicle enters, and when it must stop, is `Motion`'s and right of 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol
@@ -17,7 +17,10 @@ from swarm.config.classes import ClassConfig
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
-from vehicle_agent.driving.motion import Motion
+from vehicle_agent.driving.motion import Motion, Point, middle_of, way_of
+
+_STRAIGHT_RAD = 1e-9
+"""Rounding: parts of one segment head so nearly the same way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,11 +147,18 @@ class PluginDynamics:
         self._were, self._are = self._are, {}
 
     def advance(
-        self, vehicle: str, motion: Motion, path: Sequence[int], seconds: float, pace_s_per_m: float
+        self,
+        vehicle: str,
+        motion: Motion,
+        path: Sequence[int],
+        seconds: float,
+        pace_s_per_m: float,
+        passes: Callable[[int], Point | None] = lambda cell: None,
     ) -> float:
         """As `Motion.advance`, no faster than `pace_s_per_m`.
 
-        path  the cells that the vehicle was granted, from its own on
+        path    the cells that the vehicle was granted, from its own on
+        passes  where it passes one of these; None is the middle
         """
         self.slowed = False
         guard = self._guard
@@ -158,7 +168,7 @@ class PluginDynamics:
         speed, heading = self._were.get(vehicle, (0.0, motion.heading_rad))
         before = self._are[vehicle][1] if vehicle in self._are else heading
         turn = _turn(before, motion.heading_rad)
-        ahead_m, turns = self._ahead(motion, path)
+        ahead_m, turns = self._ahead(motion, path, passes)
         stretch = Stretch(vehicle, speed, limit, turn, ahead_m, self._tick_s, seconds, turns)
         if guard is None:
             wanted = self._dynamics.speed(stretch)
@@ -169,19 +179,21 @@ class PluginDynamics:
         self._are[vehicle] = chosen, motion.heading_rad
         return motion.advance(seconds, 1.0 / chosen if chosen > 0 else math.inf)
 
-    def _ahead(self, motion: Motion, path: Sequence[int]) -> tuple[float, tuple[tuple[float, float], ...]]:
+    def _ahead(
+        self, motion: Motion, path: Sequence[int], passes: Callable[[int], Point | None]
+    ) -> tuple[float, tuple[tuple[float, float], ...]]:
         """Metres to the end of what was granted, and the turns until there."""
-        cells = path[path.index(motion.head) :] if motion.head in path else ()
-        cols, resolution_m = self._grid.cols, self._grid.resolution_m
+        cells = path[path.index(motion.head) + 1 :] if motion.head in path else ()
+        stops = [motion.goal, *((cell, passes(cell) or middle_of(self._grid, cell)) for cell in cells)]
         ahead_m, heading_rad = motion.left_m, motion.heading_rad
         turns: list[tuple[float, float]] = []
-        for tail, head in pairwise(cells):
-            south, east = head // cols - tail // cols, head % cols - tail % cols
-            onward_rad = math.atan2(east, -south) % math.tau
-            if onward_rad != heading_rad:
-                turns.append((ahead_m, _turn(heading_rad, onward_rad)))
-            heading_rad = onward_rad
-            ahead_m += resolution_m * (math.sqrt(2) if south and east else 1.0)
+        for start, goal in pairwise(stops):
+            way = way_of(self._grid, start, goal)
+            turn_rad = _turn(heading_rad, way.heading_rad)
+            if abs(turn_rad) > _STRAIGHT_RAD:
+                turns.append((ahead_m, turn_rad))
+            heading_rad = way.heading_rad
+            ahead_m += way.length_m
         return ahead_m, tuple(turns)
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from swarm.grid import GridSpec
 
 Point = tuple[float, float]
 """Row and col, whole numbers in the middles of cells."""
+Stop = tuple[int, Point]
+"""Where a step begins or ends: a cell, and a point in it."""
 
 
 class Motion:
@@ -35,13 +38,18 @@ class Motion:
     def put(self, cell: int) -> None:
         """At rest in the middle of a cell."""
         self.tail = self.head = cell
-        self._at = self._to = self._middle(cell)
+        self._at = self._to = middle_of(self._grid, cell)
         self.done_m = self.length_m = self.border_m = 0.0
 
     @property
     def cell(self) -> int:
         """The one cell that the vehicle occupies."""
         return self.tail if self.done_m < self.border_m else self.head
+
+    @property
+    def goal(self) -> Stop:
+        """Where the step ends."""
+        return self.head, self._to
 
     @property
     def left_m(self) -> float:
@@ -67,19 +75,12 @@ class Motion:
         cols = cell % self._grid.cols - self.head % self._grid.cols
         if not self.at_rest or max(abs(rows), abs(cols)) != 1:
             raise ValueError(f"no step from cell {self.head} to {cell}")
-        begin, middle = self._at, self._middle(self.head)
-        end = self._to = self._middle(cell) if to is None else to
-        if to is None and begin == middle:
-            self._via = None
-            self.length_m = math.hypot(rows, cols) * self._grid.resolution_m
-            self.border_m = 0.5 * self.length_m
-        else:
-            self._via = _via(begin, end, (middle[0] + 0.5 * rows, middle[1] + 0.5 * cols), rows, cols)
-            self.border_m = math.dist(begin, self._via) * self._grid.resolution_m
-            self.length_m = self.border_m + math.dist(self._via, end) * self._grid.resolution_m
+        self._to = middle_of(self._grid, cell) if to is None else to
+        way = way_of(self._grid, (self.head, self._at), (cell, self._to))
+        self._via, self.border_m, self.length_m = way.via, way.border_m, way.length_m
         self.head = cell
         self.done_m = 0.0
-        self.heading_rad = math.atan2(end[1] - begin[1], begin[0] - end[0]) % math.tau
+        self.heading_rad = way.heading_rad
 
     def turn_back(self) -> None:
         """Return to where the step began, if it has not entered the next cell."""
@@ -120,8 +121,38 @@ class Motion:
         row, col = row0 + share * (row1 - row0), col0 + share * (col1 - col0)
         return (col + 0.5) * self._grid.resolution_m, (row + 0.5) * self._grid.resolution_m
 
-    def _middle(self, cell: int) -> Point:
-        return float(cell // self._grid.cols), float(cell % self._grid.cols)
+
+class Way(NamedTuple):
+    """A step from a point of a cell to a point of a neighbour.
+
+    via          where it passes their border; None if it leads from middle to middle
+    border_m     metres up to there; length_m: of the whole
+    heading_rad  clockwise from north
+    """
+
+    via: Point | None
+    border_m: float
+    length_m: float
+    heading_rad: float
+
+
+def way_of(grid: GridSpec, start: Stop, goal: Stop) -> Way:
+    """The step between two neighbours: straight, or over their corner, so that it touches no other cell."""
+    (tail, begin), (head, end) = start, goal
+    middle = middle_of(grid, tail)
+    rows, cols = head // grid.cols - tail // grid.cols, head % grid.cols - tail % grid.cols
+    heading_rad = math.atan2(end[1] - begin[1], begin[0] - end[0]) % math.tau
+    if begin == middle and end == middle_of(grid, head):
+        length_m = math.hypot(rows, cols) * grid.resolution_m
+        return Way(None, 0.5 * length_m, length_m, heading_rad)
+    via = _via(begin, end, (middle[0] + 0.5 * rows, middle[1] + 0.5 * cols), rows, cols)
+    border_m = math.dist(begin, via) * grid.resolution_m
+    return Way(via, border_m, border_m + math.dist(via, end) * grid.resolution_m, heading_rad)
+
+
+def middle_of(grid: GridSpec, cell: int) -> Point:
+    """The middle of a cell."""
+    return float(cell // grid.cols), float(cell % grid.cols)
 
 
 def _via(begin: Point, end: Point, shared: Point, rows: int, cols: int) -> Point:
