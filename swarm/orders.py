@@ -6,10 +6,11 @@ asked to answer as soon as it obeys.
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import dataclass, field
 
-from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Replied
+from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
 from swarm.errors import BusError, ConfigError
 from swarm.liveness import Roster
 from swarm.ranks import job_of
@@ -25,6 +26,8 @@ _FIND_S = 3.0
 _ORDER_S = 5.0
 _OBEY_S = 3.0
 _LEAVE_S = 0.3
+_MOST_SEEN = 1 << 12
+"""Whoever holds a certificate may raise tokens of any number of lives, one after the other."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,11 @@ class Operator:
     def __init__(self, bus: Bus, patience_s: float = _OBEY_S) -> None:
         self._bus = bus
         self._patience_s = patience_s
-        self._tokens: Inbox | None = None
-        self._roster = Roster()
-        self._left: set[str] = set()
-        """Those of which no token is up any more, as role-id."""
+        self._roster: Roster | None = None
+        """Whose tokens are up, once they are watched; guarded by `_lock`."""
+        self._seen: set[tuple[str, str]] = set()
+        """(role, id) of all whose tokens ever were, guarded likewise."""
+        self._lock = threading.Lock()
 
     def zones(self) -> Zones:
         """The zones that stand. Raises BusError without a keeper."""
@@ -94,9 +98,9 @@ class Operator:
     # --- asking ---------------------------------------------------------------------------------------------
 
     def _members(self) -> list[RunInfo]:
-        if self._tokens is None:  # before anybody is asked, so that no answer is of one whose end we missed
-            self._tokens = Inbox()
-            self._bus.watch_alive(self._tokens.post)
+        if self._roster is None:  # before anybody is asked, so that no answer is of one whose end we missed
+            self._roster = Roster()
+            self._bus.watch_alive(self._hear_token)
         found = self._ask(RUN, Nothing(), _FIND_S)[0]
         return [each for each in found if isinstance(each, RunInfo) and each.run_id]
 
@@ -140,17 +144,26 @@ class Operator:
                 break
         return Acknowledged(obeyed, sorted(concerned - obeyed.keys()))
 
-    def _who_left(self) -> set[str]:
-        while self._tokens is not None and (event := self._tokens.take(0.0)) is not None:
+    def _hear_token(self, event: Event) -> None:
+        """On the bus's threads."""
+        with self._lock:
+            assert self._roster is not None
             match event:
                 case Appeared(peer):
                     self._roster.appeared(peer)
-                    self._left.discard(f"{peer.role}-{peer.id}")
+                    if len(self._seen) < _MOST_SEEN:
+                        self._seen.add((peer.role, peer.id))
                 case Disappeared(peer):
                     self._roster.gone(peer)
-                    if not self._roster.is_alive(peer.role, peer.id):
-                        self._left.add(f"{peer.role}-{peer.id}")
-        return self._left if self._roster.up() else set()  # if all are gone, it is our link that is lost
+
+    def _who_left(self) -> set[str]:
+        """Those of which no token is up any more, as role-id."""
+        with self._lock:
+            up = [] if self._roster is None else self._roster.up()
+            left = self._seen.difference(up)
+        return (
+            {f"{role}-{id}" for role, id in left} if up else set()
+        )  # if all are gone, it is our link that is lost
 
     def _ask(
         self, topic: Topic, request: Message, timeout_s: float, **fields: str | int

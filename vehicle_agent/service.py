@@ -201,7 +201,8 @@ class AgentService:
         self._sync.start(now_ns)
         self._obedience.start(now_ns)
         self._bus.collect(POSE)
-        self._bus.collect(BODY)
+        if not self._flies:  # bodies are on the ground
+            self._bus.collect(BODY)
         self._agent.bodies.listen_anew(now_ns)
         if self._untracked.targets:
             self._bus.collect(TRUE_POSE)
@@ -395,8 +396,6 @@ class AgentService:
         bodies = self._agent.bodies
         for heard in self._bus.collected(BODY):
             assert isinstance(heard.message, Body)
-            if self._flies:  # bodies are on the ground
-                continue
             bodies.hear(heard.message, now_ns)
             age_ns = now_ns - heard.message.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree

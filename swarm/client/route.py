@@ -46,14 +46,18 @@ class Route:
 
     @classmethod
     def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
-        """A route of an answer, or one that was pushed. Raises ValueError if it leaves the terrain."""
+        """A route of an answer, or one that was pushed. Raises ValueError if it leaves the terrain, or one of its
+        segments leads nowhere."""
         searching = route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
         led = searching or route.status is RouteStatus.OK
         cells = tuple(walk(frame.grid, route.start, route.directions)) if led else ()
+        turns = route.turns if led else ()
+        if any(cells[start] == cells[end] for start, end in pairwise(turns)):
+            raise ValueError("a segment of the route ends where it begins")
         age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
         return cls(
             frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
-            age_s, lost, route.turns if led else (),
+            age_s, lost, turns,
         )  # fmt: skip
 
     @property

@@ -128,8 +128,10 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     for plugin in plugins_of(scenario):
         yield from _said(check_name, plugin, source)
     yield from _said(check_cost, scenario.cost, source)
-    if scenario.cost.directional or aloft_classes(scenario):
-        yield from _said(_check_directional, scenario.planner, source)
+    if scenario.cost.directional:
+        yield from _said(_check_climbs, scenario.planner, "cost.directional = true", source)
+    elif aloft := aloft_classes(scenario):
+        yield from _said(_check_climbs, scenario.planner, f"class {aloft[0]}, which flies", source)
     yield from class_faults(scenario, source)
     yield from _group_faults(scenario, source)
     shown = scenario.monitor.show_target
@@ -194,11 +196,10 @@ def _check_zone(zone: ZoneConfig, where: str) -> None:
             raise ConfigError(f"{where}: {key} goes with kind {kind}, found {zone.kind!r}")
 
 
-def _check_directional(planner: PlannerConfig, source: str) -> None:
+def _check_climbs(planner: PlannerConfig, why: str, source: str) -> None:
     if planner.length_weight:
         raise ConfigError(
-            f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"
-            " leave it out"
+            f"{source}: planner.length_weight: {planner.length_weight:g} does not go with {why}; leave it out"
         )
 
 

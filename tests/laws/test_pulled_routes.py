@@ -16,9 +16,11 @@ from support.effort import few
 
 from planner_service.pulled_routes import Puller
 from planner_service.route_finder import RouteFinder
+from swarm.client.frame import Frame
+from swarm.client.route import Route as ClientRoute
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ProtocolError
-from swarm.grid import walk
+from swarm.grid import GridSpec, walk
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, Routes, RouteStatus
@@ -254,6 +256,21 @@ def test_legs_that_do_not_end_with_their_route_are_refused(legs: list[int]) -> N
     assert [columns.batch.statuses[n] for n in (0, 1)] == [OK, NO_TARGET]
     with pytest.raises(ValueError, match="legs"):
         Routes(**{name: getattr(columns, name) for name in Routes.__struct_fields__ if name != "legs"}, legs=bad)
+
+
+def test_a_client_refuses_a_segment_that_ends_where_it_begins() -> None:
+    """East and back west as one segment: nobody could say where one is on it."""
+    frame = Frame(GridSpec(9, 9, 1.0))
+    legs = np.array([2], "<u4").tobytes()
+    for directions, refused in ((b"\2\6", True), (b"\2\2", False)):
+        route = Route(status=RouteStatus.OK, start=0, cost_s=1.0, directions=directions, legs=legs)
+        told = PushedRoute(vehicle="a", target="t", incarnation=1, target_cell=2, map_version=0, route=route)
+        assert decode(encode(told), PushedRoute) == told
+        if refused:
+            with pytest.raises(ValueError, match="ends where it begins"):
+                ClientRoute.of(frame, route, told)
+        else:
+            assert ClientRoute.of(frame, route, told).ahead(0.0, 0.0, 1.0)
 
 
 def test_a_route_that_is_not_pulled_beside_one_that_is_goes_step_by_step() -> None:

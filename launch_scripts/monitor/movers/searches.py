@@ -56,7 +56,7 @@ def searched_points(mesh: TerrainMesh, beliefs: Mapping[str, Believed]) -> tuple
     for believed in beliefs.values():
         cells = np.array(believed.cells, np.int64)
         shares = column(believed.shares, "<f4")
-        on_map = cells < grid.cells
+        on_map = (cells >= 0) & (cells < grid.cells)
         cells, shares = cells[on_map], shares[on_map]
         rows, cols = np.divmod(cells, grid.cols)
         east_m, south_m = (((each + 0.5) * grid.resolution_m).astype(np.float32) for each in (cols, rows))

@@ -211,6 +211,8 @@ def _routes(arrays: Any, grid: GridSpec) -> list[GivenRoute]:
     if min(columns[-1], default=0) < 0:
         raise ValueError("a route has less than no steps")
     directions = arrays["routes_directions"].astype(np.uint8)
+    if len(directions) != sum(columns[-1]):
+        raise ValueError("the directions of routes are not theirs")
     legs = iter(_legs(arrays, len(columns[-1])))
     routes, at = [], 0
     for vehicle, target, time_ns, start, cost_s, bound_s, steps in zip(*columns, strict=True):
@@ -230,9 +232,10 @@ def _legs(arrays: Any, many: int) -> list[NDArray[Any]]:
     if "routes_legs" not in arrays:
         return [np.empty(0, np.int64)] * many
     counts = _whole(arrays, "routes_many_legs")
-    if len(counts) != many or min(counts, default=0) < 0:
+    legs = _whole(arrays, "routes_legs")
+    if len(counts) != many or min(counts, default=0) < 0 or sum(counts) != len(legs) or min(legs, default=1) < 1:
         raise ValueError("the legs of routes are not theirs")
-    return np.split(_whole(arrays, "routes_legs"), np.cumsum(counts))[:many]
+    return np.split(legs, np.cumsum(counts))[:many]
 
 
 def _walked(grid: GridSpec, start: int, directions: NDArray[np.uint8]) -> NDArray[np.int64] | None:

@@ -149,7 +149,7 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
     """The route that a vehicle has just begun to follow, for those who watch.
 
-    legs  of a pulled route, as in `Route`
+    legs  of a pulled route, as in `Route`; the first begins where the vehicle is, on a segment perhaps
     """
 
     vehicle: VehicleId
