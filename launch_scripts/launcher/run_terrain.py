@@ -11,8 +11,9 @@ from pathlib import Path
 from launch_scripts.launcher.watcher import ask_run
 from shared_map.keeper.base_map import NEEDED
 from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
+from shared_map.terrain.prepared import load_prepared, save_prepared, scenario_key
 from shared_map.terrain.row_bands import Progress, no_progress
-from shared_map.terrain.terrain import build_truth, load_prepared, save_prepared, scenario_key
+from shared_map.terrain.terrain import build_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES
 from swarm.config.plugin_names import cost_layers_of

@@ -36,7 +36,8 @@ from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
-from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
+from shared_map.terrain.prepared import load_terrain, load_truth, prepare
+from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening

@@ -16,7 +16,7 @@ from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.class_grounds import class_terrains
 from shared_map.prepared_classes import load_classes
-from shared_map.terrain.terrain import load_terrain, load_truth
+from shared_map.terrain.prepared import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.classes import aloft_classes

@@ -9,7 +9,8 @@ from launch_scripts.world.referee import BodyHit, Collision, LethalEntry
 from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.targets import Action, Captured, Publish, TargetWorld
 from launch_scripts.world.telling import Telling
-from shared_map.terrain.terrain import Terrain, load_homes
+from shared_map.terrain.prepared import load_homes
+from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.liveness import Roster

@@ -6,21 +6,17 @@ Agents import this, so nothing slow is imported at the top: what only building n
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats, give_back_memory, open_array, save_array
+from shared_map.arrays import Bytes, Floats
 from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
 from shared_map.terrain.hidden import true_ground
-from shared_map.terrain.homes import homes_of
-from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.layers import (
     TerrainClass,
     along_slope_of_padded,
@@ -34,17 +30,13 @@ from shared_map.terrain.layers import (
 )
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.slope_rules import said_of_cost
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.zones import ZoneFacts, files_of_zone, paint_zones
+from shared_map.terrain.step_climb import Climb, climb_of
+from shared_map.terrain.zones import ZoneFacts, paint_zones
 from swarm.config.classes import GROUND, of_class
 from swarm.config.ground import CostConfig
-from swarm.config.input_files import FileKind, read_text
-from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-from swarm.plugins.find import source_of
-from swarm.runtime.role import RoleSetup
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
@@ -52,7 +44,6 @@ if TYPE_CHECKING:
 
 FORMAT = 4
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
-_META = "terrain.json"
 _ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"
 
 
@@ -270,167 +261,3 @@ def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
         terrain.classes,
         scenario.seed,
     )
-
-
-# --- prepared: built once by the launcher, read by every process in a blink -----------------------------------
-
-
-def scenario_key(scenario: Scenario) -> str:
-    """Fingerprint of all that a terrain is built from: a prepared one with another key is another terrain."""
-    parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
-    named = scenario.terrain
-    names = (named.source, named.photo, named.labels, named.cover, named.cover_codes)
-    files = [Path(name) for name in names if name]
-    files += [path for zone in (*scenario.cost.zones, *named.hidden.zones) for path in files_of_zone(zone)]
-    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in files if path.is_file()]
-    layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
-    payload = msgspec.json.encode([parts, stamps, layers], order="sorted")
-    return hashlib.blake2b(payload, digest_size=8).hexdigest()
-
-
-def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") -> None:
-    """Write a terrain and its truth where `load_prepared` finds them. The description is written last."""
-    arrays: dict[str, NDArray[Any]] = {
-        "elevation": terrain.elevation_m,
-        "photo": terrain.photo,
-        "pace": terrain.pace_s_per_m,
-        "classes": terrain.classes,
-        "truth": truth,
-        "homes": homes_of(terrain.pace_s_per_m, truth),
-    }
-    if terrain.ground_s_per_m is not terrain.pace_s_per_m:
-        arrays["ground"] = terrain.ground_s_per_m
-    if terrain.climb is not None:
-        arrays["climb"] = terrain.climb.factors
-    meta = {
-        "format": FORMAT,
-        "key": key,
-        "grid": msgspec.to_builtins(terrain.grid),
-        "digest": terrain.digest,
-        "vehicle_radius_m": terrain.vehicle_radius_m,
-        "steepest": None if terrain.climb is None else terrain.climb.steepest,
-        "arrays": sorted(arrays),
-        "notes": list(terrain.notes),
-    }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / _META).unlink(missing_ok=True)
-        for name, array in arrays.items():
-            save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
-        partial = folder / f"{_META}.part"
-        partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
-        partial.rename(folder / _META)
-    except OSError as error:
-        raise TerrainError(f"cannot write the prepared terrain to {folder}: {error.strerror or error}") from error
-
-
-def load_prepared(folder: Path, key: str = "") -> Terrain | None:
-    """The terrain that `save_prepared` left, mapped read-only; None if there is none, or one of another key.
-
-    Raises TerrainError if it is damaged."""
-    meta = _read_meta(folder, key)
-    if meta is None:
-        return None
-    try:
-        grid = GridSpec(**meta["grid"])
-        digest, radius, notes = str(meta["digest"]), float(meta["vehicle_radius_m"]), tuple(meta["notes"])
-        has_ground, steepest = "ground" in meta["arrays"], meta["steepest"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise TerrainError(f"prepared terrain {folder / _META} is damaged ({error}); delete the folder") from error
-    shape = (grid.rows, grid.cols)
-    pace = read_array(folder, "pace", shape, np.float32)
-    elevation_m = read_array(folder, "elevation", shape, np.float32)
-    climb = None
-    if steepest is not None:
-        factors = read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
-        climb = Climb(grid, elevation_m, factors, float(steepest))
-    return Terrain(
-        grid=grid,
-        elevation_m=elevation_m,
-        photo=read_array(folder, "photo", (*shape, 3), np.uint8),
-        pace_s_per_m=pace,
-        classes=read_array(folder, "classes", shape, np.uint8),
-        digest=digest,
-        ground_s_per_m=read_array(folder, "ground", shape, np.float32) if has_ground else pace,
-        vehicle_radius_m=radius,
-        climb=climb,
-        notes=notes,
-    )
-
-
-def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
-    """The truth beside a prepared terrain; None if there is none."""
-    meta = _read_meta(folder, key)
-    if meta is None:
-        return None
-    grid = GridSpec(**meta["grid"])
-    return read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
-
-
-def _read_meta(folder: Path, key: str) -> dict[str, Any] | None:
-    try:
-        if not (folder / _META).exists():
-            return None
-        meta = json.loads(read_text(folder / _META, FileKind.PREPARED))
-    except (TerrainError, ValueError, RecursionError) as error:
-        raise TerrainError(
-            f"prepared terrain {folder / _META} is unreadable ({error}); delete the folder"
-        ) from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT or (key and meta.get("key") != key):
-        return None
-    return meta
-
-
-def read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
-    """An array of a prepared folder, mapped read-only. Raises TerrainError if it is not as described."""
-    path = folder / f"{name}.npy"
-    try:
-        array = open_array(path)
-    except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
-        raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
-    if array.shape != tuple(shape) or array.dtype != dtype:
-        raise TerrainError(f"prepared terrain {path} is {array.shape} {array.dtype}, not as described; delete it")
-    return array
-
-
-def load_terrain(setup: RoleSetup) -> Terrain:
-    """The terrain of a run: prepared in its folder if it is there, else built."""
-    if setup.run_dir is not None:
-        terrain = load_prepared(setup.run_dir, scenario_key(setup.scenario))
-        if terrain is not None:
-            return terrain
-    return build_terrain(setup.scenario)
-
-
-def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
-    """The truth of a run, as `load_terrain`."""
-    if setup.run_dir is not None:
-        truth = load_prepared_truth(setup.run_dir, scenario_key(setup.scenario))
-        if truth is not None:
-            return truth
-    return build_truth(setup.scenario, terrain)
-
-
-def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
-    """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
-    meta = None if setup.run_dir is None else _read_meta(setup.run_dir, scenario_key(setup.scenario))
-    if setup.run_dir is not None and meta is not None and "homes" in meta["arrays"]:
-        return read_array(setup.run_dir, "homes", (terrain.grid.rows, terrain.grid.cols), np.bool_)
-    return homes_of(terrain.pace_s_per_m, truth)
-
-
-def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
-    """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
-    for the other processes. What is returned is mapped, as theirs."""
-    key, kept = scenario_key(scenario), kept_key(scenario)
-    if kept is None or not fetch_kept(kept, folder):
-        terrain = build_terrain(scenario, progress)
-        save_prepared(folder, terrain, build_truth(scenario, terrain), key)
-        del terrain
-        give_back_memory()
-        if kept is not None:
-            keep(kept, [folder / _META, *folder.glob("*.npy")])
-    mapped, truth = load_prepared(folder, key), load_prepared_truth(folder, key)
-    if mapped is None or truth is None:
-        raise TerrainError(f"the prepared terrain in {folder} has gone: it is another run's; start again")
-    return mapped, truth

@@ -12,9 +12,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from planner_service.target_tree import TargetTree
+from shared_map.terrain.prepared import load_prepared, save_prepared
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.synthetic.noise import mountains
-from shared_map.terrain.terrain import build_terrain, load_prepared, save_prepared
+from shared_map.terrain.terrain import build_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.load import parse_scenario

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared_map.terrain import kept, terrain
-from shared_map.terrain.terrain import prepare
+from shared_map.terrain import kept, prepared, terrain
+from shared_map.terrain.prepared import prepare
 from swarm.config.ground import CostConfig, HiddenConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
 
@@ -35,7 +35,7 @@ def built(monkeypatch: pytest.MonkeyPatch) -> list[Scenario]:
         made.append(scenario)
         return build(scenario, *rest)
 
-    monkeypatch.setattr(terrain, "build_terrain", noted)
+    monkeypatch.setattr(prepared, "build_terrain", noted)
     return made
 
 

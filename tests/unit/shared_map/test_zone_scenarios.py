@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 from launch_scripts.commands.terrain.terrain import app
 from launch_scripts.launcher.run_terrain import missing_files
 from shared_map.terrain.kept import kept_key
-from shared_map.terrain.terrain import build_terrain, build_truth, scenario_key
+from shared_map.terrain.prepared import scenario_key
+from shared_map.terrain.terrain import build_terrain, build_truth
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, TerrainError
