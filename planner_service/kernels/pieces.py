@@ -13,7 +13,9 @@ place.
 Arrays, beside those of `layout`; tiles are numbered row by row, `across` in a row; n is their number:
     piece    uint8    (n * CELLS,)  of each cell, tile by tile, the rows of one behind each other; NO_PIECE where
                                     there is no way, and beyond the grid
-    local    float64  (n * CELLS,)  s; from each cell to its piece's exit
+    rim      float64  (n * ROOM,)   s; from each cell on the border of a tile, by the name of a piece whose exit it
+                                    were, to its piece's exit. What cells further inside cost follows from the
+                                    parents, and is found where it is wanted: kept, it were most of a tree's memory
     total    float64  (n * ROOM, 4) s; of each piece, ROOM names a tile: TOTAL, from its exit to the root, inf of
                                     NO_PIECE and where there is no way; BEFORE, what that was by the last
                                     evaluation; LENGTH, from its exit to the next piece's
@@ -35,6 +37,7 @@ A tile is worked on with one cell around, WIDE ** 2 cells that are called its be
     names    int16    (ROOM,)       of each name, the cell of a tile
     cost     float64  (WIDE ** 2,)  s; what a cell costs
     own      float64  (WIDE ** 2,)  s; cell costs
+    inner    float64  (WIDE ** 2,)  s; from each cell to its piece's exit; 0 around the tile
     less     int32    (WIDE ** 2,)  whether a cell is offered less
     queue    int32    (WIDE ** 2,)  cells
     waits    uint8    (WIDE ** 2,)  whether a cell is in the queue; 0 between calls
@@ -75,7 +78,7 @@ MOST_SLACK = 8 * FINEST
 these and the rounding of sums."""
 
 Cells = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64], int]
-"""(parent, piece, local, root), root a padded cell."""
+"""(parent, piece, rim, root), root a padded cell."""
 Pieces = tuple[NDArray[np.float64], NDArray[np.int32]]
 """(total, hook)."""
 Tiles = tuple[
@@ -92,6 +95,7 @@ Bench = tuple[
     NDArray[np.int16],
     NDArray[np.float64],
     NDArray[np.float64],
+    NDArray[np.float64],
     NDArray[np.int32],
     NDArray[np.int32],
     NDArray[np.uint8],
@@ -99,22 +103,23 @@ Bench = tuple[
     NDArray[np.uint8],
     NDArray[np.int64],
 ]
-"""(names, cost, own, less, queue, waits, code, name, around)."""
+"""(names, cost, own, inner, less, queue, waits, code, name, around)."""
 
 LABELLED = "Tuple((u1[::1], u1[::1], f8[::1], i8))"
 PIECES = "Tuple((f8[:, ::1], i4[:, ::1]))"
 TILES = "Tuple((u1[::1], i4[::1], f8[::1], u1[::1], f8[:, ::1], f8[:, ::1], i8))"
-BENCH = "Tuple((i2[::1], f8[::1], f8[::1], i4[::1], i4[::1], u1[::1], u1[::1], u1[::1], i8[::1]))"
+BENCH = "Tuple((i2[::1], f8[::1], f8[::1], f8[::1], i4[::1], i4[::1], u1[::1], u1[::1], u1[::1], i8[::1]))"
 
 
 def make_bench() -> Bench:
-    """(names, cost, own, less, queue, waits, code, name, around)."""
+    """(names, cost, own, inner, less, queue, waits, code, name, around)."""
     tile = np.arange(CELLS, dtype=np.int16).reshape(SIDE, SIDE)
     names = np.zeros(ROOM, np.int16)
     names[: 4 * SIDE - 4] = np.concatenate((tile[0], tile[-1], tile[1:-1, 0], tile[1:-1, -1]))
     size = WIDE * WIDE
     return (
-        *(names, np.full(size, np.inf), np.full(size, np.inf), np.zeros(size, np.int32), np.empty(size, np.int32)),
+        *(names, np.full(size, np.inf), np.full(size, np.inf), np.zeros(size)),
+        *(np.zeros(size, np.int32), np.empty(size, np.int32)),
         *(np.zeros(size, np.uint8), np.full(size, NONE), np.full(size, NO_PIECE), step_offsets(WIDE)),
     )
 
@@ -182,31 +187,88 @@ def where_to(across, t, cell, code):
 
 
 @helper
-def relabel_tile(t, grid, labels, tiles, bench):
-    """Write which piece each cell of a tile is of, and what it costs inside the tile, by the parents. Cells behind
-    one that has no parent have no way. Breadth first from the exits, without a branch for each neighbour."""
-    cell_cost, _, stride, rule, _ = grid
-    parent, piece, local, root = labels
-    exits, many, span, _, _, _, across = tiles
-    names, cost, own, _, queue, _, code, name, around = bench
+def _load(t, grid, labels, across, bench):
+    """Put cell costs and parents of a tile on the bench. What its cells cost inside it is less than 0 until known,
+    and they have no name."""
+    cell_cost, _, stride, _, _ = grid
+    parent = labels[0]
+    _, _, own, inner, _, _, _, code, name, _ = bench
     origin, rows, cols = corner_of(grid, across, t)
-    for row in range(SIDE):
-        at = np.uint64((row + 1) * WIDE + 1)
-        for col in range(np.uint64(SIDE)):
-            code[at + col] = NONE
-            name[at + col] = NO_PIECE
-            cost[at + col] = 0.0
+    if rows < SIDE or cols < SIDE:
+        for i in range(own.size):
+            own[i] = np.inf
+            inner[i] = 0.0
+            code[i] = NONE
+            name[i] = NO_PIECE
     for row in range(rows):
         g, at = np.uint64(origin + row * stride), np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(cols)):
-            code[at + col] = parent[g + col]
             own[at + col] = cell_cost[g + col]
+        for col in range(np.uint64(cols)):
+            code[at + col] = parent[g + col]
+            name[at + col] = NO_PIECE
+        for col in range(np.uint64(cols)):
+            inner[at + col] = 0.0 if parent[g + col] == NONE else -1.0
+
+
+@helper
+def _follow(t, grid, across, bench):
+    """Costs inside a tile, and names, of all cells on the bench by their parents, where those of its exits are
+    known."""
+    rule = grid[3]
+    _, _, own, inner, _, queue, _, code, name, around = bench
+    _, rows, cols = corner_of(grid, across, t)
+    for row in range(rows):
+        for col in range(cols):
+            at = (row + 1) * WIDE + col + 1
+            steps = 0
+            while inner[at] < 0.0:
+                queue[steps] = at
+                steps += 1
+                at += around[code[at]]
+            for i in range(steps - 1, -1, -1):
+                u = at
+                at = np.int64(queue[i])
+                inner[at] = inner[u] + step_cost(rule, own[u], np.int64(code[at]))
+                name[at] = name[u]
+
+
+@helper
+def drive_tile(t, grid, labels, tiles, bench):
+    """Put a tile on the bench, with what each cell costs inside it."""
+    exits, many, across = tiles[0], tiles[1], tiles[6]
+    names, inner = bench[0], bench[3]
+    _load(t, grid, labels, across, bench)
+    for j in range(many[t]):
+        name = exits[t * ROOM + j]
+        if name != ROOT_PIECE:  # which has no parent
+            inner[on_bench(np.int64(names[name]))] = 0.0
+    _follow(t, grid, across, bench)
+
+
+@helper
+def write_rim(t, labels, bench):
+    """Keep what the cells on a tile's border cost inside it, from the bench."""
+    rim = labels[2]
+    names, inner = bench[0], bench[3]
+    for each in range(4 * SIDE - 4):
+        rim[t * ROOM + each] = inner[on_bench(np.int64(names[each]))]
+
+
+@helper
+def relabel_tile(t, grid, labels, tiles, bench):
+    """Write which piece each cell of a tile is of, and what it costs inside the tile, by the parents. Cells behind
+    one that has no parent have no way."""
+    _, piece, _, root = labels
+    exits, many, span, _, _, _, across = tiles
+    names, _, _, inner, _, _, _, code, name, _ = bench
+    _load(t, grid, labels, across, bench)
     count = 0
-    home, cell = tile_of(root, stride, across)
+    home, cell = tile_of(root, grid[2], across)
     if home == t:
         at = on_bench(cell)
         name[at] = ROOT_PIECE
-        queue[0] = at
+        inner[at] = 0.0
         exits[t * ROOM] = ROOT_PIECE
         count = 1
     for each in range(4 * SIDE - 4):
@@ -218,32 +280,19 @@ def relabel_tile(t, grid, labels, tiles, bench):
         other, _ = where_to(across, t, cell, way)
         if other != t:
             name[at] = each
-            queue[count] = at
+            inner[at] = 0.0
             exits[t * ROOM + count] = each
             count += 1
     many[t] = count
-    first, last = 0, count
-    while first < last:
-        at = np.int64(queue[first])
-        if first >= count:
-            way = np.int64(code[at])
-            u = at + around[way]
-            name[at] = name[u]
-            cost[at] = cost[u] + step_cost(rule, own[u], way)
-        first += 1
-        for way in range(8):
-            v = at + around[way]
-            queue[last] = v
-            last += code[v] == (way + 4) & 7
+    _follow(t, grid, across, bench)
     longest = 0.0
     for row in range(SIDE):
         i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(SIDE)):
             piece[i + col] = name[at + col]
-            local[i + col] = cost[at + col]
-    for each in range(count, last):
-        longest = max(longest, cost[queue[each]])
+            longest = max(longest, inner[at + col] if name[at + col] != NO_PIECE else 0.0)
     span[t] = longest
+    write_rim(t, labels, bench)
 
 
 @helper
@@ -270,7 +319,7 @@ def relabel_tiles(grid, labels, tiles, bench, which):
 def _hook_tile(t, grid, labels, pieces, tiles, names):
     """Write where the pieces of a tile lead, and how far that is."""
     cell_cost, offsets, stride, rule, _ = grid
-    parent, piece, local, _ = labels
+    parent, piece, rim, _ = labels
     total, hook = pieces
     exits, many, _, _, _, _, across = tiles
     origin, _, _ = corner_of(grid, across, t)
@@ -285,9 +334,8 @@ def _hook_tile(t, grid, labels, pieces, tiles, names):
         v = origin + (cell >> BITS) * stride + (cell & _INSIDE)
         way = np.int64(parent[v])
         other, beside = where_to(across, t, cell, way)
-        i = other * CELLS + beside
-        hook[y, HOOK] = other * ROOM + np.int64(piece[i])
-        total[y, LENGTH] = local[i] + step_cost(rule, cell_cost[v + offsets[way]], way)
+        hook[y, HOOK] = other * ROOM + np.int64(piece[other * CELLS + beside])
+        total[y, LENGTH] = rim[other * ROOM + name_of(beside)] + step_cost(rule, cell_cost[v + offsets[way]], way)
 
 
 @helper
@@ -406,13 +454,32 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
     return count
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, i8, i8[::1], f8[::1])")
-def costs_at(grid, labels, pieces, across, cells, costs):
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {BENCH}, i8, i8[::1], f8[::1])")
+def costs_at(grid, labels, pieces, bench, across, cells, costs):
     """costs := float64, s, of padded cells; inf where there is no way. Raises ValueError where one is no cell."""
-    _, piece, local, _ = labels
-    total = pieces[0]
-    stride = grid[2]
-    check_cells(cells, grid[0].size)
+    cell_cost, offsets, stride, rule, _ = grid
+    parent, piece, _, _ = labels
+    total, steps_s = pieces[0], bench[1]
+    check_cells(cells, cell_cost.size)
     for i in range(cells.size):
-        t, cell = tile_of(cells[i], stride, across)
-        costs[i] = total[t * ROOM + np.int64(piece[t * CELLS + cell]), TOTAL] + local[t * CELLS + cell]
+        v = cells[i]
+        t, cell = tile_of(v, stride, across)
+        costs[i] = total[t * ROOM + np.int64(piece[t * CELLS + cell]), TOTAL]
+        row, col = cell >> BITS, cell & _INSIDE
+        way = np.int64(parent[v])
+        steps = 0
+        while way != NONE:
+            down, right = moved(way)
+            row += down
+            col += right
+            if (row | col) & -SIDE:
+                break
+            v += offsets[way]
+            steps_s[steps] = step_cost(rule, cell_cost[v], way)
+            steps += 1
+            way = np.int64(parent[v])
+        # Summed from the exit, as elsewhere: the same numbers in another order are another sum.
+        inner = 0.0
+        for step in range(steps - 1, -1, -1):
+            inner += steps_s[step]
+        costs[i] += inner

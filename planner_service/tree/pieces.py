@@ -52,7 +52,7 @@ class PieceTree:
         self._across = -(-cost_grid.grid.cols // SIDE)
         self._count = count = -(-cost_grid.grid.rows // SIDE) * self._across
         self._piece = np.full(count * CELLS, NO_PIECE, np.uint8)
-        self._local = np.zeros(count * CELLS, np.float64)
+        self._rim = np.zeros(count * ROOM, np.float64)
         self._pieces = pieces.make_pieces(count)
         exits, many, span = np.zeros(count * ROOM, np.uint8), np.zeros(count, np.int32), np.zeros(count, np.float64)
         self._wanted = np.zeros(count, np.uint8)
@@ -70,7 +70,7 @@ class PieceTree:
 
     @property
     def _labels(self) -> pieces.Cells:
-        return self.parent, self._piece, self._local, self.cost_grid.pad(self.root)
+        return self.parent, self._piece, self._rim, self.cost_grid.pad(self.root)
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -116,8 +116,8 @@ class PieceTree:
         self.root = root
         changed = np.zeros(self._count, np.uint8)
         pieces_mend.merge_parents(
-            *(grid.padded, self._labels, self._pieces, self._across),
-            *(cost, parent, box, old_root, way, changed),
+            *(grid.padded, self._labels, self._pieces, self._tiles, self._bench),
+            *((cost, parent, box, way), old_root, changed),
         )
         self._relabel(np.flatnonzero(changed))
         self._moved = True
@@ -154,7 +154,8 @@ class PieceTree:
             self._add_up()
         costs = np.empty(cells.size, np.float64)
         pieces.costs_at(
-            self.cost_grid.padded, self._labels, self._pieces, self._across, np.ascontiguousarray(cells), costs
+            *(self.cost_grid.padded, self._labels, self._pieces, self._bench, self._across),
+            *(np.ascontiguousarray(cells), costs),
         )
         return costs
 
