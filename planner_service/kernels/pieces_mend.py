@@ -42,15 +42,14 @@ from planner_service.kernels.pieces import (
     TOTAL,
     WIDE,
     corner_of,
-    drive_tile,
     moved,
     name_of,
     on_bench,
     step_cost,
     tile_of,
     where_to,
-    write_rim,
 )
+from planner_service.kernels.pieces_labels import drive_tile, keep_tile
 
 _ONE = np.uint64(1)
 _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
@@ -146,7 +145,7 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
     """Have a cell of a tile, `at` on the bench, take the least that it is offered. Returns whether that is less."""
     _, _, stride, rule, corners = grid
     parent, piece, _, _ = labels
-    _, cost, own, inner, _, _, _, _, _, around = bench
+    cost, own, inner, around = bench[1], bench[2], bench[3], bench[9]
     across = tiles[6]
     best, by = np.inf, 0
     for code in range(8):
@@ -187,7 +186,7 @@ def _spread(t, grid, labels, tiles, bench, count, least):
     _, offsets, stride, rule, corners = grid
     parent, piece, _, _ = labels
     span, wanted, across = tiles[2], tiles[3], tiles[6]
-    _, cost, own, inner, _, queue, waits, _, _, around = bench
+    cost, own, inner, queue, waits, around = bench[1], bench[2], bench[3], bench[5], bench[6], bench[9]
     first = t * CELLS
     origin, rows, cols = corner_of(grid, across, t)
     head, tail = 0, count
@@ -235,7 +234,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     piece = labels[1]
     total = pieces[0]
     exits, many, span, _, _, _, across = tiles
-    names, cost, own, _, less, queue, waits, _, _, _ = bench
+    names, cost, own, less, queue, waits = bench[0], bench[1], bench[2], bench[4], bench[5], bench[6]
     _lay(t, grid, labels, total, tiles, bench)
     _, rows, cols = corner_of(grid, across, t)
     farthest = 0.0
@@ -263,7 +262,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     if count == 0:
         return False
     _spread(t, grid, labels, tiles, bench, count, least)
-    write_rim(t, labels, bench)
+    keep_tile(t, labels, bench)
     # Exits whose way leads on inside the tile by now are none any more; nobody leads over them.
     kept = 0
     for j in range(many[t]):
