@@ -104,6 +104,11 @@ class RosTypes:
             {name: ([], [(f"{part.lower()}_message", (Nodetype.NAME, f"{name}_{part}")) for part in parts])}
         )
 
+    @property
+    def names(self) -> list[str]:
+        """Of all types: messages, and the parts of services."""
+        return sorted(self._store.fielddefs)
+
     def hash_of(self, name: str) -> str:
         """RIHS01_... of a message or a service (of the service itself, not of its parts)."""
         return NO_HASH if self.distribution is Distribution.HUMBLE else self._store.hash_rihs01(name)
@@ -112,7 +117,7 @@ class RosTypes:
         """The definition of a message with those that it is made of, as recordings keep it."""
         return str(self._store.generate_msgdef(name, ros_version=2)[0])
 
-    def make(self, name: str, **fields: Any) -> Any:
+    def make(self, name: str, /, **fields: Any) -> Any:
         """A message of a type, such as make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=0.0)."""
         return self._store.types[name](**fields)
 
