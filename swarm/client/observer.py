@@ -150,9 +150,19 @@ class Observer:
 
     @property
     def marks(self) -> Mapping[int, Mark]:
-        """What is marked now, by cell: of several statements about a cell the newest."""
+        """What is marked now for all vehicles, by cell: of several statements about a cell the newest."""
+        return self._marks_of(0)
+
+    def marks_for(self, vehicle_class: str) -> Mapping[int, Mark]:
+        """What is marked now for one class of vehicles alone, as `marks`. Raises ConfigError if there is no such
+        class."""
+        return self._marks_of(self._session.class_number(vehicle_class, "vehicle_class"))
+
+    def _marks_of(self, class_number: int) -> Mapping[int, Mark]:
         with self._session.lock:
-            return marked(self._sets.values(), self._session.frame.grid, self._session.swarm_now_ns())
+            grid = self._session.frame.grid
+            sets = [each for (tile, _), each in self._sets.items() if grid.class_of_tile(tile)[0] == class_number]
+            return marked(sets, grid, self._session.swarm_now_ns())
 
     def on_note(self, callback: Callable[[Note], None]) -> None:
         """Call with every note, on the connection's thread."""
@@ -201,11 +211,10 @@ class Observer:
     def _hear_marks(self, marks: MarkSet) -> None:
         held = self._sets.get((marks.tile, marks.author))
         newer = held is None or (marks.epoch, marks.seq) > (held.epoch, held.seq)
-        if (
-            newer
-            and marks.tile < self._session.frame.grid.tiles
-            and (held is not None or len(self._sets) < _MOST_SETS)
-        ):
+        grid = self._session.frame.grid
+        class_number, place = grid.class_of_tile(marks.tile)
+        known = place < grid.tiles and class_number <= len(self._session.run.classes)
+        if newer and known and (held is not None or len(self._sets) < _MOST_SETS):
             self._sets[marks.tile, marks.author] = marks
 
     def _hear_followed(self, followed: Followed) -> None:
@@ -240,11 +249,11 @@ def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
 
 
 def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Mark]:
-    """The winning statements of these sets, by cell of the grid: as `shared_map.replication.merge` has it, the
-    newest wins, and of two with one stamp that of the larger author."""
+    """The winning statements of these sets, which are for the same vehicles, by cell of the grid: the newest wins,
+    and of two with one stamp that of the larger author, as `shared_map.replication.merge` has it."""
     won: dict[int, tuple[int, str, int, float]] = {}
     for each in sets:
-        row, col = divmod(each.tile, grid.tile_cols)
+        row, col = divmod(grid.class_of_tile(each.tile)[1], grid.tile_cols)
         corner_row, corner_col = row * TILE_CELLS, col * TILE_CELLS
         untils_ns = memoryview(each.untils_ns).cast("q") if each.untils_ns else None
         rows = zip(

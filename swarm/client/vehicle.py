@@ -276,6 +276,7 @@ class Vehicle:
         pace_s_per_m: float | None = None,
         clear: bool = False,
         for_s: float | None = None,
+        only_for: str | None = None,
     ) -> int:
         """State something about cells, for all vehicles and planners. Returns how many cells were stated.
 
@@ -284,8 +285,11 @@ class Vehicle:
         pace_s_per_m  they take so long to drive
         clear         they are as the map had them before
         for_s         the statement ends by itself; None: it stands until somebody states otherwise
+        only_for      one of the scenario's classes of vehicles, for which the statement counts before those for
+                      all, unless they are lethal. To the others it says nothing
 
-        Raises ConfigError on a cell outside, on a pace beyond its bounds, and unless exactly one thing is stated.
+        Raises ConfigError on a cell outside, on a pace beyond its bounds, on a class that there is not, and unless
+        exactly one thing is stated.
         """
         session = self._session
         if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
@@ -296,6 +300,7 @@ class Vehicle:
             raise session.refused(f"pace_s_per_m is {pace_s_per_m!r}, expected {PACE_LEAST:.4g} ... {PACE_MOST:g}")
         if for_s is not None and not 0 < for_s < 1e9:
             raise session.refused(f"for_s is {for_s!r}, expected seconds, more than 0")
+        class_number = 0 if only_for is None else session.class_number(only_for, "only_for")
         kind = MarkKind.LETHAL if lethal else MarkKind.CLEAR if clear else MarkKind.PACE
         with session.lock:
             session.check_open()
@@ -308,7 +313,8 @@ class Vehicle:
             if not self._marks.any:
                 session.bus.serve(MARKS, session.post, author=self._marks.author)
                 session.bus.subscribe(MARKS, session.post, author=self._marks.author)
-            self._put_marks(self._marks.state(once, kind, pace_s_per_m or 0.0, now_ns, until_ns))
+            sets = self._marks.state(once, kind, pace_s_per_m or 0.0, now_ns, until_ns, class_number)
+            self._put_marks(sets)
             self._digest_due_ns = 0
         return len(once)
 

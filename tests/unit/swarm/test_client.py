@@ -283,6 +283,38 @@ def test_what_is_marked_reaches_every_replica_and_the_keeper_and_ends_when_it_sh
     assert keeper is not None
 
 
+def test_what_is_marked_for_one_class_reaches_that_class_alone() -> None:
+    world = SwarmModel()
+    keeper, ear = world.keeper("0", KeeperStore(":memory:")), world.listener("ear")
+    program = Program(world)
+    watcher = program.swarm.observer()
+    rover = program.swarm.vehicle("rover")
+    last = MAP_GRID.cells - 1
+    rover.mark([0, last], lethal=True, only_for="truck")
+    rover.mark([0], pace_s_per_m=0.5)
+    world.run(1.0)
+    sink = ear.replica._cost_map
+    assert (sink.all_kinds[2, 0], sink.all_kinds[2, last], sink.kinds[0], sink.kinds[last]) == (
+        LETHAL,
+        LETHAL,
+        PACE,
+        CLEAR,
+    )
+    assert (sorted(watcher.marks), sorted(watcher.marks_for("truck"))) == ([0], [0, last])
+    assert not watcher.marks_for("walker")
+    rover.mark([0], clear=True, only_for="truck")
+    world.run(1.0)
+    assert (sink.all_kinds[2, 0], sink.kinds[0]) == (CLEAR, PACE)
+    rover.leave()
+    world.run(1.0)
+    late = world.listener("late")
+    world.run(2.0)
+    assert late.replica._cost_map.same(sink), "the keeper has it, though its author is gone"
+    with pytest.raises(ConfigError, match="only_for: there is no class 'boat' beside that of"):
+        rover.mark([1], lethal=True, only_for="boat")
+    assert keeper is not None
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_marks_reach_every_replica_though_messages_are_lost_and_repeated(seed: int) -> None:
     world = SwarmModel(LossyLinks(seed, dropped=0.4, repeated=0.3, jitter_ms=50))
