@@ -112,7 +112,7 @@ class RosTypes:
         """The definition of a message with those that it is made of, as recordings keep it."""
         return str(self._store.generate_msgdef(name, ros_version=2)[0])
 
-    def make(self, name: str, **fields: Any) -> Any:
+    def make(self, name: str, /, **fields: Any) -> Any:
         """A message of a type, such as make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=0.0)."""
         return self._store.types[name](**fields)
 
