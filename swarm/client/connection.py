@@ -83,6 +83,11 @@ class Swarm:
         return self._session.run
 
     @property
+    def now_ns(self) -> int:
+        """The time by the swarm's clocks, in ns since 1970: that by which marks begin and end."""
+        return self._session.swarm_now_ns()
+
+    @property
     def ended(self) -> SwarmError | None:
         """Why nothing can be said any more: it is closed, or another run is in the namespace. None while it can."""
         return self._session.ended
