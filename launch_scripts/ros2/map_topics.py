@@ -80,7 +80,7 @@ def corners(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         return points_m
     steps = np.diff(points_m, axis=0)
     turns = steps[1:, 0] * steps[:-1, 1] != steps[1:, 1] * steps[:-1, 0]
-    back = (steps[1:] * steps[:-1]).sum(axis=1) < 0
+    back = (steps[1:] * steps[:-1]).sum(axis=1) <= 0  # or it stands
     kept = np.concatenate([[True], turns | back, [True]])
     return np.asarray(points_m[kept])
 
