@@ -50,7 +50,7 @@ class Wheel:
         """The command that lets it stand, where it drives for us."""
         self._look(beat, now_ns)
         modes = self._kind.modes
-        if self.why or not self._taken or modes is None or beat.mode == modes.hold:
+        if self.why or not self._taken or modes is None or beat.mode != self.mode or self.mode == modes.hold:
             return None
         if self._holding and now_ns < self._due_ns:
             return None
