@@ -115,6 +115,17 @@ def test_one_that_drives_stays_a_body_when_its_link_is_lost_and_gets_its_target_
     assert [each for each in world.run(1.0) if isinstance(each, Follow)] == [Follow("t0")]
 
 
+def test_what_a_vehicle_had_before_its_link_was_lost_is_not_relied_on() -> None:
+    world = driving(MISSION)
+    world.speaks = False
+    world.run(8.0)
+    world.speaks = True
+    world.run(1.0)
+    world.adapter.hear_way(WITH_A_TURN)
+    world.run(5.0)
+    assert len(world.vehicle.missions) == 2
+
+
 def test_one_that_flies_is_withdrawn_when_its_link_is_lost() -> None:
     world = driving(Wishes("t0", altitude_m=30.0), Autopilot(type=COPTER))
     world.speaks = False
