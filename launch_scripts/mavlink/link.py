@@ -208,7 +208,8 @@ class SerialLink:
             time.sleep(within_s)
             return None
         try:
-            data: bytes = self._port.read(max(1, self._port.in_waiting))
+            data: bytes = self._port.read(1)  # waits for it
+            data += self._port.read(self._port.in_waiting)
         except OSError:
             self.close()
             return None

@@ -262,6 +262,14 @@ def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_anew() -> None:
     assert len(vehicle.missions) == 1
 
 
+def test_a_newer_route_waits_until_the_mission_in_flight_has_ended() -> None:
+    world = driving(MISSION, Autopilot(answers=False), seconds=0.1)
+    for number in range(7):
+        world.adapter.hear_way([TO_THE_EAST, WITH_A_TURN][number % 2])
+        world.run(1.0)
+    assert {each.items for each in of(world, MissionCount)} == {4}  # type: ignore[attr-defined]
+
+
 def test_a_refused_mission_says_the_result() -> None:
     world = driving(MISSION, Autopilot(answers=False), seconds=0.2)
     world.hear(MissionAnswered(13))
@@ -389,6 +397,14 @@ def test_ardupilot_gets_the_next_turn_each_second_and_its_own_place_when_the_swa
     world.adapter.hear_swarm(False)
     holds = [each for each in world.run(10.0) if isinstance(each, Setpoint)]
     assert places(holds) == [GRID.cell(40, 39)] * 3  # type: ignore[arg-type]
+
+
+def test_what_was_steered_before_the_link_was_lost_is_not_held_when_it_is_back() -> None:
+    world = driving(GUIDED)
+    world.speaks = False
+    world.run(8.0)
+    world.speaks = True
+    assert not [each for each in world.run(3.0) if isinstance(each, Setpoint)]
 
 
 def test_a_copter_in_guided_takes_off_once() -> None:
