@@ -18,7 +18,7 @@ from typer.exceptions import TyperException
 from launch_scripts.command_line import complete, usage
 from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
-from launch_scripts.commands import afterwards, before, chaos, query, roles
+from launch_scripts.commands import afterwards, before, chaos, mavlink, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
     AsJson,
@@ -295,6 +295,7 @@ app.add_typer(afterwards.app)
 app.add_typer(roles.app)
 app.add_typer(query.app)
 app.add_typer(orders.app)
+app.add_typer(mavlink.app)
 
 
 @cache

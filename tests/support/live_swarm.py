@@ -61,10 +61,10 @@ web_port = 0
 """
 
 
-def write_scenario(folder: Path, also: str = "") -> Path:
-    """A small scenario on a free port; `also` are further sections of it."""
+def write_scenario(folder: Path, also: str = "", text: str = _SCENARIO) -> Path:
+    """A small scenario on a free port; `also` are further sections of it, `text` is another one with `{port}`."""
     path = folder / "small.toml"
-    path.write_text(_SCENARIO.format(port=free_ports(1)[0]) + also)
+    path.write_text(text.format(port=free_ports(1)[0]) + also)
     return path
 
 
@@ -82,8 +82,8 @@ def swarm(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedPr
 class LiveSwarm:
     """`swarm up` under way, in a session of its own."""
 
-    def __init__(self, folder: Path, *options: object, also: str = "") -> None:
-        self.path = write_scenario(folder, also)
+    def __init__(self, folder: Path, *options: object, also: str = "", text: str = _SCENARIO) -> None:
+        self.path = write_scenario(folder, also, text)
         self.scenario: Scenario = load_scenario(self.path)
         self.output = folder / "output.txt"
         self.runs = folder / "runs"

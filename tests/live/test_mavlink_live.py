@@ -1,0 +1,206 @@
+"""`swarm mavlink` between a swarm of real processes and an autopilot that is not ours: MAVSDK's server side."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.live_swarm import SWARM, LiveSwarm
+from support.processes import eventually
+
+from launch_scripts.ports import free_ports
+from swarm.client import Swarm, connect
+
+pytest.importorskip("mavsdk", reason="mavsdk, an autopilot to speak to, is not installed")
+pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+pytestmark = pytest.mark.network
+
+VEHICLE = Path(__file__).parents[1] / "support" / "mavlink_vehicle.py"
+ROWS, COLS, CELL_M = 60, 80, 30.0
+TARGET, START = (12, 70), (40, 10)
+_SCENARIO = """
+name = "with-mavlink"
+seconds = 300
+
+[terrain]
+source = "ground.tif"
+level_is = "ground"
+
+[[targets]]
+name = "t"
+count = 1
+walk = "still"
+start = "cell:12,70"
+caught = "stay"
+
+[[groups]]
+vehicles = 1
+
+[network]
+listen = ["tcp/127.0.0.1:{port}"]
+connect = ["tcp/127.0.0.1:{port}"]
+
+[monitor]
+grpc_port = 0
+web_port = 0
+"""
+
+
+def write_ground(path: Path) -> None:
+    import rasterio
+    from rasterio.transform import from_origin
+
+    heights = np.add.outer(np.sin(np.arange(ROWS) / 5), np.cos(np.arange(COLS) / 7)).astype(np.float32) * 3 + 400
+    shape = {"height": ROWS, "width": COLS, "count": 1, "dtype": "float32", "crs": "EPSG:32616"}
+    with rasterio.open(
+        path, "w", driver="GTiff", transform=from_origin(740_000, 4_030_000, CELL_M, CELL_M), **shape
+    ) as file:
+        file.write(heights, 1)
+
+
+class Child:
+    """A process under way, whose output is read from a file."""
+
+    def __init__(self, output: Path, *command: object) -> None:
+        self.output = output
+        with output.open("w") as file:
+            self.process = subprocess.Popen(
+                list(map(str, command)), stdout=file, stderr=subprocess.STDOUT, env={**os.environ}
+            )
+
+    def said(self, pattern: str) -> re.Match[str] | None:
+        return re.search(pattern, self.output.read_text(), re.MULTILINE)
+
+    def waits_for(self, pattern: str, within_s: float = 20.0) -> None:
+        eventually(lambda: self.said(pattern), within_s, f"{pattern!r} in {self.output.name}")
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(10)
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
+    folder = tmp_path_factory.mktemp("mavlink")
+    write_ground(folder / "ground.tif")
+    live = LiveSwarm(folder, text=_SCENARIO)
+    try:
+        live.wait_until_up()
+        yield live
+    finally:
+        live.kill()
+
+
+@pytest.fixture
+def swarm(live: LiveSwarm) -> Iterator[Swarm]:
+    with connect(live.endpoint) as swarm:
+        yield swarm
+
+
+class Pair:
+    """A vehicle and its adapter, which may be started and killed one by one."""
+
+    def __init__(self, folder: Path, live: LiveSwarm, swarm: Swarm) -> None:
+        self.folder, self.live = folder, live
+        self.port = free_ports(1)[0]
+        frame = swarm.frame
+        self.start = frame.to_wgs84(*frame.centre_m(frame.grid.cell(*START)))
+        self.children: list[Child] = []
+
+    def vehicle(self) -> Child:
+        return self._start(sys.executable, VEHICLE, self.port, *self.start, 60)
+
+    def adapter(self, *options: object) -> Child:
+        where = ("--connect", self.live.endpoint, "--lost-after", 2)
+        return self._start(*SWARM, "mavlink", f"udpin:127.0.0.1:{self.port}", *where, *options)
+
+    def _start(self, *command: object) -> Child:
+        self.children.append(Child(self.folder / f"child{len(self.children)}.txt", *command))
+        return self.children[-1]
+
+
+@pytest.fixture
+def pair(tmp_path: Path, live: LiveSwarm, swarm: Swarm) -> Iterator[Pair]:
+    pair = Pair(tmp_path, live, swarm)
+    yield pair
+    for child in pair.children:
+        child.kill()
+
+
+def test_a_vehicle_that_only_speaks_mavlink_is_avoided_and_gone_when_its_adapter_is_killed(
+    pair: Pair, swarm: Swarm
+) -> None:
+    with swarm.observer() as watching:
+        pair.vehicle()
+        adapter = pair.adapter("--id", "rover")
+        eventually(lambda: "rover" in watching.vehicles, 20, "the rover in the swarm")
+        seen = watching.vehicles["rover"]
+        assert swarm.frame.cell(seen.x_m, seen.y_m) == swarm.frame.grid.cell(*START)
+        assert adapter.said("found an autopilot without modes")
+        assert not adapter.said("mission"), "nothing is driven without --target"
+        adapter.process.send_signal(signal.SIGKILL)
+        eventually(lambda: "rover" not in watching.vehicles, 5, "the end of the lease")
+
+
+def test_without_arm_a_mission_is_uploaded_and_the_vehicle_stays_where_it_is(pair: Pair, swarm: Swarm) -> None:
+    vehicle = pair.vehicle()
+    pair.adapter("--target", "t")
+    vehicle.waits_for(r"^mission \d+ ")
+    found = vehicle.said(r"^mission (\d+) (\S+) (\S+)")
+    assert found is not None
+    end = swarm.frame.cell(*swarm.frame.from_wgs84(float(found[2]), float(found[3])))
+    row, col = swarm.frame.grid.row_col(end)
+    assert max(abs(row - TARGET[0]), abs(col - TARGET[1])) <= 1, "its last item is the target's cell"
+    assert int(found[1]) < 40, "turns, not cells"
+    vehicle.waits_for(r"(?s)mission.*^at .*^at .*^at ")
+    assert not vehicle.said("armed")
+    assert len(set(re.findall(r"^at (.*)$", vehicle.output.read_text(), re.MULTILINE))) == 1
+
+
+def test_with_arm_it_drives_to_the_target_and_goes_on_after_either_side_was_killed(
+    pair: Pair, swarm: Swarm
+) -> None:
+    with swarm.observer() as watching:
+        first = pair.vehicle()
+        adapter = pair.adapter("--target", "t", "--arm", "--id", "rover")
+        first.waits_for("^armed 1")
+        x_m = swarm.frame.centre_m(swarm.frame.grid.cell(*START))[0]
+        eventually(lambda: watching.vehicles["rover"].x_m > x_m + 100, 20, "its driving")
+        first.kill()
+        adapter.waits_for("no heartbeat for 2 s: the vehicle is left to its own fail-safe")
+        second = pair.vehicle()
+        second.waits_for(r"^mission \d+ ")
+        adapter.waits_for("left alone from now on: it was disarmed, and not by us")
+        assert not second.said("armed")
+        adapter.kill()
+        pair.adapter("--target", "t", "--arm", "--id", "rover")
+        second.waits_for("^armed 1")
+        eventually(lambda: watching.vehicles["rover"].x_m > x_m + 100, 20, "its driving again")
+
+
+def test_ground_without_coordinates_is_one_sentence(tmp_path: Path) -> None:
+    live = LiveSwarm(tmp_path, "--only", "router", "--only", "keeper")
+    try:
+        live.wait_until_up()
+        child = Child(
+            tmp_path / "out.txt",
+            *SWARM,
+            "mavlink",
+            f"udpin:127.0.0.1:{free_ports(1)[0]}",
+            "--connect",
+            live.endpoint,
+        )
+        assert child.process.wait(30) == 2
+        assert child.output.read_text() == (
+            "swarm: swarm mavlink needs latitudes and longitudes: this terrain has no coordinates "
+            '(its crs is "local"): give x_m and y_m\n'
+        )
+    finally:
+        live.kill()

@@ -1,0 +1,140 @@
+"""An adapter's core between a vehicle and a swarm that a test plays, on a clock that it moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from launch_scripts.mavlink.adapter import Adapter, Wishes
+from launch_scripts.mavlink.autopilots import ARDUPILOT, PX4
+from launch_scripts.mavlink.messages import (
+    ARM_DISARM,
+    DO_SET_MODE,
+    MISSION_START,
+    Action,
+    Beat,
+    Command,
+    CommandAnswered,
+    Incoming,
+    ItemAsked,
+    MissionAnswered,
+    MissionCount,
+    MissionItem,
+    Position,
+    Tell,
+    Way,
+)
+from swarm.client import Frame
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+
+GRID = GridSpec(60, 80, 30.0, 740_000.0, 4_030_000.0, "EPSG:32616")
+FRAME = Frame(GRID)
+ROVER, COPTER, PLANE = 10, 2, 1
+MANUAL = 0
+TICK_NS = NS_PER_S // 20
+START = GRID.cell(40, 10)
+TO_THE_EAST = Way(tuple(GRID.centre_m(GRID.cell(40, col)) for col in range(10, 40)), "ok")
+WITH_A_TURN = Way((*TO_THE_EAST.points_m, *(GRID.centre_m(GRID.cell(row, 39)) for row in range(39, 20, -1))), "ok")
+NOWHERE = Way((), "unreachable")
+
+
+@dataclass
+class Autopilot:
+    """What is not simulated by the core: PX4 or ArduPilot as far as their protocols go.
+
+    answers  it takes part in missions and obeys commands; a test may take that away
+    """
+
+    autopilot: int = ARDUPILOT
+    type: int = ROVER
+    answers: bool = True
+    armed: bool = False
+    mode: int = MANUAL
+    cell: int = START
+    height_m: float = 0.0
+    missions: list[list[MissionItem]] = field(default_factory=list)
+    commands: list[Command] = field(default_factory=list)
+    _wanted: int = 0
+    _items: list[MissionItem] = field(default_factory=list)
+
+    def beat(self) -> Beat:
+        return Beat(self.autopilot, self.type, self.armed, self.mode)
+
+    def position(self) -> Position:
+        return Position(*FRAME.to_wgs84(*GRID.centre_m(self.cell)), self.height_m, 2.0, 1.0)
+
+    def hear(self, action: Action) -> list[Incoming]:
+        """Its answers."""
+        if isinstance(action, Command):
+            self.commands.append(action)
+        if not self.answers:
+            return []
+        match action:
+            case MissionCount(items=items):
+                self._wanted, self._items = items, []
+                return [ItemAsked(0)]
+            case MissionItem(seq=seq) if seq == len(self._items) and self._wanted:
+                self._items.append(action)
+                if len(self._items) < self._wanted:
+                    return [ItemAsked(len(self._items))]
+                self._wanted = 0
+                self.missions.append(self._items)
+                return [MissionAnswered(0)]
+            case Command(command=command, params=params):
+                return [CommandAnswered(command, self._obey(command, params))]
+        return []
+
+    def _obey(self, command: int, params: tuple[float, ...]) -> int:
+        if command == ARM_DISARM:
+            self.armed = params[0] == 1
+        elif command == DO_SET_MODE and self.autopilot == PX4:
+            self.mode = int(params[1]) << 16 | int(params[2]) << 24
+        elif command == DO_SET_MODE:
+            self.mode = int(params[1])
+        elif command != MISSION_START:
+            return 0
+        return 0
+
+
+class World:
+    """Ticks the core twenty times a second, with a heartbeat a second and ten positions while the vehicle speaks.
+
+    said  what the core has said, with when it did
+    """
+
+    def __init__(self, wishes: Wishes, vehicle: Autopilot | None = None) -> None:
+        self.vehicle = vehicle or Autopilot()
+        self.adapter = Adapter(FRAME, wishes)
+        self.wishes = wishes
+        self.now_ns = 100 * NS_PER_S
+        self.speaks = True
+        self.said: list[tuple[int, Action]] = []
+        self._ticks = 0
+
+    def run(self, seconds: float) -> list[Action]:
+        """What is said meanwhile."""
+        before = len(self.said)
+        for _ in range(round(seconds * NS_PER_S / TICK_NS)):
+            self.tick()
+        return [action for _, action in self.said[before:]]
+
+    def tick(self) -> list[Action]:
+        if self.speaks and self._ticks % 20 == 0:
+            self.hear(self.vehicle.beat())
+        if self.speaks and self._ticks % 2 == 0:
+            self.hear(self.vehicle.position())
+        self._ticks += 1
+        self.now_ns += TICK_NS
+        actions = self.adapter.tick(self.now_ns)
+        self.said += [(self.now_ns, action) for action in actions]
+        if self.speaks:
+            for action in actions:
+                for answer in self.vehicle.hear(action):
+                    self.hear(answer)
+        return actions
+
+    def hear(self, message: Incoming) -> None:
+        self.adapter.hear(message, self.now_ns)
+
+    def told(self) -> list[str]:
+        return [action.sentence for _, action in self.said if isinstance(action, Tell)]

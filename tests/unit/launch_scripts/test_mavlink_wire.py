@@ -1,0 +1,379 @@
+"""The door and the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import socket
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.effort import few
+
+from launch_scripts.mavlink.link import Link, open_link, read_address
+from launch_scripts.mavlink.messages import (
+    ABOVE_HOME,
+    ABOVE_TERRAIN,
+    ARM_DISARM,
+    NAV_WAYPOINT,
+    Beat,
+    Command,
+    CommandAnswered,
+    Heartbeat,
+    ItemAsked,
+    MissionAnswered,
+    MissionCancelled,
+    MissionCount,
+    MissionCurrent,
+    MissionItem,
+    Position,
+    Setpoint,
+    Warned,
+)
+from launch_scripts.mavlink.run import read_key
+from launch_scripts.mavlink.wire import AUTOPILOT, COMPID, SYSID, Wire
+from swarm.errors import BusError, ConfigError
+
+common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")
+KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+NOW_S = 1_700_000_000.0
+
+
+class Sender:
+    """Another system on the link, by pymavlink itself."""
+
+    def __init__(
+        self, sysid: int = 1, compid: int = AUTOPILOT, key: bytes | None = None, at_s: float = NOW_S
+    ) -> None:
+        self.mav = common.MAVLink(None, srcSystem=sysid, srcComponent=compid)
+        if key is not None:
+            self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
+            self.mav.signing.timestamp = int((at_s - 1_420_070_400) * 1e5)
+
+    def bytes_of(self, *messages: Any) -> bytes:
+        packed = []
+        for message in messages:
+            packed.append(bytes(message.pack(self.mav)))
+            self.mav.seq = (self.mav.seq + 1) % 256
+        return b"".join(packed)
+
+
+def beat(autopilot: int = 3, type: int = 10, mode: int = 4, base: int = 129) -> Any:
+    return common.MAVLink_heartbeat_message(type, autopilot, base, mode, 4, 3)
+
+
+def position(lat: int = 365_000_000, lon: int = -841_000_000, vx: int = 300, hdg: int = 9000) -> Any:
+    return common.MAVLink_global_position_int_message(1, lat, lon, 500_000, 12_500, vx, 400, 0, hdg)
+
+
+def wire(sysid: int | None = None, key: bytes | None = None) -> Wire:
+    return Wire(sysid, key, NOW_S)
+
+
+def read(door: Wire, data: bytes) -> list[Any]:
+    return door.read(data, whole=True)
+
+
+# --- in -----------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_vehicle_says_is_read_with_its_units() -> None:
+    said = Sender().bytes_of(
+        beat(),
+        position(),
+        position(hdg=65535),
+        common.MAVLink_mission_request_int_message(SYSID, COMPID, 3),
+        common.MAVLink_mission_request_message(SYSID, COMPID, 4),
+        common.MAVLink_mission_ack_message(SYSID, COMPID, 0),
+        common.MAVLink_command_ack_message(ARM_DISARM, 4),
+        common.MAVLink_statustext_message(2, b"PreArm: \x1b[2J no fix"),
+        common.MAVLink_statustext_message(6, b"only information"),
+        common.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0),
+    )
+    place = Position(36.5, -84.1, 12.5, 5.0, math.pi / 2)
+    assert read(wire(), said) == [
+        Beat(3, 10, True, 4), place, Position(36.5, -84.1, 12.5, 5.0, None), ItemAsked(3), ItemAsked(4),
+        MissionAnswered(0), CommandAnswered(ARM_DISARM, 4), Warned("PreArm: [2J no fix"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        position(lat=0, lon=0),
+        position(lat=900_000_001),
+        position(lon=-1_800_000_001),
+        position(lat=2**31 - 1),
+        beat(autopilot=8),
+        common.MAVLink_mission_request_int_message(SYSID, 1, 3),
+        common.MAVLink_mission_request_int_message(255, COMPID, 3),
+        common.MAVLink_mission_ack_message(SYSID, COMPID, 0, 1),
+        common.MAVLink_command_ack_message(ARM_DISARM, 0, 0, 0, 255, 190),
+        common.MAVLink_statustext_message(2, b"\x01\x02"),
+    ],
+)
+def test_what_makes_no_sense_or_is_not_to_us_is_counted_and_not_heard(message: Any) -> None:
+    door, sender = wire(), Sender()
+    read(door, sender.bytes_of(beat()))
+    assert read(door, sender.bytes_of(message)) == []
+    assert door.counts["senseless"] == 1
+
+
+def test_the_first_autopilot_is_the_vehicle_and_all_others_are_not_heard() -> None:
+    door = wire()
+    assert read(door, Sender(255, 190).bytes_of(beat(autopilot=8, type=6))) == [], "a ground station"
+    assert read(door, Sender(7, 100).bytes_of(beat())) == [], "a camera"
+    assert read(door, Sender(7).bytes_of(position())) == [], "nobody's heartbeat was heard yet"
+    assert door.vehicle is None
+    assert len(read(door, Sender(7).bytes_of(beat()))) == 1
+    assert door.vehicle == 7
+    assert read(door, Sender(8).bytes_of(beat(), position())) == []
+    assert read(wire(8), Sender(7).bytes_of(beat())) == []
+    assert door.counts["of_others"] == 5
+
+
+def test_messages_that_are_cut_anywhere_are_read_from_a_stream_and_not_from_datagrams() -> None:
+    said = Sender().bytes_of(beat(), position(), beat())
+    for cut in range(len(said)):
+        door = wire()
+        assert len([*door.read(said[:cut], whole=False), *door.read(said[cut:], whole=False)]) == 3
+    door = wire()
+    assert len([*door.read(said[:30], whole=True), *door.read(said[30:], whole=True)]) < 3
+
+
+@settings(max_examples=few(300), deadline=None)
+@given(st.lists(st.binary(max_size=400), max_size=8), st.booleans(), st.sampled_from([None, KEY]))
+def test_any_bytes_pass_the_door_as_nothing_and_a_vehicle_is_heard_after_them(
+    pieces: list[bytes], whole: bool, key: bytes | None
+) -> None:
+    door = wire(key=key)
+    for piece in pieces:
+        door.read(piece, whole=whole)
+        assert len(door._mav.buf) <= 512
+    # What looked like the begin of a message takes up to 280 bytes of what follows with it.
+    sender = Sender(key=key)
+    heard = [each for _ in range(40) for each in door.read(sender.bytes_of(beat()), whole=whole)]
+    assert heard
+    assert set(heard) == {Beat(3, 10, True, 4)}
+
+
+# --- signatures ---------------------------------------------------------------------------------------------------
+
+
+def test_with_a_key_only_what_is_signed_by_it_is_heard() -> None:
+    door = wire(key=KEY)
+    assert read(door, Sender().bytes_of(beat())) == []
+    assert read(door, Sender(key=OTHER_KEY).bytes_of(beat())) == []
+    signed = Sender(key=KEY, at_s=NOW_S + 1).bytes_of(beat())
+    assert len(read(door, signed)) == 1
+    assert read(door, signed) == [], "said again by somebody who has heard it"
+
+
+def test_a_forged_signature_of_a_late_time_shuts_nobody_out() -> None:
+    door, sender = wire(key=KEY), Sender(key=KEY)
+    assert len(read(door, sender.bytes_of(beat()))) == 1
+    read(door, Sender(key=OTHER_KEY, at_s=NOW_S + 1e6).bytes_of(beat()))
+    assert len(read(door, sender.bytes_of(beat()))) == 1
+
+
+def test_what_we_say_is_signed() -> None:
+    vehicle = common.MAVLink(None)
+    vehicle.signing.secret_key, vehicle.signing.timestamp = KEY, int((NOW_S - 1_420_070_400) * 1e5)
+    (heard,) = vehicle.parse_buffer(wire(key=KEY).write(Heartbeat()))
+    assert heard.get_type() == "HEARTBEAT"
+    assert heard._signed
+
+
+def test_a_key_is_64_digits(tmp_path: Path) -> None:
+    file = tmp_path / "key"
+    file.write_text(KEY.hex() + "\n")
+    assert read_key(file) == KEY
+    for text in ("", "zz", "ab" * 31, "é" * 64):
+        file.write_text(text)
+        with pytest.raises(ConfigError, match="holds no key, expected 64 hexadecimal digits"):
+            read_key(file)
+    with pytest.raises(ConfigError, match="cannot read"):
+        read_key(tmp_path / "none")
+
+
+@settings(max_examples=few(200), deadline=None)
+@given(st.binary(min_size=1, max_size=20), st.integers(0, 60), st.sampled_from([beat(), position()]))
+def test_a_signed_message_that_was_changed_on_its_way_is_not_heard(other: bytes, at: int, message: Any) -> None:
+    door, sender = wire(key=KEY), Sender(key=KEY)
+    read(door, sender.bytes_of(beat()))
+    said = sender.bytes_of(message)
+    changed = (said[:at] + other + said[at + len(other) :])[: len(said)]
+    assert len(read(door, changed)) == (changed == said)
+
+
+# --- out ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_said_to_a_vehicle_has_its_number_and_the_units_of_mavlink() -> None:
+    door, vehicle = wire(9), common.MAVLink(None)
+    said = [
+        Heartbeat(), Command(ARM_DISARM, (1,)), MissionCount(2),
+        MissionItem(1, NAV_WAYPOINT, ABOVE_TERRAIN, 36.5, -84.1234567, 30.0, current=True),
+        MissionCurrent(1), MissionCancelled(), Setpoint(ABOVE_HOME, 36.5, -84.1, None),
+        Setpoint(ABOVE_HOME, 36.5, -84.1, 30.0),
+    ]  # fmt: skip
+    heard = [vehicle.parse_buffer(door.write(message))[0] for message in said]
+    assert {(each.get_srcSystem(), each.get_srcComponent()) for each in heard} == {(SYSID, COMPID)}
+    assert [each._header.seq for each in heard] == list(range(8))
+    for each in heard[1:]:
+        assert (each.target_system, each.target_component) == (9, AUTOPILOT)
+    first, command, count, item, current, cancelled, on_ground, in_air = heard
+    assert (first.type, first.autopilot) == (18, 8)
+    assert (command.command, command.param1, command.param7) == (ARM_DISARM, 1.0, 0.0)
+    assert (count.count, current.seq, cancelled.type) == (2, 1, 15)
+    assert (item.seq, item.frame, item.x, item.y, item.z, item.current) == (
+        1, ABOVE_TERRAIN, 365_000_000, -841_234_567, 30.0, 1,
+    )  # fmt: skip
+    assert math.isnan(item.param4)
+    assert (on_ground.type_mask, in_air.type_mask, in_air.alt) == (0x0DFC, 0x0DF8, 30.0)
+
+
+def test_to_nobody_only_heartbeats_are_said() -> None:
+    assert wire().write(Heartbeat())
+    assert wire().write(MissionCount(3)) == b""
+
+
+# --- links --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14550"),
+        ("udpout:10.0.0.2:14550", "udpout:10.0.0.2:14550"),
+        ("tcp:localhost:5760", "tcp:localhost:5760"),
+        ("serial:/dev/ttyACM0", "serial:/dev/ttyACM0:57600"),
+        ("serial:/dev/ttyACM0:921600", "serial:/dev/ttyACM0:921600"),
+        ("udpin:[::1]:14550", "udpin:::1:14550"),
+    ],
+)
+def test_addresses_are_read(text: str, shown: str) -> None:
+    assert str(read_address(text)) == shown
+
+
+@pytest.mark.parametrize(
+    "text", ["", "14550", "udp:1.2.3.4:5", "udpin:1.2.3.4", "udpin:host:0", "udpin:host:65536", "tcp::5", "serial:",
+             "serial:/dev/x:fast", "udpin:a:b:5", "log.bin"],
+)  # fmt: skip
+def test_what_is_no_address_is_one_sentence(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"LINK: found .* expected udpin:HOST:PORT"):
+        read_address(text)
+
+
+@contextlib.contextmanager
+def opened(text: str) -> Iterator[Link]:
+    link = open_link(read_address(text))
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def within(link: Link, turns: int = 100) -> bytes:
+    """What it brings first."""
+    for _ in range(turns):
+        if data := link.read(0.05):
+            return data
+    raise AssertionError("nothing came")
+
+
+@pytest.fixture
+def peer() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.bind(("127.0.0.1", 0))
+        made.settimeout(5.0)
+        yield made
+
+
+@pytest.mark.network
+def test_udp_answers_the_vehicle_and_no_stranger(peer: socket.socket) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with opened(f"udpin:127.0.0.1:{port}") as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        link.write(b"to nobody")
+        peer.sendto(b"vehicle", ("127.0.0.1", port))
+        assert within(link) == b"vehicle"
+        link.answer_last()
+        stranger.sendto(b"stranger", ("127.0.0.1", port))
+        assert within(link) == b"stranger"
+        link.write(b"answer")
+        assert peer.recv(100) == b"answer"
+        with pytest.raises(BusError, match=f"cannot listen at udpin:127.0.0.1:{port}: Address already in use"):
+            open_link(read_address(f"udpin:127.0.0.1:{port}"))
+
+
+@pytest.mark.network
+def test_udp_out_speaks_first_and_survives_that_nobody_is_there(peer: socket.socket) -> None:
+    with opened(f"udpout:127.0.0.1:{peer.getsockname()[1]}") as link:
+        link.write(b"hello")
+        data, back = peer.recvfrom(100)
+        peer.sendto(data * 2, back)
+        assert within(link) == b"hellohello"
+        peer.close()
+        for _ in range(3):
+            link.write(b"anybody?")
+            assert link.read(0.01) is None
+
+
+@pytest.mark.network
+def test_tcp_connects_again_when_its_peer_has_gone_and_is_back() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(10.0)
+        address = server.getsockname()
+        with opened(f"tcp:127.0.0.1:{address[1]}") as link:
+            for word in (b"first", b"second"):
+                assert link.read(0.0) is None
+                connection, _ = server.accept()
+                connection.sendall(word)
+                assert within(link) == word
+                link.write(b"back")
+                assert connection.recv(10) == b"back"
+                connection.close()
+                assert link.read(0.2) is None
+                for _ in range(60):  # a second passes before it tries again
+                    link.read(0.02)
+    link.write(b"closed")
+
+
+@pytest.mark.network
+def test_tcp_to_nobody_waits_and_says_nothing() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with opened(f"tcp:127.0.0.1:{port}") as link:
+        for _ in range(5):
+            link.write(b"anybody?")
+            assert link.read(0.01) is None
+
+
+def test_a_serial_port_is_read_and_written() -> None:
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    ours, theirs = os.openpty()
+    tty.setraw(ours)
+    try:
+        with opened(f"serial:{os.ttyname(theirs)}:57600") as link:
+            os.write(ours, b"vehicle")
+            assert within(link) == b"vehicle"
+            link.write(b"answer")
+            assert os.read(ours, 100) == b"answer"
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    with pytest.raises(BusError, match="cannot open serial:/dev/nothing:57600"):
+        open_link(read_address("serial:/dev/nothing"))
+
+
+def test_an_unknown_host_is_one_sentence() -> None:
+    with pytest.raises(ConfigError, match="LINK: there is no host"):
+        open_link(read_address("tcp:no such host:5760"))
