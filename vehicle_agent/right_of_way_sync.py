@@ -20,6 +20,7 @@ from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Sta
 from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
+from vehicle_agent.traffic.own_time import OwnTime
 from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
@@ -28,7 +29,8 @@ _FIRST_ANSWERS_S = 0.3
 """A new life waits so long for the others' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
-_PROMISE_TIMEOUT_S = 0.5
+_PROMISE_TIMEOUT_S = 5.0
+"""A member that is late answers late, and its promise counts until we claim anew: by epoch, so it does no harm."""
 _MOST_REFUSALS_TOLD = 100
 _RESERVE_NS = NS_PER_S
 _SILENT_AGAIN_NS = 60 * NS_PER_S
@@ -70,6 +72,8 @@ class RightOfWaySync:
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
+        self._own_time = OwnTime(int(NS_PER_S / setup.scenario.vehicles.tick_hz))
+        """What the core is told. When to ask, and when to tell people, goes by the time of the wall."""
         self._asking = False
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
@@ -94,21 +98,21 @@ class RightOfWaySync:
 
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
-        core = self.core
+        core, own_ns = self.core, self._own_time.at(now_ns)
         core.silent = not self._store.ready
         match event:
             case Heard(message=Table() as table):
-                self._perform(core.hear_table(table, now_ns))
+                self._perform(core.hear_table(table, own_ns))
             case Heard(message=Stored() as stored):
-                self._perform(core.hear_stored(stored, now_ns))
+                self._perform(core.hear_stored(stored, own_ns))
             case Asked(topic=topic, request=Claim() as claim) if topic is TABLE:
-                self._hear_claim(event, claim.epoch, now_ns)
+                self._hear_claim(event, claim.epoch, own_ns)
                 event.end()
             case Asked(topic=topic, request=KnownRequest() as request) if topic is KNOWN:
                 self._answer(event, core.answer_known(request))
                 event.end()
             case Replied(topic=topic, fields=fields, tag=tag, message=Table() as table) if topic is TABLE:
-                core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, now_ns)
+                core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, own_ns)
             case Replied(message=Known() as known):
                 self._perform(core.hear_known(known))
             case Appeared(peer=Peer(role="agent") as peer):
@@ -127,20 +131,20 @@ class RightOfWaySync:
         """Take in what wardens have granted since the last time. Called before vehicles drive."""
         for heard in self._bus.collected(GRANTED):
             assert isinstance(heard.message, Granted)
-            self._placed(self.core.hear_granted(heard.message, now_ns))
+            self._placed(self.core.hear_granted(heard.message, self._own_time.at(now_ns)))
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
+        own_ns = self._own_time.tick(now_ns)
         if not self._asking and not self.core.settled and now_ns >= self._ask_due_ns:
             self._ask_known()
         self._look_after_store(now_ns)
         for heard in self._bus.collected(STANDING):
             assert isinstance(heard.message, Standing)
-            self.core.hear_standing(heard.message, now_ns)
-        self._perform(self.core.tick(wishes, now_ns))
-        self._tell_unled(now_ns)
+            self.core.hear_standing(heard.message, own_ns)
+        self._perform(self.core.tick(wishes, own_ns))
+        self._tell_unled(self.core.unled(own_ns), now_ns)
 
-    def _tell_unled(self, now_ns: int) -> None:
-        unled = self.core.unled(now_ns)
+    def _tell_unled(self, unled: Mapping[int, str], now_ns: int) -> None:
         self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
         for plot, text in unled.items():
             if now_ns >= self._unled_due_ns[plot]:
@@ -177,13 +181,13 @@ class RightOfWaySync:
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
 
-    def _hear_claim(self, asked: Asked, epoch: int, now_ns: int) -> None:
+    def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
         """A claim is answered to the member whose epoch it is, under its own name."""
         if not asked.fields["plot"].isdecimal():
             return
         plot, plots = int(asked.fields["plot"]), self.core.plots
         if plot in plots.all and asked.fields["member"] == plots.warden(plot, epoch):
-            self._answer(asked, self.core.hear_claim(plot, epoch, now_ns))
+            self._answer(asked, self.core.hear_claim(plot, epoch, own_ns))
 
     def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:
         """Perform what has to be done first, and answer with the last."""

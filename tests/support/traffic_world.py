@@ -17,6 +17,7 @@ from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Stored, Table
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
+from vehicle_agent.traffic.own_time import OwnTime
 from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 MS = NS_PER_S // 1000
@@ -26,7 +27,11 @@ LOOK_AHEAD = 3
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong until `quiet_s`: shares of messages, and events a second in the whole swarm."""
+    """What goes wrong until `quiet_s`: shares of messages, and events a second in the whole swarm.
+
+    tick_ns  how often processes tick, all the time. Late ones hear what was said at their ticks only, and all go by
+             their own time, as agents do; otherwise by clocks that leap, which must do no harm either
+    """
 
     loss: float = 0.0
     repeat: float = 0.0
@@ -38,6 +43,7 @@ class Faults:
     leaps: float = 0.0
     twins: float = 0.0
     quiet_s: float = 0.0
+    tick_ns: int = TICK_NS
 
 
 @dataclass
@@ -60,6 +66,7 @@ class Process:
         self.vehicles = list(world.spawns.get(agent, ()))
         # A clock of its own: it may be years off, and leaps.
         self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
+        self.own_time = OwnTime(TICK_NS)
         self.ages: dict[str, int] = {}
         self.tokens: set[Peer] = set()
 
@@ -69,7 +76,8 @@ class Process:
 
     @property
     def now_ns(self) -> int:
-        return self.world.now_ns + self.offset_ns
+        now_ns = self.world.now_ns + self.offset_ns
+        return self.own_time.at(now_ns) if self.world.is_late else now_ns
 
     @property
     def settled(self) -> bool:
@@ -136,6 +144,7 @@ class Process:
 
     def tick(self) -> None:
         holdings = self.rights.holdings
+        self.own_time.tick(self.world.now_ns + self.offset_ns)
         self.see_tokens()
         wishes = {}
         if holdings.life and not holdings.replaced:
@@ -197,6 +206,7 @@ class TrafficWorld:
     ) -> None:
         self.chance = random.Random(seed)
         self.faults = faults
+        self.is_late = faults.tick_ns > TICK_NS
         self.now_ns = 0
         self.grid = GridSpec(size, size, 1.0)
         names = [f"a{k}" for k in range(agents)]
@@ -356,9 +366,13 @@ class TrafficWorld:
 
         def tick() -> None:
             if process.alive:
+                if self.is_late:
+                    self.wake(process)
                 if process.hung is None:
                     process.tick()
-                self.at(TICK_NS, tick)
+                if self.is_late:
+                    process.hung = []
+                self.at(self.faults.tick_ns, tick)
 
         self.at(self.chance.randrange(TICK_NS), tick)
 
