@@ -104,6 +104,11 @@ class RosTypes:
             {name: ([], [(f"{part.lower()}_message", (Nodetype.NAME, f"{name}_{part}")) for part in parts])}
         )
 
+    @property
+    def names(self) -> list[str]:
+        """Of all types: messages, and the parts of services."""
+        return sorted(self._store.fielddefs)
+
     def hash_of(self, name: str) -> str:
         """RIHS01_... of a message or a service (of the service itself, not of its parts)."""
         return NO_HASH if self.distribution is Distribution.HUMBLE else self._store.hash_rihs01(name)
