@@ -85,9 +85,12 @@ def export(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
     gif: Annotated[bool, typer.Option("--gif", help="Write a moving picture of the run instead.")] = False,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Write a recording with ROS 2 messages instead, for Foxglove.")
+    ] = False,
     runs: Runs = Path("runs"),
 ) -> None:
-    """Write what a run has left for a GIS, a spreadsheet, or as a moving picture.
+    """Write what a run has left for a GIS, a spreadsheet, Foxglove, or as a moving picture.
 
     Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
     their certified gaps, and marks as areas that say the same. GeoJSON and the columns lat and lon of CSV are in
@@ -98,10 +101,12 @@ def export(
     swarm export LAST --format gpkg --what tracks --what marks
 
     swarm export LAST --gif
+
+    swarm export LAST --mcap
     """
     from launch_scripts.commands.report import export_from
 
-    export_from(run, runs, what or (), format, out, force, gif)
+    export_from(run, runs, what or (), format, out, force, gif, mcap)
 
 
 @app.command(rich_help_panel=LEFT)

@@ -18,7 +18,14 @@ def write_report_page(run: str, runs: Path) -> None:
 
 
 def export_from(
-    run: str, runs: Path, what: Sequence[str], format: str, out: Path | None, force: bool, gif: bool
+    run: str,
+    runs: Path,
+    what: Sequence[str],
+    format: str,
+    out: Path | None,
+    force: bool,
+    gif: bool,
+    mcap: bool,
 ) -> None:
     """Write files of a run. Raises ConfigError or StoreError in one sentence."""
     from launch_scripts.report.geo.run_export import FORMATS, WHAT, export_run
@@ -27,7 +34,14 @@ def export_from(
         for each in given:
             if each not in allowed:
                 raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
+    if gif and mcap:
+        raise ConfigError("--gif and --mcap: found both, expected one of them")
     folder = find_run(run, runs)
+    if mcap:
+        from launch_scripts.report.foxglove.mcap_export import export_mcap
+
+        print(export_mcap(folder, out, force))
+        return
     if gif:
         from launch_scripts.report.pictures.animation import export_gif
 

@@ -1,4 +1,4 @@
-"""Writes what a run leaves behind: `report.json`, tables, `tracks.npz`, `report.png`, `report.html`."""
+"""Writes what a run leaves behind: `report.json`, tables, `tracks.npz`, `ground.npz`, pictures, `report.html`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.report.files import replacing, write_file
 from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, tracks_in
+from launch_scripts.report.ground_pace import GROUND_PACE_FILE, packed_ground
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.result_tables import TABLES, csv_of
 from launch_scripts.report.results.run_folder import REPORT_FILE, ended
@@ -85,6 +86,7 @@ def write_report(
         **{file: partial(csv_of, section, report) for section, (file, _) in TABLES.items()},
         TRACKS_FILE: lambda: tracks,
         GROUND_FILE: ground.webp,
+        GROUND_PACE_FILE: lambda: packed_ground(terrain, ground.level),
     }
     factors = factors_in(recorder.observed.learned_words())
     if (factors != 1).any():

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.report.files import replacing
-from launch_scripts.report.geo.geo_shapes import Ring, areas_of, line, point, polygon
+from launch_scripts.report.geo.geo_shapes import Ring, areas_of, line, point, polygon, turns_of
 from launch_scripts.report.geo.track_file import RunTracks, Track
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.places import MapFrame, middles_of
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 from swarm.wire.statements import MarkKind
@@ -99,11 +99,7 @@ def route_layer(tracks: RunTracks) -> Layer:
          "length_m": "real"},
     )  # fmt: skip
     for route in tracks.routes:
-        rows, cols = np.divmod(route.cells, grid.cols)
-        turns = np.ones(len(rows), bool)
-        turns[1:-1] = (np.diff(rows, 2) != 0) | (np.diff(cols, 2) != 0)
-        x_m = grid.west_m + (cols[turns] + 0.5) * grid.resolution_m
-        y_m = grid.north_m - (rows[turns] + 0.5) * grid.resolution_m
+        x_m, y_m = middles_of(grid, turns_of(route.cells, grid))
         length_m = float(np.hypot(np.diff(x_m), np.diff(y_m)).sum())
         if length_m > 0:
             values: dict[str, Value] = {

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.terrain.places import MapFrame
+from swarm.grid import GridSpec
 
 Ring = NDArray[np.float64]
 """float64 (n, 2): x and y, or longitude and latitude; the last point is the first."""
@@ -74,3 +75,11 @@ def point(there: Ring, frame: MapFrame) -> dict[str, Any]:
 
 def _rounded(points: Ring, frame: MapFrame) -> Any:
     return points.round(3 if frame.grid.crs == "local" else 8).tolist()
+
+
+def turns_of(cells: NDArray[np.int64], grid: GridSpec) -> NDArray[np.int64]:
+    """The cells of a route at which it turns, and both ends: int64 (n,)."""
+    rows, cols = np.divmod(cells, grid.cols)
+    turns = np.ones(len(cells), np.bool_)
+    turns[1:-1] = (np.diff(rows, 2) != 0) | (np.diff(cols, 2) != 0)
+    return cells[turns]

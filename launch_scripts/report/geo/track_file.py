@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import struct
-import zipfile
-import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,28 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report.array_archive import arrays_in, packed
 from launch_scripts.report.latest_state import MarkedCells
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import StoreError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 from swarm.wire.messages.vehicles import Followed
-from swarm.wire.statements import MarkKind
+from swarm.wire.statements import STAMP_LIMIT_NS, MarkKind
 
 _MARKS: dict[str, Any] = {"cells": np.int64, "kinds": np.uint8, "paces": np.float32, "stamps_ns": np.int64}
 """Columns of marks."""
 _STEP_ROWS, _STEP_COLS = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
 TRACKS_FILE = "tracks.npz"
-_DAMAGES = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, NotImplementedError, SyntaxError),
-    *(MemoryError, OverflowError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
-"""What NumPy and zipfile raise on bytes that are no archive of arrays."""
-_MOST_BYTES = 1 << 30
-"""Of all arrays, unpacked."""
 _LEAST_M, _FARTHEST_M = 1e-4, 1e12
 """Cells of no terrain are so small, and no message places anything so far away."""
 
@@ -84,13 +72,18 @@ class RunTracks:
     """At the end; none in a file of an older build."""
     routes: list[GivenRoute]
     """In order of time; none in a file of an older build."""
+    began_ns: int | None = None
+    """From when the time of the run counts, as its times do; None in a file of an older build."""
 
 
 def packed_tracks(recorder: Recorder) -> bytes:
     """The content of the file."""
     grid = recorder.grid
     began_ns = recorder.model.began_ns or 0
-    arrays: dict[str, NDArray[Any]] = {"grid": np.array(json.dumps(asdict(grid)))}
+    arrays: dict[str, NDArray[Any]] = {
+        "grid": np.array(json.dumps(asdict(grid))),
+        "began_ns": np.array(began_ns, np.int64),
+    }
     for name, tracks in (("vehicles", recorder.vehicle_tracks), ("targets", recorder.target_tracks)):
         arrays |= {f"{name}_{column}": array for column, array in _columns(tracks).items()}
     captures = list(recorder.captures)
@@ -101,9 +94,7 @@ def packed_tracks(recorder: Recorder) -> bytes:
     marked = recorder.marked()
     arrays |= {f"marks_{name}": getattr(marked, name) for name in _MARKS}
     arrays |= _route_columns([(each.time_ns, each.route) for each in recorder.routes.kept])
-    file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **arrays)
-    return file.getvalue()
+    return packed(arrays)
 
 
 def _route_columns(routes: list[tuple[int, Followed]]) -> dict[str, NDArray[Any]]:
@@ -142,24 +133,18 @@ def read_tracks(path: Path) -> RunTracks:
 
 def tracks_in(content: bytes, path: Path) -> RunTracks:
     """What `packed_tracks` packed. Raises StoreError if it is damaged; `path` is how the sentence calls it."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            unpacked = sum(each.file_size for each in archive.infolist())
-        if unpacked > _MOST_BYTES:
-            raise ValueError(f"{unpacked} bytes when unpacked, at most {_MOST_BYTES}")
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            grid = _grid(json.loads(str(arrays["grid"])))
-            vehicles, targets = (_tracks(arrays, name, grid) for name in ("vehicles", "targets"))
-            captured_ns, captured = _whole(arrays, "captures_time_ns"), _on_map(arrays["captures_place_m"], grid)
-            captures = [
-                Track(str(id), 0, captured_ns[n : n + 1], captured[n : n + 1])
-                for n, (id, _, _) in enumerate(zip(arrays["captures_id"], captured_ns, captured, strict=True))
-            ]
-            marks = _marks(arrays, grid)
-            routes = _routes(arrays, grid)
-    except _DAMAGES as error:
-        raise StoreError(f"{path} is damaged: {error}") from error
-    return RunTracks(grid, vehicles, targets, captures, marks, routes)
+    with arrays_in(content, path) as arrays:
+        grid = _grid(json.loads(str(arrays["grid"])))
+        vehicles, targets = (_tracks(arrays, name, grid) for name in ("vehicles", "targets"))
+        captured_ns, captured = _times(arrays, "captures_time_ns"), _on_map(arrays["captures_place_m"], grid)
+        captures = [
+            Track(str(id), 0, captured_ns[n : n + 1], captured[n : n + 1])
+            for n, (id, _, _) in enumerate(zip(arrays["captures_id"], captured_ns, captured, strict=True))
+        ]
+        marks = _marks(arrays, grid)
+        routes = _routes(arrays, grid)
+        began_ns = int(arrays["began_ns"]) if "began_ns" in arrays else None
+    return RunTracks(grid, vehicles, targets, captures, marks, routes, began_ns)
 
 
 def _grid(fields: dict[str, Any]) -> GridSpec:
@@ -185,10 +170,18 @@ def _whole(arrays: Any, name: str) -> NDArray[np.int64]:
     return np.asarray(array, np.int64)
 
 
+def _times(arrays: Any, name: str) -> NDArray[np.int64]:
+    """A column of times that a message may have."""
+    array = _whole(arrays, name)
+    if len(array) and not 0 <= array.min() <= array.max() < STAMP_LIMIT_NS:
+        raise ValueError(f"{name} has a time before 1970 or after 2116")
+    return array
+
+
 def _marks(arrays: Any, grid: GridSpec) -> MarkedCells:
     if "marks_cells" not in arrays:
         return MarkedCells(*(np.zeros(0, kind) for kind in _MARKS.values()))
-    cells, stamps_ns = (_whole(arrays, f"marks_{name}") for name in ("cells", "stamps_ns"))
+    cells, stamps_ns = _whole(arrays, "marks_cells"), _times(arrays, "marks_stamps_ns")
     kinds, paces = (arrays[f"marks_{name}"].astype(_MARKS[name]) for name in ("kinds", "paces"))
     marks = MarkedCells(cells, kinds, paces, stamps_ns)
     if any(len(getattr(marks, name)) != len(marks.cells) for name in _MARKS):
@@ -203,10 +196,11 @@ def _marks(arrays: Any, grid: GridSpec) -> MarkedCells:
 def _routes(arrays: Any, grid: GridSpec) -> list[GivenRoute]:
     if "routes_vehicle" not in arrays:
         return []
-    whole = ("time_ns", "start", "steps")
+    kinds = {"time_ns": _times, "start": _whole, "steps": _whole}
     names = ("vehicle", "target", "time_ns", "start", "cost_s", "bound_s", "steps")
     columns = [
-        (_whole(arrays, f"routes_{name}") if name in whole else arrays[f"routes_{name}"]).tolist() for name in names
+        (kinds[name](arrays, f"routes_{name}") if name in kinds else arrays[f"routes_{name}"]).tolist()
+        for name in names
     ]
     if min(columns[-1], default=0) < 0:
         raise ValueError("a route has less than no steps")
@@ -250,10 +244,8 @@ def _walked(grid: GridSpec, start: int, directions: NDArray[np.uint8]) -> NDArra
 
 
 def _tracks(arrays: Any, name: str, grid: GridSpec) -> list[Track]:
-    ids, (pieces, samples, times) = (
-        arrays[f"{name}_id"],
-        (_whole(arrays, f"{name}_{column}") for column in ("piece", "samples", "time_ns")),
-    )
+    ids, times = arrays[f"{name}_id"], _times(arrays, f"{name}_time_ns")
+    pieces, samples = (_whole(arrays, f"{name}_{column}") for column in ("piece", "samples"))
     places = _on_map(arrays[f"{name}_place_m"], grid)
     ends = np.cumsum(samples)
     lengths_fit = len(ids) == len(pieces) == len(samples) and len(times) == len(places)

@@ -38,10 +38,12 @@ class GroundPicture:
 
     pixels  uint8 (height, width, 3)
     drawn   what is on it beside the terrain, for a legend: lethal, forbidden, hidden
+    level   of the terrain, that was drawn
     """
 
     pixels: NDArray[np.uint8]
     drawn: tuple[str, ...]
+    level: Level
 
     def webp(self) -> bytes:
         from PIL import Image
@@ -70,7 +72,7 @@ def ground_picture(terrain: Terrain, scenario: Scenario, truth: NDArray[np.float
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     there = {"lethal": lethal & ~forbidden, "forbidden": forbidden, "hidden": hidden}
-    return GroundPicture(pixels, tuple(name for name, cells in there.items() if cells.any()))
+    return GroundPicture(pixels, tuple(name for name, cells in there.items() if cells.any()), seen)
 
 
 def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:

@@ -98,8 +98,8 @@ def test_the_report_has_every_number_that_was_asked_for(
     assert image.shape[:2] == (round(picture.HEIGHT_IN * picture.DPI), round(picture.WIDTH_IN * picture.DPI))
     assert image[..., :3].std() > 0.1
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "ground.webp", "groups.csv", "report.html", "report.json", "report.png", "targets.csv", "tracks.npz",
-        "vehicles.csv",
+        "ground.npz", "ground.webp", "groups.csv", "report.html", "report.json", "report.png", "targets.csv",
+        "tracks.npz", "vehicles.csv",
     ]  # fmt: skip
 
 

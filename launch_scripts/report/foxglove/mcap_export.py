@@ -1,0 +1,122 @@
+"""`swarm export --mcap`: a run as an MCAP file with the types of ROS 2, for Foxglove, rosbags or `ros2 bag`."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from launch_scripts.report.files import replacing
+from launch_scripts.report.geo.run_export import free_places, groups_of, tracks_of_run
+from launch_scripts.report.ground_pace import GROUND_PACE_FILE, read_ground
+from launch_scripts.report.pictures.palette import GROUPS, rgb
+from launch_scripts.report.results.run_folder import REPORT_FILE, read_report
+from swarm.errors import ConfigError, StoreError
+from swarm.grid import GridSpec
+
+if TYPE_CHECKING:
+    from launch_scripts.report.foxglove.timeline import Told
+    from launch_scripts.ros2.markers import Colour
+    from launch_scripts.ros2.types import RosTypes
+
+_PROFILE, _SCHEMAS, _MESSAGES = "ros2", "ros2msg", "cdr"
+"""Words of MCAP's registry: what the file is for, how types are written in it, how messages."""
+
+
+def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
+    """Write the recording of a run; returns a line about it. Raises ConfigError or StoreError in one sentence."""
+    _check_packages()
+    from launch_scripts.report.foxglove.log_lines import lines_of
+    from launch_scripts.report.foxglove.timeline import told
+    from launch_scripts.ros2.frames import RosMap
+    from launch_scripts.ros2.messages import RosMessages
+    from launch_scripts.ros2.types import Distribution, types_of
+
+    tracks = tracks_of_run(folder)
+    report = read_report(folder) if (folder / REPORT_FILE).exists() else {}
+    ground = read_ground(folder, tracks.grid)
+    began_ns = _began_ns(tracks.began_ns, [int(each.time_ns[0]) for each in tracks.vehicles if len(each.time_ns)])
+    lines = lines_of(report, folder / REPORT_FILE, began_ns, tracks.captures)
+    messages = RosMessages(types_of(Distribution.JAZZY), RosMap(tracks.grid))
+    run = folder.resolve().name
+    if not any(len(each.time_ns) for each in (*tracks.vehicles, *tracks.targets)):
+        raise ConfigError(f"{folder} has no tracks: nothing was heard of vehicles and targets")
+    (path,) = free_places(folder, [f"{run}.mcap"], out, force)
+    timeline = told(messages, tracks, ground, lines, _colours(report))
+    counts = write_mcap(path, timeline, messages.types, _facts(run, report, tracks.grid))
+    topics = ", ".join(f"{count:,} {topic}" for topic, count in sorted(counts.items()))
+    without = "" if ground is not None else f"; no /map: there is no {GROUND_PACE_FILE} of it"
+    return f"{path}: {topics}{without}"
+
+
+def write_mcap(path: Path, timeline: Iterable[Told], types: RosTypes, facts: Mapping[str, str]) -> Counter[str]:
+    """Write messages as they come, in compressed chunks of a megabyte; returns how many each topic has.
+    Raises StoreError.
+
+    facts  about the run, for whoever looks into the file
+    """
+    from mcap.writer import CompressionType, Writer
+
+    counts: Counter[str] = Counter()
+    channels: dict[str, int] = {}
+    schemas: dict[str, int] = {}
+    try:
+        with replacing(path) as half, half.open("wb") as file:
+            writer = Writer(file, compression=CompressionType.ZSTD)
+            writer.start(_PROFILE, f"terrain-swarm {importlib.metadata.version('terrain-swarm')}")
+            writer.add_metadata("run", dict(facts))
+            for each in timeline:
+                type_name = each.message.__msgtype__
+                if type_name not in schemas:
+                    text = types.definition_of(type_name).encode()
+                    schemas[type_name] = writer.register_schema(type_name, _SCHEMAS, text)
+                if each.topic not in channels:
+                    channels[each.topic] = writer.register_channel(each.topic, _MESSAGES, schemas[type_name])
+                writer.add_message(
+                    channels[each.topic],
+                    each.time_ns,
+                    types.pack(each.message, type_name),
+                    each.time_ns,
+                    counts[each.topic],
+                )
+                counts[each.topic] += 1
+            writer.finish()  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    return counts
+
+
+def _check_packages() -> None:
+    missing = [name for name in ("mcap", "rosbags", "xxhash") if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"--mcap needs {' and '.join(missing)}, which is not installed: pip install 'terrain-swarm[ros2]'"
+        )
+
+
+def _began_ns(told_ns: int | None, first_ns: Iterable[int]) -> int:
+    """From when the time of the run counts; an older build did not say it, but its first samples are from then."""
+    return told_ns if told_ns is not None else min(first_ns, default=0)
+
+
+def _colours(report: Mapping[str, Any]) -> dict[str, Colour]:
+    """Vehicle -> colour of its group, as in all pictures of a run."""
+    groups = groups_of(report)
+    order = {group: n for n, group in enumerate(dict.fromkeys([*(report.get("by_group") or {}), *groups.values()]))}
+    of_group = {group: _opaque(GROUPS[n % len(GROUPS)]) for group, n in order.items()}
+    return {vehicle: of_group[group] for vehicle, group in groups.items()}
+
+
+def _opaque(colour: str) -> Colour:
+    red, green, blue = (part / 255 for part in rgb(colour))
+    return red, green, blue, 1.0
+
+
+def _facts(run: str, report: Mapping[str, Any], grid: GridSpec) -> dict[str, str]:
+    """What places and times mean, and which run it is."""
+    known = {name: report[name] for name in ("scenario", "seed", "version") if report.get(name) is not None}
+    place = {"crs": grid.crs, "west_m": grid.west_m, "north_m": grid.north_m, "resolution_m": grid.resolution_m}
+    return {name: str(value)[:1000] for name, value in {"run": run, **known, **place}.items()}

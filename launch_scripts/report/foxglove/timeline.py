@@ -1,0 +1,211 @@
+"""What a run leaves as ROS messages in order of time. Pure; one message is made at a time.
+
+A viewer that jumps to an instant shows the last message of each topic. So each message holds all of its topic: all
+vehicles, all routes, all marks; what would be too much is told less often.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.report.foxglove.log_lines import Line
+from launch_scripts.report.geo.geo_shapes import turns_of
+from launch_scripts.report.geo.track_file import GivenRoute, RunTracks, Track
+from launch_scripts.report.ground_pace import GroundPace
+from launch_scripts.ros2 import markers
+from launch_scripts.ros2.frames import headings_along
+from launch_scripts.ros2.grids import UNKNOWN, occupancy_grid, occupancy_of
+from launch_scripts.ros2.markers import Colour, Drawing, Form, MarkerBook
+from launch_scripts.ros2.messages import RosMessages
+from shared_map.terrain.places import middles_of
+from swarm.clock import NS_PER_S
+from swarm.wire.statements import MarkKind
+
+CAPTURE: Colour = (1.0, 0.85, 0.1, 1.0)
+_SHOWN_NS = 5 * NS_PER_S
+"""Captures are drawn for so long."""
+_MOST_POINTS, _MOST_CELLS = 2_000_000, 64_000_000
+"""Of all routes drawn, and of all grids of marks, in a recording: 48 MB and 64 MB before compression."""
+_LEAST, _MOST = 8, 600
+"""Messages that drawings and grids of marks get, as far as there is news for them."""
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """One message of a recording."""
+
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def told(
+    messages: RosMessages,
+    tracks: RunTracks,
+    ground: GroundPace | None,
+    lines: Sequence[Line],
+    colours: Mapping[str, Colour],
+) -> Iterator[Told]:
+    """All messages in order of time.
+
+    colours  vehicle -> of its route; those of others are `markers.ROUTE`
+    """
+    moving = (*tracks.vehicles, *tracks.targets, *tracks.captures)
+    ends = [int(each.time_ns[n]) for each in moving if len(each.time_ns) for n in (0, -1)]
+    ends += [route.time_ns for route in tracks.routes] + [line.time_ns for line in lines]
+    if not ends:
+        return
+    first_ns, last_ns = min(ends), max(ends)
+    yield from heapq.merge(
+        _still(messages, tracks, ground, first_ns),
+        _vehicles(messages, tracks.vehicles),
+        _targets(messages, tracks.targets),
+        _marks(messages, tracks, ground, first_ns, last_ns),
+        _drawn(messages, tracks, colours, first_ns, last_ns),
+        (
+            Told(line.time_ns, "/rosout", messages.log(line.time_ns, line.severity, line.name, line.text))
+            for line in lines
+        ),
+        key=lambda each: each.time_ns,
+    )
+
+
+def _still(messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, first_ns: int) -> Iterator[Told]:
+    frames = [messages.map_transform(first_ns)]
+    frames += [messages.vehicle_transforms(first_ns, each.id, 0.0, 0.0, None)[0] for each in tracks.vehicles]
+    yield Told(first_ns, "/tf_static", messages.transforms(frames))
+    if ground is not None:
+        occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
+        yield Told(first_ns, "/map", occupancy_grid(messages, first_ns, occupancy, ground.side))
+
+
+# --- what moves ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Instant:
+    """Everything that was seen at one time, in order of id. xy_m float64 (n, 2)."""
+
+    time_ns: int
+    ids: list[str]
+    xy_m: NDArray[np.float64]
+    headings_rad: list[float]
+
+
+def _instants(tracks: Sequence[Track]) -> Iterator[_Instant]:
+    """The samples of all tracks, time by time. Headings lead from each sample to the next of its track."""
+    tracks = sorted((each for each in tracks if len(each.time_ns)), key=lambda each: (each.id, each.piece))
+    if not tracks:
+        return
+    times = np.concatenate([each.time_ns for each in tracks])
+    xy_m = np.concatenate([each.xy_m for each in tracks])
+    headings = np.concatenate([headings_along(each.xy_m) for each in tracks])
+    of = np.repeat(np.arange(len(tracks)), [len(each.time_ns) for each in tracks])
+    order = np.lexsort((of, times))
+    begins = np.flatnonzero(np.diff(times[order], prepend=times[order[0]] - 1))
+    for some in np.split(order, begins[1:]):
+        ids = [tracks[n].id for n in of[some].tolist()]
+        yield _Instant(int(times[some[0]]), ids, xy_m[some], headings[some].tolist())
+
+
+def _vehicles(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
+    for now in _instants(tracks):
+        bases = [
+            messages.vehicle_transforms(now.time_ns, id, x_m, y_m, heading_rad)[1]
+            for id, (x_m, y_m), heading_rad in zip(now.ids, now.xy_m.tolist(), now.headings_rad, strict=True)
+        ]
+        yield Told(now.time_ns, "/tf", messages.transforms(bases))
+        poses = messages.pose_array(now.time_ns, now.xy_m, now.headings_rad)
+        yield Told(now.time_ns, "/swarm/poses", poses)
+
+
+def _targets(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
+    for now in _instants(tracks):
+        poses = messages.pose_array(now.time_ns, now.xy_m, now.headings_rad)
+        yield Told(now.time_ns, "/targets", poses)
+
+
+# --- what changes now and then ------------------------------------------------------------------------------------
+
+
+def instants_of(changes: Iterable[int], first_ns: int, last_ns: int, most: int) -> list[int]:
+    """When to tell what changes at these times: at or soon after each change, at most once a second, at most `most`
+    times, and never after the end."""
+    period_ns = max(NS_PER_S, -(-(last_ns - first_ns) // max(most - 1, 1)))
+    told_ns = {
+        first_ns + -(-(min(max(each, first_ns), last_ns) - first_ns) // period_ns) * period_ns for each in changes
+    }
+    return sorted({min(each, last_ns) for each in told_ns})
+
+
+def _marks(
+    messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, first_ns: int, last_ns: int
+) -> Iterator[Told]:
+    """What was marked at the end, each cell from its newest mark on: -1 where nothing is."""
+    grid, marks = tracks.grid, tracks.marks
+    side = 1 if ground is None else ground.side
+    while (-(-grid.rows // side)) * (-(-grid.cols // side)) > 1 << 20:
+        side *= 2
+    stands = np.isin(marks.kinds, (MarkKind.LETHAL, MarkKind.PACE))
+    paces = np.where(marks.kinds == MarkKind.LETHAL, np.inf, marks.paces.astype(np.float64))[stands]
+    best_s_per_m = ground.best_s_per_m if ground is not None else float(paces.min(initial=1.0))
+    values = occupancy_of(paces, max(best_s_per_m, 1e-6))
+    rows, cols = np.divmod(marks.cells[stands], grid.cols)
+    order = np.argsort(marks.stamps_ns[stands], kind="stable")
+    rows, cols, values = rows[order] // side, cols[order] // side, values[order]
+    stamps_ns = np.clip(marks.stamps_ns[stands][order], first_ns, last_ns)
+    occupancy = np.full((-(-grid.rows // side), -(-grid.cols // side)), UNKNOWN, np.int8)
+    most = min(max(_MOST_CELLS // occupancy.size, _LEAST), _MOST)
+    done = 0
+    for now_ns in instants_of(np.unique(stamps_ns).tolist(), first_ns, last_ns, most):
+        until = int(np.searchsorted(stamps_ns, now_ns, "right"))
+        np.maximum.at(occupancy, (rows[done:until], cols[done:until]), values[done:until])
+        done = until
+        yield Told(now_ns, "/marks", occupancy_grid(messages, now_ns, occupancy.copy(), side))
+
+
+def _drawn(
+    messages: RosMessages,
+    tracks: RunTracks,
+    colours: Mapping[str, Colour],
+    first_ns: int,
+    last_ns: int,
+) -> Iterator[Told]:
+    """The route that each vehicle has begun last, and captures for a while."""
+    routes = sorted(tracks.routes, key=lambda route: route.time_ns)
+    captures_ns = [int(each.time_ns[0]) for each in tracks.captures]
+    changes = {route.time_ns for route in routes}.union(captures_ns, (each + _SHOWN_NS for each in captures_ns))
+    points = sum(len(turns_of(route.cells, tracks.grid)) for route in routes)
+    at_once = len({route.vehicle for route in routes}) * points // max(len(routes), 1)
+    most = min(max(_MOST_POINTS // max(at_once, 1), _LEAST), _MOST)
+    book = MarkerBook(messages)
+    current: dict[str, Drawing] = {}
+    done = 0
+    for now_ns in instants_of(changes, first_ns, last_ns, most):
+        while done < len(routes) and routes[done].time_ns <= now_ns:
+            route = routes[done]
+            current[route.vehicle] = _route(tracks, route, colours.get(route.vehicle, markers.ROUTE))
+            done += 1
+        seen = [
+            each
+            for each, at_ns in zip(tracks.captures, captures_ns, strict=True)
+            if at_ns <= now_ns < at_ns + _SHOWN_NS
+        ]
+        drawings = [*current.values(), *(_capture(tracks, each) for each in seen)]
+        yield Told(now_ns, "/swarm/markers", book.array(now_ns, drawings))
+
+
+def _route(tracks: RunTracks, route: GivenRoute, colour: Colour) -> Drawing:
+    cells = turns_of(route.cells, tracks.grid)
+    return markers.route(tracks.grid, route.vehicle, middles_of(tracks.grid, cells).T, colour)
+
+
+def _capture(tracks: RunTracks, capture: Track) -> Drawing:
+    return Drawing("captures", capture.id, Form.CUBES, capture.xy_m[:1], CAPTURE, 3 * tracks.grid.resolution_m)

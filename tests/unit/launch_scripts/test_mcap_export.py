@@ -1,0 +1,329 @@
+"""`swarm export --mcap`: what a run left, as readers of MCAP and ROS that are not ours read it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from support.fake_run import fake_run
+
+from launch_scripts.cli import main
+from launch_scripts.report.foxglove.timeline import instants_of
+from launch_scripts.report.geo.track_file import TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.ground_pace import GROUND_PACE_FILE
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.write_report import make_report, write_report
+from launch_scripts.ros2.frames import RosMap
+from launch_scripts.ros2.grids import rows_from_north
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.processes import Note
+from swarm.wire.statements import MarkKind
+
+GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
+BEGAN_NS = 1_700_000_000 * NS_PER_S
+TOPICS = {"/map", "/marks", "/rosout", "/swarm/markers", "/swarm/poses", "/targets", "/tf", "/tf_static"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that a run leaves."""
+    folder = tmp_path_factory.mktemp("runs") / "r1"
+    folder.mkdir()
+    scenario = parse_scenario(
+        'name = "little"\nseed = 3\nseconds = 20.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 4\n'
+    )
+    pace = np.full((48, 64), 0.1, np.float32)
+    pace[:10, :10], pace[30:, 20:40], pace[40:, 60:] = 0.2, 0.4, np.inf
+    terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
+    truth = np.array(pace)
+    truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
+    recorder = Recorder(scenario, GRID)
+    for now_ns, told in fake_run(terrain, truth, scenario):
+        if isinstance(told, Peer):
+            recorder.alive(told, True, BEGAN_NS + now_ns)
+        else:
+            if isinstance(told, MarkSet):
+                stamps_ns = np.frombuffer(told.stamps_ns, "<i8") + BEGAN_NS
+                told = msgspec.structs.replace(told, stamps_ns=stamps_ns.tobytes())
+            recorder.heard(told, {}, BEGAN_NS + now_ns)
+    note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
+    recorder.heard(note, {}, BEGAN_NS + 3 * NS_PER_S)
+    with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
+        patched.setattr("launch_scripts.report.pictures.picture.save_picture", lambda half, *_: half.touch())
+        write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracks(run: Path) -> RunTracks:
+    return read_tracks(run / TRACKS_FILE)
+
+
+@pytest.fixture(scope="module")
+def recording(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    with pytest.MonkeyPatch.context() as patched:
+        assert swarm(patched, "export", run, "--mcap", "--out", out) == 0
+    return out / "r1.mcap"
+
+
+@pytest.fixture(scope="module")
+def heard(recording: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Topic -> (time, message), as mcap and mcap-ros2-support read them by the definitions in the file."""
+    topics = defaultdict(list)
+    with recording.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
+            topics[channel.topic].append((message.log_time, decoded))
+    return topics
+
+
+def swarm(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["swarm", *map(str, words)])
+    try:
+        return main()
+    except SystemExit as end:  # of a command that went well
+        return int(end.code or 0)
+
+
+def in_map(xy_m: np.ndarray[Any, np.dtype[np.float64]]) -> list[tuple[float, float]]:
+    return [RosMap(GRID).to_ros(x, y) for x, y in xy_m.tolist()]
+
+
+# --- values -------------------------------------------------------------------------------------------------------
+
+
+def test_every_vehicle_is_at_every_time_where_its_track_says(
+    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
+) -> None:
+    expected = {
+        (f"{each.id}/base_link", int(time_ns)): place
+        for each in tracks.vehicles
+        for time_ns, place in zip(each.time_ns, in_map(each.xy_m), strict=True)
+    }
+    found, turned = {}, defaultdict(list)
+    for time_ns, told in heard["/tf"]:
+        for each in told.transforms:
+            assert each.header.stamp.sec * NS_PER_S + each.header.stamp.nanosec == time_ns
+            assert each.header.frame_id == each.child_frame_id.replace("base_link", "odom")
+            place = each.transform.translation
+            found[each.child_frame_id, time_ns] = (place.x, place.y)
+            turned[each.child_frame_id].append((place, each.transform.rotation))
+    assert found == expected
+    for places in turned.values():
+        for (here, rotation), (there, _) in itertools.pairwise(places):
+            step = there.x - here.x, there.y - here.y
+            if any(step):
+                yaw = 2 * math.atan2(rotation.z, rotation.w)
+                assert (math.cos(yaw), math.sin(yaw)) == pytest.approx(np.array(step) / math.hypot(*step))
+    for (time_ns, told), (_, poses) in zip(heard["/tf"], heard["/swarm/poses"], strict=True):
+        assert poses.header.frame_id == "map"
+        at = [(each.position.x, each.position.y) for each in poses.poses]
+        assert at == [found[each.child_frame_id, time_ns] for each in told.transforms]
+
+
+def test_every_frame_hangs_on_the_terrain(heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks) -> None:
+    ((time_ns, still),) = heard["/tf_static"]
+    assert time_ns == min(times[0][0] for times in heard.values())
+    parents = {each.child_frame_id: each.header.frame_id for each in still.transforms}
+    for _, told in heard["/tf"]:
+        parents |= {each.child_frame_id: each.header.frame_id for each in told.transforms}
+    origin = still.transforms[0].transform.translation
+    assert (parents["map"], origin.x, origin.y) == ("terrain", 500_000, 5_200_000 - 48 * 25)
+    for each in tracks.vehicles:
+        assert parents[parents[f"{each.id}/base_link"]] == "map"
+
+
+def test_every_target_is_where_its_track_says(heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks) -> None:
+    expected = defaultdict(set)
+    for each in tracks.targets:
+        for time_ns, place in zip(each.time_ns.tolist(), in_map(each.xy_m), strict=True):
+            expected[time_ns].add(place)
+    found = {time_ns: {(p.position.x, p.position.y) for p in told.poses} for time_ns, told in heard["/targets"]}
+    assert found == expected
+
+
+def test_the_map_says_what_is_lost_of_the_best_speed(heard: dict[str, list[tuple[int, Any]]]) -> None:
+    ((_, told),) = heard["/map"]
+    assert (told.info.resolution, told.info.width, told.info.height) == (25.0, 64, 48)
+    assert (told.info.origin.position.x, told.info.origin.position.y) == (0, 0)
+    shown = rows_from_north(np.array(told.data, np.int8), told.info.height, told.info.width)
+    expected = np.zeros((48, 64), np.int8)
+    expected[:10, :10], expected[30:, 20:40], expected[40:, 60:] = 50, 75, 100
+    assert (shown == expected).all()
+
+
+def test_marks_are_in_the_last_grid_as_they_were_at_the_end(
+    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
+) -> None:
+    grids = [np.array(told.data, np.int8) for _, told in heard["/marks"]]
+    assert len(grids) > 1
+    for before, after in itertools.pairwise(grids):
+        assert (after[before >= 0] == before[before >= 0]).all()
+        assert (after >= 0).sum() > (before >= 0).sum()
+    last = rows_from_north(grids[-1], 48, 64).reshape(-1)
+    marked = tracks.marks.kinds != MarkKind.CLEAR
+    assert set(np.flatnonzero(last >= 0).tolist()) == set(tracks.marks.cells[marked].tolist())
+    lethal = tracks.marks.cells[tracks.marks.kinds == MarkKind.LETHAL]
+    assert (last[lethal] == 100).all()
+    paced = tracks.marks.kinds == MarkKind.PACE
+    lost = 100 * (1 - 0.1 / tracks.marks.paces[paced])
+    assert np.abs(last[tracks.marks.cells[paced]] - lost).max() <= 0.51
+
+
+def test_markers_show_the_route_that_each_vehicle_has_begun_last(
+    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
+) -> None:
+    assert len(tracks.routes) > len(tracks.vehicles)
+    for now_ns, told in heard["/swarm/markers"]:
+        newest = {route.vehicle: route for route in tracks.routes if route.time_ns <= now_ns}
+        shown = [each for each in told.markers if each.ns == "routes" and each.action == 0]
+        ends = {((p := each.points)[0].x, p[0].y, p[-1].x, p[-1].y) for each in shown}
+        wanted = set()
+        for route in newest.values():
+            if len(route.cells) > 1:
+                first, last = (RosMap(GRID).to_ros(*GRID.centre_m(int(route.cells[n]))) for n in (0, -1))
+                wanted.add((*first, *last))
+        assert ends == wanted
+        captured = {each.id for each in tracks.captures if now_ns - 5 * NS_PER_S < each.time_ns[0] <= now_ns}
+        assert len([each for each in told.markers if each.ns == "captures" and each.action == 0]) == len(captured)
+
+
+def test_the_log_has_every_note_alarm_and_capture(
+    heard: dict[str, list[tuple[int, Any]]], run: Path, tracks: RunTracks
+) -> None:
+    report = json.loads((run / "report.json").read_text())
+    lines = [(time_ns, told.name, told.msg, told.level) for time_ns, told in heard["/rosout"]]
+    for note in report["notes"]:
+        at_ns = BEGAN_NS + note["t_s"] * NS_PER_S
+        assert any(
+            abs(time_ns - at_ns) < 1e6 and (name, text, level) == (note["from"], note["text"], 20)
+            for time_ns, name, text, level in lines
+        )
+    captured = [time_ns for time_ns, _, text, _ in lines if "captured" in text]
+    assert len(captured) == len(tracks.captures) > 0
+    assert np.abs(np.array(captured) - [each.time_ns[0] for each in tracks.captures]).max() < 2e6
+    for alarm in report["alarms"]:
+        assert any(alarm["text"] in text and level >= 30 for *_, text, level in lines) or alarm["since_s"] is None
+
+
+# --- the file -----------------------------------------------------------------------------------------------------
+
+
+def test_the_file_is_indexed_compressed_in_order_and_says_which_run_it_is(recording: Path) -> None:
+    with recording.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert {each.topic for each in summary.channels.values()} == TOPICS
+        assert {each.message_encoding for each in summary.channels.values()} == {"cdr"}
+        assert {each.encoding for each in summary.schemas.values()} == {"ros2msg"}
+        assert {each.compression for each in summary.chunk_indexes} == {"zstd"}
+        (about,) = reader.iter_metadata()
+        assert (about.metadata["run"], about.metadata["crs"]) == ("r1", "EPSG:32632")
+        times = [message.log_time for *_, message in reader.iter_messages(log_time_order=False)]
+        assert times == sorted(times)
+        assert len(times) == summary.statistics.message_count
+
+
+def test_rosbags_reads_the_same(recording: Path, heard: dict[str, list[tuple[int, Any]]]) -> None:
+    many: dict[str, int] = defaultdict(int)
+    with AnyReader([recording]) as reader:
+        for connection, time_ns, content in reader.messages():
+            message: Any = reader.deserialize(content, connection.msgtype)
+            at, told = heard[connection.topic][many[connection.topic]]
+            assert at == time_ns
+            if connection.topic in ("/map", "/marks"):
+                assert message.data.tolist() == list(told.data)
+            many[connection.topic] += 1
+    assert many == {topic: len(told) for topic, told in heard.items()}
+
+
+def test_an_older_run_has_no_map_and_says_so(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = tmp_path / "old"
+    old.mkdir()
+    with np.load(run / TRACKS_FILE) as arrays:
+        np.savez(old / TRACKS_FILE, **{name: arrays[name] for name in arrays if name != "began_ns"})
+    assert swarm(monkeypatch, "export", old, "--mcap") == 0
+    assert f"no /map: there is no {GROUND_PACE_FILE}" in capsys.readouterr().out
+    with (old / "export" / "old.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert {each.topic for each in summary.channels.values()} == TOPICS - {"/map"}
+
+
+def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = tmp_path / "damaged"
+    for file, content, complaint in (
+        (TRACKS_FILE, b"PK", "tracks.npz is damaged"),
+        (GROUND_PACE_FILE, b"PK", "ground.npz is damaged"),
+        ("report.json", b'{"notes": [{"t_s": "soon"}]}', "report.json is damaged: Expected `float`, got `str`"),
+        ("report.json", b'{"notes": 5}', "report.json is damaged"),
+        ("report.json", b"[]", "report.json is damaged"),
+    ):
+        damaged.mkdir(exist_ok=True)
+        for each in (TRACKS_FILE, GROUND_PACE_FILE, "report.json"):
+            (damaged / each).write_bytes(content if each == file else (run / each).read_bytes())
+        assert swarm(monkeypatch, "export", damaged, "--mcap") != 0
+        told = capsys.readouterr().err
+        assert complaint in told
+        assert told.count("\n") == 1
+        assert not list(damaged.rglob("*.mcap*"))
+    assert swarm(monkeypatch, "export", run, "--mcap", "--gif") == 2
+    assert "--gif and --mcap: found both" in capsys.readouterr().err
+    with monkeypatch.context() as patched:
+        patched.setattr("launch_scripts.report.foxglove.mcap_export.find_spec", lambda name: None)
+        assert swarm(patched, "export", run, "--mcap") == 2
+    assert "--mcap needs mcap and rosbags and xxhash" in (told := capsys.readouterr().err)
+    assert "pip install 'terrain-swarm[ros2]'" in told
+    (tmp_path / "empty").mkdir()
+    assert swarm(monkeypatch, "export", tmp_path / "empty", "--mcap") == 2
+    assert "has no tracks.npz" in capsys.readouterr().err
+
+
+def test_no_recording_is_replaced_unless_told(
+    recording: Path, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = recording.read_bytes()
+    assert swarm(monkeypatch, "export", run, "--mcap", "--out", recording.parent) == 2
+    assert "--force replaces it" in capsys.readouterr().err
+    assert swarm(monkeypatch, "export", run, "--mcap", "--out", recording.parent, "--force") == 0
+    assert recording.read_bytes() == before
+
+
+@given(st.lists(st.integers(-(10**9), 10**12)), st.integers(0, 10**11), st.integers(0, 10**12), st.integers(2, 50))
+def test_changes_are_told_soon_seldom_and_all(changes: list[int], first_ns: int, lasts_ns: int, most: int) -> None:
+    last_ns = first_ns + lasts_ns
+    instants = instants_of(changes, first_ns, last_ns, most)
+    assert instants == sorted(set(instants))
+    assert len(instants) <= most + 1
+    period_ns = max(NS_PER_S, lasts_ns // (most - 1) + 1)
+    for change in changes:
+        within = min(max(change, first_ns), last_ns)
+        assert any(within <= each <= within + period_ns for each in instants)
+    assert all(first_ns <= each <= last_ns for each in instants)
