@@ -118,17 +118,17 @@ def learning(
     swarm bench learning --right --seeds 0:50
     swarm bench learning --simulated --seeds 7:11
 
-    --simulated runs the scenario jacksboro, where grass is three times as slow as its prior says: captures, and how far
-    vehicles came. Two runs of some 40 s of CPU a seed.
+    --simulated runs the scenario jacksboro, where grass is three times as slow as its
+    prior says: captures, and how far vehicles came. Two runs of some 40 s of CPU a seed.
     """
     if simulated:
         from launch_scripts.bench.learning_runs import run as run_jacksboro
-        from launch_scripts.bench.learning_runs import tables as demo_tables
+        from launch_scripts.bench.learning_runs import tables as tables_of_jacksboro
         from launch_scripts.simulation.campaign import parse_seeds
 
         with progress_of("learning") as progress:
             report = run_jacksboro(parse_seeds(seeds), seconds, progress)
-        show(report, as_json, demo_tables)
+        show(report, as_json, tables_of_jacksboro)
         return
     from launch_scripts.bench.planning.learning import run_learning, tables
     from launch_scripts.simulation.campaign import parse_seeds
