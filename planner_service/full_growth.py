@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.forms import AnyTree
+from planner_service.tree.forms import AnyTree, in_cells
 from planner_service.tree.pieces import PieceTree
 from shared_map.arrays import Floats
+
+_NONE: Floats = np.empty(0, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +24,8 @@ class GrownTree:
 
     target_cell  the root, wherever the target was
     map_version  of the snapshot
-    cost         float32, s, cost-to-go of each cell; of no meaning where nothing was grown
-    heuristic    a copy of it
+    cost         float32, s, cost-to-go of each cell; of no meaning where nothing was grown, empty beside `pieces`
+    heuristic    a copy of it; None beside `pieces`, whose exact costs bound themselves
     parent       uint8, direction of the next cell
     cell_cost    float32, s, the cell costs of the snapshot
     reach        s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
@@ -34,7 +36,7 @@ class GrownTree:
     target_cell: int
     map_version: int
     cost: Floats
-    heuristic: Floats
+    heuristic: Floats | None
     parent: NDArray[np.uint8]
     cell_cost: Floats
     reach: float
@@ -43,9 +45,10 @@ class GrownTree:
 
     def tree_on(self, cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
         """The tree on the map as it is now: to be repaired by what has changed since the snapshot."""
-        if self.pieces is not None and in_pieces:
-            self.pieces.cost_grid = cost_grid
-            return self.pieces
+        if self.pieces is not None:
+            same = self.pieces if in_pieces else in_cells(self.pieces)
+            same.cost_grid = cost_grid
+            return same
         tree = CostToGoTree(cost_grid)
         tree.take(self.target_cell, self.cost, self.parent, self.reach)
         return tree
@@ -71,11 +74,12 @@ def growth_job(
         reach = -1.0
         if can_be_root(cost_grid, target_cell):
             reach = cost_grid.grow(cost_grid.pad(target_cell), cost, parent)
-        heuristic = cost.copy() if reach >= 0 else cost
         pieces = None
         if in_pieces and reach >= 0:
+            cost = _NONE  # given back before the pieces take as much
             pieces = PieceTree(cost_grid)
             pieces.take(target_cell, parent)
+        heuristic = None if pieces is not None else cost.copy() if reach >= 0 else cost
         return GrownTree(
             *(target_cell, map_version, cost, heuristic, parent, cost_grid.cell_cost, reach, offered, pieces)
         )

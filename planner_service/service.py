@@ -31,7 +31,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.config.classes import GROUND
+from swarm.config.classes import GROUND, class_numbers
 from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
@@ -88,7 +88,7 @@ class PlannerService:
         self._sightings = Sightings(filter)
         self._presence = Presence(terrain.grid, _PRESENCE_NS, scenario.vehicles.sense_range_m, filter)
         """Who looks where; nothing is heard of it for a target that has a tracker."""
-        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain))
+        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
         self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._faults: list[str] = []

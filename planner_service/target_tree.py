@@ -191,9 +191,12 @@ class TargetTree:
             return self._leave_to_worker() if target_cell != tree.root else repaired
         tree = self._tree = grown.tree_on(self._costs, self._in_pieces)
         self._reach.note_whole(grown.target_cell)
-        self._bounds.take(grown.heuristic)
-        self._is_better_bound = False
-        self._learn_bounds(since)
+        self._is_better_bound = grown.heuristic is None
+        if grown.heuristic is None:
+            self._bounds.forget()
+        else:
+            self._bounds.take(grown.heuristic)
+            self._learn_bounds(since)
         self._stale = False
         moved = target_cell != tree.root
         row = self.strategy

@@ -3,7 +3,7 @@
 A mark says what the ground of a cell is for the class "ground", as sensors and operators tell it. Another class
 reads it by its own rule: what is lethal by a mark is so for all; a pace that is three times the prior is so for
 that class, too, and so is what is learned of a kind of ground. What a class cannot drive by its own rule no mark
-opens.
+opens. What is said for one class alone counts for that class before what is said for all, unless that is lethal.
 """
 
 from __future__ import annotations
@@ -62,29 +62,94 @@ def read_marks(
     return own_kinds, read_by(own_prior, prior, stated, own.least_s_per_m)
 
 
+def for_class(
+    own: Terrain,
+    cells: NDArray[np.int64],
+    kinds: NDArray[np.uint8],
+    paces: Floats,
+    own_kinds: NDArray[np.uint8],
+    own_paces: Floats,
+) -> tuple[NDArray[np.uint8], Floats]:
+    """What holds of cells for a class: what is said for it alone, or else for all. What is lethal to all stays so,
+    and so does what the class cannot drive by its own rule.
+
+    own                   the terrain of the class
+    kinds, paces          what is said for all, as `read_marks` has it for the class
+    own_kinds, own_paces  what is said for the class alone; CLEAR where nothing is
+    """
+    closed = (own_kinds == MarkKind.PACE) & np.isinf(own.ground_s_per_m.reshape(-1)[cells])
+    told = (own_kinds != MarkKind.CLEAR) & (kinds != MarkKind.LETHAL) & ~closed
+    bounded = np.maximum(own_paces, np.float32(own.least_s_per_m))
+    return np.where(told, own_kinds, kinds).astype(np.uint8), np.where(told, bounded, paces).astype(np.float32)
+
+
 class ClassMaps:
     """The cost maps of all classes of a process, which takes in marks for them together.
+
+    terrains  class -> the ground by its own rule, of the classes beside "ground"
+    numbers   class -> its number among those of the scenario, from 1 on
 
     common    that of the class "ground"
     of        class -> its cost map, of the others
     """
 
-    def __init__(self, common: CostMap, terrains: Mapping[str, Terrain]) -> None:
+    def __init__(self, common: CostMap, terrains: Mapping[str, Terrain], numbers: Mapping[str, int]) -> None:
         self.common = common
         learns = common.keys is not None
         self.of = {
             name: CostMap(terrain, learning=learns and terrain.flight_m is None)
             for name, terrain in terrains.items()
         }
+        self._by_number = {numbers[name]: cost_map for name, cost_map in self.of.items()}
+        self._kinds = np.full(common.grid.cells if self.of else 0, MarkKind.CLEAR, np.uint8)
+        """What is said of each cell for all vehicles. A pace is that of the common ground."""
+        self._own: dict[int, dict[int, tuple[int, float]]] = {number: {} for number in self._by_number}
+        """Class number -> cell -> kind and pace of what is said for that class alone."""
 
     def learn(self, words: Sequence[MarkSet]) -> bool:
         """As `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""
         return any([cost_map.learn(words) for cost_map in (self.common, *self.of.values())])  # noqa: C419 - all do
 
-    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
-        """As `CostMap.apply`, to each map what the statements are to its class."""
-        self.common.apply(cells, kinds, paces)
-        if not self.of:
-            return
-        for cost_map in self.of.values():
-            cost_map.apply(cells, *read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces))
+    def apply(
+        self,
+        cells: NDArray[np.uint32],
+        kinds: NDArray[np.uint8],
+        paces: NDArray[np.float32],
+        class_number: int = 0,
+    ) -> None:
+        """As `CostMap.apply`: what is said for all vehicles to each map as it is to its class, what is said for one
+        class to its map. Of a class that has no map here nothing changes."""
+        if class_number == 0:
+            self.common.apply(cells, kinds, paces)
+            if not self.of:
+                return
+            self._kinds[cells] = kinds
+            for number, cost_map in self._by_number.items():
+                read = read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces)
+                cost_map.apply(cells, *self._told(number, cells, *read))
+        elif (own := self._own.get(class_number)) is not None:
+            for cell, kind, pace in zip(cells.tolist(), kinds.tolist(), paces.tolist(), strict=True):
+                if kind == MarkKind.CLEAR:
+                    own.pop(cell, None)
+                else:
+                    own[cell] = kind, pace
+            cost_map = self._by_number[class_number]
+            ground = self.common.ground_s_per_m.reshape(-1)[cells]
+            read = read_marks(cost_map.terrain, self.common.terrain, cells, self._kinds[cells], ground)
+            cost_map.apply(cells, *self._told(class_number, cells, *read))
+
+    def _told(
+        self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats
+    ) -> tuple[NDArray[np.uint8], Floats]:
+        """What holds for a class, where this is what is said for all."""
+        own = self._own[number]
+        if not own:
+            return kinds, paces
+        said = [own.get(cell, _NOTHING) for cell in cells.tolist()]
+        own_kinds = np.array([kind for kind, _ in said], np.uint8)
+        own_paces = np.array([pace for _, pace in said], np.float32)
+        terrain = self._by_number[number].terrain
+        return for_class(terrain, np.asarray(cells, np.int64), kinds, paces, own_kinds, own_paces)
+
+
+_NOTHING = (int(MarkKind.CLEAR), 0.0)

@@ -79,14 +79,23 @@ class CostMap:
             self._stated = np.zeros(self.grid.cells, np.bool_)
         self._dirty: list[Window] = []
 
-    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
+    def apply(
+        self,
+        cells: NDArray[np.uint32],
+        kinds: NDArray[np.uint8],
+        paces: NDArray[np.float32],
+        class_number: int = 0,
+    ) -> None:
         """Make these the current statements about these cells; of a repeated cell the last counts. PACE sets the
         pace, even where the prior is lethal; LETHAL makes the cell lethal; CLEAR restores the prior.
 
         cells  uint32 (n,)   flat indices in the grid; raises OutsideGridError if one is not in it
         kinds  uint8 (n,)    MarkKind
         paces  float32 (n,)  s/m; read where the kind is PACE
+        class_number  0 for all vehicles; what is said for one class alone changes nothing (see `ClassMaps`)
         """
+        if class_number:
+            return
         if len(cells) <= _FEW:
             self._apply_few(cells, kinds, paces)
             return

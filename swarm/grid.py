@@ -177,6 +177,18 @@ class GridSpec:
         """The region that holds a cell. Raises OutsideGridError outside the grid."""
         return self.region_of_tile(self.tile_of(cell))
 
+    def tile_for(self, tile: int, class_number: int) -> int:
+        """The tile as one class of vehicles has it, for marks which hold for that class alone: each class has its
+        tiles behind those of the one before, with one between, about which is what is learned.
+
+        class_number  0 for all vehicles; 1 is the first of the scenario's `[[classes]]`
+        """
+        return class_number * (self.tiles + 1) + tile
+
+    def class_of_tile(self, tile: int) -> tuple[int, int]:
+        """(class_number, tile): undoes `tile_for`."""
+        return divmod(tile, self.tiles + 1)
+
     def tile_window(self, tile: int) -> Window:
         """The cells of a tile; at the east and south border it may be smaller. Raises OutsideGridError."""
         if not 0 <= tile < self.tiles:

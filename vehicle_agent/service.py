@@ -19,7 +19,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
-from swarm.config.classes import GROUND, class_named, flies, of_class
+from swarm.config.classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.config.plugin_names import assignment_key
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -106,7 +106,12 @@ class AgentService:
         self._bus = bus
         self._post = post
         self._setup = setup
-        self._maps = AgentMaps(common, own, learning=scenario.map.learning)
+        self._maps = AgentMaps(
+            common,
+            own,
+            learning=scenario.map.learning,
+            class_number=class_numbers(scenario).get(self._class, 0),
+        )
         group = plan.group.name
         self._author = author_of(group, setup.author)
         self._replica = MapReplica(
@@ -170,7 +175,7 @@ class AgentService:
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * as_class.vehicles.sense_range_m)
-        self._zones = ZonesAround(self._replica, self._maps.own, self._maps.read)
+        self._zones = ZonesAround(self._replica, self._maps)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._obeyed_version = 0

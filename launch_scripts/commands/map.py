@@ -39,7 +39,7 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
 
 def _parted(grid: GridSpec, sets: list[MarkSet]) -> tuple[list[MarkSet], list[MarkSet]]:
     """The sets of marks, and what authors have learned, which lies beyond the last tile and is about no cell."""
-    return [each for each in sets if each.tile < grid.tiles], [each for each in sets if each.tile == grid.tiles]
+    return [each for each in sets if each.tile != grid.tiles], [each for each in sets if each.tile == grid.tiles]
 
 
 @app.command()

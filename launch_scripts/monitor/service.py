@@ -27,6 +27,7 @@ from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
+from swarm.config.classes import class_numbers
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
@@ -106,7 +107,17 @@ class MonitorService:
         legend = self._movers.looks.legend()
         shown = layers or [PHOTO]
         self._ground = GroundView(
-            rec, self._mesh, terrain, cost_map, replica, shown, self._target_ids, truth, zones, legend
+            rec,
+            self._mesh,
+            terrain,
+            cost_map,
+            replica,
+            shown,
+            self._target_ids,
+            truth,
+            zones,
+            legend,
+            list(class_numbers(setup.scenario)),
         )
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns

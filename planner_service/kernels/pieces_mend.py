@@ -44,55 +44,56 @@ from planner_service.kernels.pieces import (
     corner_of,
     moved,
     name_of,
+    on_bench,
     step_cost,
     tile_of,
     where_to,
 )
+from planner_service.kernels.pieces_labels import drive_tile, keep_tile
 
 _ONE = np.uint64(1)
+_WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
 
 
 @helper
 def _lay_line(count, first, steps, other, grid, labels, total, bench):
     """Put `count` cells of tile `other` on the bench; there is no such tile where cells are lethal.
 
-    first  where the first is on the map, among the cells of all tiles, on the bench
+    first  where the first is on the map, in its tile, on the bench
     steps  from one to the next, in the same order
     """
     cell_cost = grid[0]
-    piece, local = labels[1], labels[2]
+    piece, rim = labels[1], labels[2]
     cost, own = bench[1], bench[2]
-    g, i, at = first
+    g, cell, at = first
     for _ in range(count):
         own[at] = cell_cost[g]
         cost[at] = np.inf
         if cell_cost[g] < INF:
-            cost[at] = total[other * ROOM + np.int64(piece[i]), TOTAL] + local[i]
+            name = np.int64(piece[other * CELLS + cell])
+            cost[at] = total[other * ROOM + name, TOTAL] + rim[other * ROOM + name_of(cell)]
         g += steps[0]
-        i += steps[1]
+        cell += steps[1]
         at += steps[2]
 
 
 @helper
 def _lay(t, grid, labels, total, tiles, bench):
     """Put a tile on the bench, with the cells around."""
-    cell_cost, _, stride, _, _ = grid
-    _, piece, local, _ = labels
-    across = tiles[6]
-    cost, own = bench[1], bench[2]
+    stride = grid[2]
+    piece, across = labels[1], tiles[6]
+    cost, inner = bench[1], bench[3]
+    drive_tile(t, grid, labels, tiles, bench)
     origin, rows, cols = corner_of(grid, across, t)
     if rows < SIDE or cols < SIDE:
         for i in range(cost.size):
             cost[i] = np.inf
-            own[i] = np.inf
     totals = np.uint64(t * ROOM)
     for row in range(rows):
-        g = np.uint64(origin + row * stride)
         i = np.uint64(t * CELLS + (row << BITS))
         at = np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(cols)):
-            cost[at + col] = total[totals + np.uint64(piece[i + col]), TOTAL] + local[i + col]
-            own[at + col] = cell_cost[g + col]
+            cost[at + col] = total[totals + np.uint64(piece[i + col]), TOTAL] + inner[at + col]
     for down in range(-1, 2):
         for right in range(-1, 2):
             if not (down or right):
@@ -102,11 +103,11 @@ def _lay(t, grid, labels, total, tiles, bench):
             col = cols if right > 0 else right
             count = 1 if down and right else (cols if down else rows)
             other = t + down * across + right
-            i = other * CELLS + ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
+            cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
             at = (row + 1) * WIDE + col + 1
             g = origin + row * stride + col
             steps = (1, 1, 1) if down else (stride, SIDE, WIDE)
-            _lay_line(count, (g, i, at), steps, other, grid, labels, total, bench)
+            _lay_line(count, (g, cell, at), steps, other, grid, labels, total, bench)
 
 
 @helper
@@ -143,8 +144,8 @@ def _open(own, around, rule, corners, at, code):
 def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
     """Have a cell of a tile, `at` on the bench, take the least that it is offered. Returns whether that is less."""
     _, _, stride, rule, corners = grid
-    parent, piece, local, _ = labels
-    _, cost, own, _, _, _, _, _, around = bench
+    parent, piece, _, _ = labels
+    cost, own, inner, around = bench[1], bench[2], bench[3], bench[9]
     across = tiles[6]
     best, by = np.inf, 0
     for code in range(8):
@@ -161,17 +162,17 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
     other, beside = where_to(across, t, cell, by)
     i = t * CELLS + cell
     if other == t:
-        j = t * CELLS + beside
-        piece[i] = piece[j]
-        local[i] = local[j] + step_cost(rule, own[at + around[by]], by)
+        u = at + around[by]
+        piece[i] = piece[t * CELLS + beside]
+        inner[at] = inner[u] + step_cost(rule, own[u], by)
         return True
     name = name_of(cell)
-    if piece[i] != name or local[i] > 0.0:
+    if piece[i] != name or inner[at] > 0.0:
         exits, many = tiles[0], tiles[1]
         exits[t * ROOM + many[t]] = name
         many[t] += 1
         piece[i] = name
-        local[i] = 0.0
+        inner[at] = 0.0
     total = pieces[0]
     total[t * ROOM + name, TOTAL] = best
     total[t * ROOM + name, BEFORE] = best
@@ -183,9 +184,9 @@ def _spread(t, grid, labels, tiles, bench, count, least):
     """Spread what the first `count` cells of the queue cost, inside the tile. Cells around that are offered less
     have their tile looked at."""
     _, offsets, stride, rule, corners = grid
-    parent, piece, local, _ = labels
+    parent, piece, _, _ = labels
     span, wanted, across = tiles[2], tiles[3], tiles[6]
-    _, cost, own, _, queue, waits, _, _, around = bench
+    cost, own, inner, queue, waits, around = bench[1], bench[2], bench[3], bench[5], bench[6], bench[9]
     first = t * CELLS
     origin, rows, cols = corner_of(grid, across, t)
     head, tail = 0, count
@@ -215,10 +216,9 @@ def _spread(t, grid, labels, tiles, bench, count, least):
                 wanted[other] |= REHOOK if child else LOOK
                 continue
             cost[u] = offer
-            i, j = first + (row << BITS) + col, first + (down << BITS) + right
-            piece[j] = piece[i]
-            local[j] = local[i] + step_cost(rule, own[at], code)
-            span[t] = max(span[t], local[j])
+            piece[first + (down << BITS) + right] = piece[first + (row << BITS) + col]
+            inner[u] = inner[at] + step_cost(rule, own[at], code)
+            span[t] = max(span[t], inner[u])
             parent[v + offsets[code]] = (code + 4) & 7
             if not waits[u]:
                 waits[u] = 1
@@ -234,7 +234,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     piece = labels[1]
     total = pieces[0]
     exits, many, span, _, _, _, across = tiles
-    names, cost, own, less, queue, waits, _, _, _ = bench
+    names, cost, own, less, queue, waits = bench[0], bench[1], bench[2], bench[4], bench[5], bench[6]
     _lay(t, grid, labels, total, tiles, bench)
     _, rows, cols = corner_of(grid, across, t)
     farthest = 0.0
@@ -262,6 +262,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     if count == 0:
         return False
     _spread(t, grid, labels, tiles, bench, count, least)
+    keep_tile(t, labels, bench)
     # Exits whose way leads on inside the tile by now are none any more; nobody leads over them.
     kept = 0
     for j in range(many[t]):
@@ -291,37 +292,49 @@ def mend_tiles(grid, labels, pieces, tiles, bench, which):
     return mended
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, i8, f4[::1], u1[::1], {BOX}, i8, f8, u1[::1])")
-def merge_parents(grid, labels, pieces, across, part, part_parent, box, old_root, way, changed):
-    """Take the parents of a window that was grown around a new root (`labels`), where its costs (`part`) are less
-    than the tree's and the way from the old root to the new one, `way` s.
-
-    changed  uint8 (n,), set to 1 for tiles in which a parent has changed
-    Costs stay what they are until `evaluate`. There is no cycle: with the lesser of the two costs, every
-    cell's parent has a lower one.
-    """
+@helper
+def _merge_tile(t, grid, labels, total, across, window, inner, old_root, changed):
+    """`merge_parents` in one tile, which is on the bench."""
     stride = grid[2]
-    parent, piece, local, root = labels
-    total = pieces[0]
+    parent, piece, _, root = labels
+    part, part_parent, box, way = window
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
-    for row in range(row0, row1):
-        for col in range(col0, col1):
+    top, left = t // across * SIDE, t % across * SIDE
+    for row in range(max(row0, top), min(row1, top + SIDE)):
+        for col in range(max(col0, left), min(col1, left + SIDE)):
             i = (row - row0 + 1) * width + col - col0 + 1
             if not part[i] < INF:
                 continue
             v = (row + 1) * stride + col + 1
-            t = (row >> BITS) * across + (col >> BITS)
-            cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
-            cost = total[t * ROOM + np.int64(piece[t * CELLS + cell]), TOTAL] + local[t * CELLS + cell]
+            cell = ((row - top) << BITS) + col - left
+            cost = total[t * ROOM + np.int64(piece[t * CELLS + cell]), TOTAL] + inner[on_bench(cell)]
             code = NONE if v == root else part_parent[i]
             if (part[i] < cost + way or v == old_root) and parent[v] != code:
                 parent[v] = code
                 changed[t] = 1
-    t, _ = tile_of(root, stride, across)
-    changed[t] = 1
-    t, _ = tile_of(old_root, stride, across)
-    changed[t] = 1
+
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {_WINDOW}, i8, u1[::1])")
+def merge_parents(grid, labels, pieces, tiles, bench, window, old_root, changed):
+    """Take the parents of a window that was grown around a new root (`labels`), where its costs are less than the
+    tree's and the way from the old root to the new one.
+
+    window   (part, part_parent, box, way): its costs and parents, and the way between the roots, s
+    changed  uint8 (n,), set to 1 for tiles in which a parent has changed
+    Costs stay what they are until `evaluate`. There is no cycle: with the lesser of the two costs, every
+    cell's parent has a lower one.
+    """
+    across = tiles[6]
+    row0, col0, row1, col1 = window[2]
+    for row in range(row0 >> BITS, ((row1 - 1) >> BITS) + 1):
+        for col in range(col0 >> BITS, ((col1 - 1) >> BITS) + 1):
+            t = row * across + col
+            drive_tile(t, grid, labels, tiles, bench)
+            _merge_tile(t, grid, labels, pieces[0], across, window, bench[3], old_root, changed)
+    for v in (labels[3], old_root):
+        t, _ = tile_of(v, grid[2], across)
+        changed[t] = 1
 
 
 @kernel(f"({GRID}, {LABELLED}, i8, i8[::1], f4[::1], u1[::1])")
@@ -359,7 +372,7 @@ def cut_ways(grid, labels, across, cells, before, changed):
 def drop_lost(grid, labels, pieces, tiles, which):
     """Cells of these tiles that have no way lose their parent, and pieces that lead nowhere go."""
     _, _, stride, _, _ = grid
-    parent, piece, local, root = labels
+    parent, piece, _, root = labels
     total = pieces[0]
     exits, many, _, _, _, _, across = tiles
     for n in range(which.size):
@@ -372,7 +385,6 @@ def drop_lost(grid, labels, pieces, tiles, which):
                 if not total[t * ROOM + np.int64(piece[i]), TOTAL] < np.inf and v != root:
                     parent[v] = NONE
                     piece[i] = NO_PIECE
-                    local[i] = 0.0
         count = 0
         for j in range(many[t]):
             name = np.int64(exits[t * ROOM + j])

@@ -197,14 +197,16 @@ class Searcher:
             return RouteBatch.none(asked, SEARCHING)
         self._left -= 1
         ways.grow(cell)
-        cost_s = self.belief.blocks.lowest(ways.costs_s)
+        costs_s = ways.costs_s.copy()
+        costs_s.reshape(-1)[cell] = np.inf  # where it stands it looks already
+        cost_s = self.belief.blocks.lowest(costs_s)
         if goal is not None and cell != goal.way.cells[-1] and cost_s[goal.block] < np.inf:
             block, mass = goal.block, goal.mass
         else:
             drawn = self._draw(vehicle, cell, cost_s)
             block, mass = drawn, self.belief.near(drawn)
             self.decisions += 1
-        place = self._place(ways, block, cell)
+        place = self._place(costs_s, block)
         if place is None:
             return RouteBatch.none(asked, UNREACHABLE)
         way = ways.way_to(place)
@@ -220,7 +222,7 @@ class Searcher:
         """The block where to look: apart from the others' if there is another. The vehicle's own is drawn only if
         it sees a part of it, or can reach no other.
 
-        cost_s  float32 (rows, cols), from the vehicle to each block
+        cost_s  float32 (rows, cols), from the vehicle to each block, its own cell aside
         """
         belief = self.belief
         assert belief is not None
@@ -238,17 +240,16 @@ class Searcher:
                 return row, col
         return own
 
-    def _place(self, ways: Ways, block: tuple[int, int], cell: int) -> int | None:
+    def _place(self, costs_s: Floats, block: tuple[int, int]) -> int | None:
         """A cell of a block from which to look: the one nearest to the middle if all is seen from there, or else
-        any. None if there is none but the vehicle's own."""
+        any. None if there is none.
+
+        costs_s  float32 (grid rows, grid cols), to each cell where the vehicle may look
+        """
         assert self.belief is not None
         blocks = self.belief.blocks
         rows, cols = blocks.cells_of(block)
-        reached = ways.costs_s[rows, cols] < np.inf
-        if block == blocks.of_cell(cell):
-            row, col = divmod(cell, blocks.grid.cols)
-            reached[row - rows.start, col - cols.start] = False
-        downs, rights = np.nonzero(reached)
+        downs, rights = np.nonzero(costs_s[rows, cols] < np.inf)
         if not len(downs):
             return None
         if blocks.seen_whole(self._range_m):

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import pieces, pieces_mend
+from planner_service.kernels import pieces, pieces_labels, pieces_mend, pieces_totals
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.pieces import CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
@@ -23,6 +23,9 @@ from swarm.grid import Window
 MOST_LOOKS = 3.0
 """A move or a repair gives way to a growth once it has looked at so many times as many tiles as the map has; to
 mend one counts double."""
+
+MOST_KEPT = 1 << 10
+"""Of so many tiles, all of a map of 2048 x 2048 cells, is kept what cells cost inside: 34 MB."""
 
 
 class PieceTree:
@@ -52,13 +55,13 @@ class PieceTree:
         self._across = -(-cost_grid.grid.cols // SIDE)
         self._count = count = -(-cost_grid.grid.rows // SIDE) * self._across
         self._piece = np.full(count * CELLS, NO_PIECE, np.uint8)
-        self._local = np.zeros(count * CELLS, np.float64)
+        self._rim = np.zeros(count * ROOM, np.float64)
         self._pieces = pieces.make_pieces(count)
         exits, many, span = np.zeros(count * ROOM, np.uint8), np.zeros(count, np.int32), np.zeros(count, np.float64)
         self._wanted = np.zeros(count, np.uint8)
         falls, self._ends = np.zeros((3, count), np.float64), np.zeros((2, count), np.float64)
         self._tiles: pieces.Tiles = exits, many, span, self._wanted, falls, self._ends, self._across
-        self._bench = pieces.make_bench()
+        self._bench = pieces.make_bench(count, MOST_KEPT)
         self._now = 0
         self._stack = np.empty(count * ROOM, np.int32)
         self._todo = np.empty(count, np.int64)
@@ -70,7 +73,7 @@ class PieceTree:
 
     @property
     def _labels(self) -> pieces.Cells:
-        return self.parent, self._piece, self._local, self.cost_grid.pad(self.root)
+        return self.parent, self._piece, self._rim, self.cost_grid.pad(self.root)
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -116,8 +119,8 @@ class PieceTree:
         self.root = root
         changed = np.zeros(self._count, np.uint8)
         pieces_mend.merge_parents(
-            *(grid.padded, self._labels, self._pieces, self._across),
-            *(cost, parent, box, old_root, way, changed),
+            *(grid.padded, self._labels, self._pieces, self._tiles, self._bench),
+            *((cost, parent, box, way), old_root, changed),
         )
         self._relabel(np.flatnonzero(changed))
         self._moved = True
@@ -153,8 +156,9 @@ class PieceTree:
         if self._moved:
             self._add_up()
         costs = np.empty(cells.size, np.float64)
-        pieces.costs_at(
-            self.cost_grid.padded, self._labels, self._pieces, self._across, np.ascontiguousarray(cells), costs
+        pieces_totals.costs_at(
+            *(self.cost_grid.padded, self._labels, self._pieces, self._bench, self._across),
+            *(np.ascontiguousarray(cells), costs),
         )
         return costs
 
@@ -178,12 +182,12 @@ class PieceTree:
         """Costs are what is driven at all times."""
 
     def _relabel(self, which: Cells) -> None:
-        pieces.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
+        pieces_labels.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
 
     def _add_up(self) -> int:
         """Evaluate the totals; returns how many tiles are to be looked at now, which stand in `_todo`."""
         self._now += self._moved
-        count = pieces.evaluate(
+        count = pieces_totals.evaluate(
             *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench[0]),
             *(np.argsort(self._ends[0]), self._now if self._moved else 0, self._stack, self._todo),
         )

@@ -72,7 +72,7 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
             "tile": each.tile,
             "epoch": each.epoch,
             "seq": each.seq,
-            **({"marks": _marks(each, grid)} if each.tile < grid.tiles else _learned(each)),
+            **(_learned(each) if each.tile == beyond_tile(grid) else {"marks": _marks(each, grid)}),
         }
         for each in sorted(sets, key=lambda each: (each.tile, each.author))
     ]
@@ -133,7 +133,7 @@ def _set(each: _Set, grid: GridSpec) -> MarkSet:
             raise ValueError(f"row {mark.row}, col {mark.col} is not in {grid.rows} x {grid.cols}")
     cells = np.array([mark.row * grid.cols + mark.col for mark in marks], np.int64)
     tiles, inner = tile_cells(grid, cells)
-    if (tiles != each.tile).any():
+    if (tiles != grid.class_of_tile(each.tile)[1]).any():
         raise ValueError(f"a mark lies outside tile {each.tile}")
     said = Statements(
         inner,
@@ -165,8 +165,8 @@ def _word(each: _Set) -> MarkSet:
 def to_bands(
     grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """(pace, kind) of the winning marks. The pace is in s/m: inf is lethal, nan is as the prior map says. The kind
-    is a MarkKind, NOTHING_SAID_BAND where no author says anything."""
+    """(pace, kind) of the winning marks for all vehicles. The pace is in s/m: inf is lethal, nan is as the prior
+    has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything."""
     pace, kind, _ = to_cells(grid, sets, now_ns)
     return pace, kind
 
@@ -182,7 +182,7 @@ def to_cells(
     kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
     stamps_ns = np.zeros(grid.cells, np.int64)
     for tile in replica.held.tiles:
-        if tile == grid.tiles:
+        if tile >= grid.tiles:  # what is learned, and what is said for one class alone
             continue
         won = replica.winners(tile)
         cells = grid_cells(grid, tile_corners(grid, tile), won.cells)

@@ -21,6 +21,7 @@ from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
+from swarm.config.classes import class_numbers
 from swarm.errors import StoreError
 from swarm.order_book import described
 from swarm.runtime.membership import Member
@@ -58,6 +59,7 @@ class KeeperService:
         self._post = post
         self._id = setup.id
         self._terrain = terrain
+        self._numbers = class_numbers(setup.scenario)
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
@@ -193,7 +195,7 @@ class KeeperService:
         if order.action != "list":
             if not order.name:
                 order = msgspec.structs.replace(order, name=free_name(self.replica))
-            found = zone_sets(order, self.replica, self._terrain, self._store.set_aside, now_ns)
+            found = zone_sets(order, self.replica, self._terrain, self._store.set_aside, now_ns, self._numbers)
             try:
                 if isinstance(found, list):
                     sets = found
@@ -211,7 +213,7 @@ class KeeperService:
                 self._plan.accepted(each)
             self._sync.publish(PublishSet(each) for each in sets)
             self._member.note(now_ns, "order", f"zone {order.action} {order.name}")
-        zones = zones_of(self.replica, now_ns)
+        zones = zones_of(self.replica, now_ns, self._numbers)
         changed = order.name if sets else ""
         asked.answer(Zones(keeper=self._id, zones=zones, changed=changed, sets=rows_of(sets)), keeper=self._id)
         asked.end()

@@ -54,12 +54,17 @@ def zone_sets(
     terrain: Terrain,
     aside: Callable[[int], Mapping[str, MarkSet]],
     now_ns: int,
+    numbers: Mapping[str, int],
 ) -> list[MarkSet] | str:
     """The sets which make, move or end a zone; why that cannot be, in a sentence.
 
-    order  names a zone
-    aside  author -> what compaction set aside of its set of a tile
+    order    names a zone
+    aside    author -> what compaction set aside of its set of a tile
+    numbers  class of vehicles -> its number
     """
+    if order.vehicle_class is not None and order.vehicle_class not in numbers:
+        known = f"there are {', '.join(numbers)}" if numbers else "the scenario has no [[classes]]"
+        return f"vehicle_class: there is no class {order.vehicle_class!r} beside that of [cost]; {known}"
     author = zone_author(order.name)
     tiles = {tile: each for tile in replica.held.tiles if (each := replica.held.get(tile, author)) is not None}
     by_tile: dict[int, Statements] = {}
@@ -70,13 +75,15 @@ def zone_sets(
         others = sum(len(each.kinds) for each in _zone_sets(replica) if each.author != author)
         if others + int(inside.sum()) > MOST_IN_ALL:
             return f"all zones together would cover {others + int(inside.sum())} cells, at most {MOST_IN_ALL}"
-        by_tile = _by_tile(order, inside, replica, now_ns)
+        by_tile = _by_tile(
+            order, inside, replica, now_ns, 0 if order.vehicle_class is None else numbers[order.vehicle_class]
+        )
     elif not any(len(standing(each, now_ns).cells) for each in tiles.values()):
         return f"there is no zone {order.name!r}; {_names(replica, now_ns)}"
     sets: list[MarkSet] = []
     for tile in sorted(tiles.keys() | by_tile.keys()):
-        numbers = [(each.epoch, each.seq) for each in (tiles.get(tile), aside(tile).get(author)) if each]
-        number = _above(max(numbers, default=(1, 0)), now_ns)
+        used = [(each.epoch, each.seq) for each in (tiles.get(tile), aside(tile).get(author)) if each]
+        number = _above(max(used, default=(1, 0)), now_ns)
         if number is None:
             return f"zone {order.name!r}: its number on tile {tile} cannot grow; give the zone another name"
         stated = by_tile.get(tile, NO_STATEMENTS)
@@ -92,18 +99,22 @@ def free_name(replica: MapReplica) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ZoneCells:
-    """Cells of a zone that stands, int64 (n,), and the rule that all of them have."""
+    """Cells of a zone that stands, int64 (n,), and the rule that all of them have.
+
+    class_number  whom it is for: 0 for all vehicles
+    """
 
     cells: NDArray[np.int64]
     kind: MarkKind
     pace_s_per_m: float
     until_ns: int
+    class_number: int
 
 
 def cells_of_zones(replica: MapReplica, now_ns: int) -> dict[str, ZoneCells]:
     """Name -> the cells of each zone that stands, in order of name."""
     cells: dict[str, list[NDArray[np.int64]]] = {}
-    rules: dict[str, tuple[int, float, int]] = {}
+    rules: dict[str, tuple[int, float, int, int]] = {}
     for each in _zone_sets(replica):
         stated = standing(each, now_ns)
         if not len(stated.cells):
@@ -111,7 +122,8 @@ def cells_of_zones(replica: MapReplica, now_ns: int) -> dict[str, ZoneCells]:
         inside = grid_cells(replica.grid, tile_corners(replica.grid, each.tile), stated.cells)
         cells.setdefault(each.author, []).append(inside.astype(np.int64))
         until_ns = FOREVER if stated.untils_ns is None else int(stated.untils_ns[0])
-        rules[each.author] = (int(stated.kinds[0]), float(stated.paces[0]), until_ns)
+        class_number, _ = replica.grid.class_of_tile(each.tile)
+        rules[each.author] = (int(stated.kinds[0]), float(stated.paces[0]), until_ns, class_number)
     return {
         author.partition(".")[2]: ZoneCells(
             np.concatenate(cells[author]), MarkKind(rules[author][0]), *rules[author][1:]
@@ -120,9 +132,13 @@ def cells_of_zones(replica: MapReplica, now_ns: int) -> dict[str, ZoneCells]:
     }
 
 
-def zones_of(replica: MapReplica, now_ns: int) -> list[Zone]:
-    """The zones that stand, in order of name."""
+def zones_of(replica: MapReplica, now_ns: int, numbers: Mapping[str, int]) -> list[Zone]:
+    """The zones that stand, in order of name.
+
+    numbers  class of vehicles -> its number
+    """
     found = []
+    names = {number: name for name, number in numbers.items()}
     for name, each in cells_of_zones(replica, now_ns).items():
         rows, cols = np.divmod(each.cells, replica.grid.cols)
         lethal = each.kind == MarkKind.LETHAL
@@ -134,6 +150,7 @@ def zones_of(replica: MapReplica, now_ns: int) -> list[Zone]:
                 cells=len(rows),
                 window=[int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1],
                 until_ns=None if each.until_ns >= _LIMIT else max(each.until_ns, 0),
+                vehicle_class=names.get(each.class_number),
             )
         )
     return found
@@ -153,7 +170,7 @@ def _zone_sets(replica: MapReplica) -> Iterator[MarkSet]:
 
 
 def _names(replica: MapReplica, now_ns: int) -> str:
-    names = [zone.name for zone in zones_of(replica, now_ns)]
+    names = list(cells_of_zones(replica, now_ns))
     return f"there are {', '.join(names[:20])}" if names else "there are none"
 
 
@@ -220,7 +237,9 @@ def _crossing(corners: Corners) -> tuple[int, int] | None:
     return None if not len(first) else (int(first[0, 0]), int(first[0, 1]))
 
 
-def _by_tile(order: ZoneOrder, inside: Bools, replica: MapReplica, now_ns: int) -> dict[int, Statements]:
+def _by_tile(
+    order: ZoneOrder, inside: Bools, replica: MapReplica, now_ns: int, class_number: int
+) -> dict[int, Statements]:
     """The statements of a zone, by tile: newer than those of all zones that are there."""
     tiles, cells = tile_cells(replica.grid, np.flatnonzero(inside))
     kind, pace = MarkKind.LETHAL, 0.0
@@ -229,13 +248,14 @@ def _by_tile(order: ZoneOrder, inside: Bools, replica: MapReplica, now_ns: int) 
     found: dict[int, Statements] = {}
     for tile in np.unique(tiles).tolist():
         here = np.sort(cells[tiles == tile])
-        known = [each.stamps_ns for each in replica.held.of_tile(tile) if is_zone(each.author) and each.kinds]
+        own = replica.grid.tile_for(tile, class_number)
+        known = [each.stamps_ns for each in replica.held.of_tile(own) if is_zone(each.author) and each.kinds]
         newest_ns = max((int(column(stamps, "<i8").max()) for stamps in known), default=0)
         stamp_ns = min(max(now_ns, newest_ns + 1), STAMP_LIMIT_NS - 1)
         untils_ns = None
         if order.lasts_s is not None:
             untils_ns = np.full(len(here), now_ns + int(order.lasts_s * NS_PER_S), np.int64)
-        found[tile] = Statements(
+        found[own] = Statements(
             here,
             np.full(len(here), kind, np.uint8),
             np.full(len(here), pace, np.float32),

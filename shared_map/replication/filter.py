@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
-from shared_map.replication.tiles import beyond_tile, region_tiles
+from shared_map.replication.tiles import beyond_tile, of_all_classes, region_tiles
 from swarm.config.scenario import Scenario
 from swarm.config.values import RESERVED_GROUP
 from swarm.grid import GridSpec
@@ -83,9 +83,8 @@ class MarkFilter:
     def limit_to(self, regions: frozenset[int]) -> None:
         """From now on accept only sets about these regions."""
         self.regions = regions
-        self._tiles = frozenset(
-            [beyond_tile(self._grid), *(tile for region in regions for tile in region_tiles(self._grid, region))]
-        )
+        tiles = [tile for region in regions for tile in region_tiles(self._grid, region)]
+        self._tiles = frozenset([beyond_tile(self._grid), *of_all_classes(self._grid, tiles)])
 
     def accepts_author(self, author: str, group: str) -> bool:
         """Whether the policy of groups lets us read this author, which states to be of this group."""

@@ -11,6 +11,7 @@ from shared_map.replication.digest import Held, Ledger, fingerprint
 from shared_map.replication.limits import Capacity
 from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
 from shared_map.replication.tombstones import Tombstones
+from swarm.config.classes import MOST_CLASSES
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.messages.marks import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
 
@@ -54,7 +55,8 @@ class HeldSets:
         the tile beyond the last one, as `words` has it, and not by operators."""
         if received.tile == self._tile_count:
             return is_zone(received.author) or told(received) is None
-        return received.tile >= self._tile_count or (self._ragged and fault(received, self._grid) is not None)
+        known = received.tile < self._tile_count and not self._ragged
+        return not known and fault(received, self._grid) is not None
 
     def is_news(self, received: MarkSet, held: MarkSet | None) -> bool:
         """Whether a set supersedes the held one of its tile and author, or if there is none, the deleted one."""
@@ -127,7 +129,8 @@ class HeldSets:
         return [tile for tile in newer if not self.tombstones.above(tile, author, numbers[tile])]
 
     def _could_hold(self, author: str, tile: int) -> bool:
-        if tile > self._tile_count:
+        class_number, at = self._grid.class_of_tile(tile)
+        if class_number > MOST_CLASSES or (class_number and at == self._tile_count):
             return False
         return not self.capacity.full_for(author) or self.get(tile, author) is not None
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
+from swarm.config.classes import MOST_CLASSES
 from swarm.config.values import RESERVED_GROUP
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column, pack_column
@@ -149,12 +150,13 @@ def _content(of: MarkSet) -> tuple[bytes, bytes, bytes, bytes, bytes, str]:
 
 def fault(of: MarkSet, grid: GridSpec) -> str | None:
     """Why a set cannot be part of a map on this grid; None if it can."""
-    if of.tile >= grid.tiles:
-        return f"tile {of.tile} is not in 0..{grid.tiles - 1}"
-    tile_row, tile_col = divmod(of.tile, grid.tile_cols)
+    class_number, tile = grid.class_of_tile(of.tile)
+    if tile == grid.tiles or class_number > MOST_CLASSES:
+        return f"tile {of.tile} is none of {grid.tiles} for all vehicles or for one of {MOST_CLASSES} classes"
+    tile_row, tile_col = divmod(tile, grid.tile_cols)
     cut_off = (tile_row + 1) * TILE_CELLS > grid.rows or (tile_col + 1) * TILE_CELLS > grid.cols
     if of.kinds and cut_off:
-        window = grid.tile_window(of.tile)
+        window = grid.tile_window(tile)
         cells = column(of.cells, "<u2")
         height, width = window.row1 - window.row0, window.col1 - window.col0
         if (cells // TILE_CELLS >= height).any() or (cells % TILE_CELLS >= width).any():

@@ -95,7 +95,7 @@ def _new_winners_of_few(grid: GridSpec, changes: Sequence[TileChange], before_ns
         here.extend((cell, *_NOTHING) for cell, was in before.items() if was[0] != _CLEAR)
         counts.append(len(here))
         if here:
-            tile_row, tile_col = divmod(tile, grid.tile_cols)
+            tile_row, tile_col = divmod(tile % (grid.tiles + 1), grid.tile_cols)
             corner = tile_row * TILE_CELLS * grid.cols + tile_col * TILE_CELLS
             for cell, kind, pace, stamp_ns in sorted(here):
                 changed.append((corner + cell // TILE_CELLS * grid.cols + cell % TILE_CELLS, kind, pace, stamp_ns))

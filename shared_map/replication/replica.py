@@ -41,9 +41,18 @@ from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
 
 
 class CostSink(Protocol):
-    """Where winning statements go, and what authors have learned: the cost map."""
+    """Where winning statements go, and what authors have learned: the cost map.
 
-    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> object: ...
+    class_number  whom the statements are for: 0 for all vehicles, or one of the scenario's classes from 1 on
+    """
+
+    def apply(
+        self,
+        cells: NDArray[np.uint32],
+        kinds: NDArray[np.uint8],
+        paces: NDArray[np.float32],
+        class_number: int = 0,
+    ) -> object: ...
 
     def learn(self, words: Sequence[MarkSet]) -> bool: ...
 
@@ -206,11 +215,23 @@ class MapReplica:
             # Nothing there is about a cell, so no set of it has winners.
             changes = [TileChange(c.tile, [], []) if c.tile == beyond else c for c in changes]
             self._learn()
+        numbers = [change.tile // (self.grid.tiles + 1) for change in changes]
+        if not any(numbers):
+            return self._apply(changes, 0, before_ns, measured)
+        counts: dict[int, int] = {}
+        for number in sorted(set(numbers)):
+            of_class = [change for change, own in zip(changes, numbers, strict=True) if own == number]
+            changed = self._apply(of_class, number, before_ns, measured)
+            counts |= zip([change.tile for change in of_class], changed, strict=True)
+        return [counts[change.tile] for change in changes]
+
+    def _apply(self, changes: list[TileChange], class_number: int, before_ns: int, measured: bool) -> list[int]:
+        """`_settle` of tiles which are all for the same vehicles."""
         won = new_winners(self.grid, changes, before_ns, self._now_ns)
         if len(won.cells):
             self.counts["marks_merged"] += len(won.cells)
             if self._cost_map is not None:
-                self._cost_map.apply(won.cells, won.kinds, won.paces)
+                self._cost_map.apply(won.cells, won.kinds, won.paces, class_number)
             if measured:
                 newest_ns = int(won.stamps_ns.max())
                 if newest_ns != NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):

@@ -14,7 +14,7 @@ from shared_map.replication.limits import Quota
 from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.pending_digests import PendingDigest, PendingDigests
 from shared_map.replication.replica import MapReplica, Merged, PublishSet
-from shared_map.replication.tiles import beyond_region, beyond_tile, region_of, region_tiles
+from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_classes, region_of, region_tiles
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
@@ -132,7 +132,7 @@ class MapSync:
         for region in sorted(before - regions):
             self._bus.unsubscribe(MARKS, region=region)
         self.replica.limit_to(regions)
-        tiles = [tile for region in new for tile in region_tiles(grid, region)]
+        tiles = of_all_classes(grid, [tile for region in new for tile in region_tiles(grid, region)])
         if not before:
             tiles.append(beyond_tile(grid))
         if tiles:

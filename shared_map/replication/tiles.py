@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from swarm.config.classes import MOST_CLASSES
 from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
 
 _TILE_BITS = TILE_CELLS.bit_length() - 1
@@ -23,13 +26,18 @@ def beyond_region(grid: GridSpec) -> int:
 
 
 def region_of(grid: GridSpec, tile: int) -> int:
-    """The region under whose key the sets about a tile go."""
-    return beyond_region(grid) if tile == beyond_tile(grid) else grid.region_of_tile(tile)
+    """The region under whose key the sets about a tile go, of whatever class."""
+    return beyond_region(grid) if tile == beyond_tile(grid) else grid.region_of_tile(grid.class_of_tile(tile)[1])
+
+
+def of_all_classes(grid: GridSpec, tiles: Iterable[int]) -> list[int]:
+    """These tiles as every class has them, and all vehicles."""
+    return [grid.tile_for(tile, number) for number in range(MOST_CLASSES + 1) for tile in tiles]
 
 
 def tile_corners(grid: GridSpec, tiles: ArrayLike) -> NDArray[np.uint32]:
-    """Flat index (uint32) of the north-west cell of each tile."""
-    tile_rows, tile_cols = np.divmod(np.asarray(tiles, np.int64), grid.tile_cols)
+    """Flat index (uint32) of the north-west cell of each tile, of whatever class."""
+    tile_rows, tile_cols = np.divmod(np.asarray(tiles, np.int64) % (grid.tiles + 1), grid.tile_cols)
     return np.asarray(tile_rows * (TILE_CELLS * grid.cols) + tile_cols * TILE_CELLS, np.uint32)
 
 

@@ -74,6 +74,7 @@ class Orders:
         name: str = "",
         pace_s_per_m: float | None = None,
         for_s: float | None = None,
+        vehicle_class: str | None = None,
     ) -> tuple[str, Acknowledged]:
         """Close an area, or give it a pace. Returns the zone's name, too.
 
@@ -81,12 +82,13 @@ class Orders:
         name          a zone that has it is replaced; the keeper finds one if it is empty
         pace_s_per_m  None: no vehicle enters
         for_s         the zone ends by itself; None: never
+        vehicle_class  for vehicles of this class only; None: for all
         """
         zones, acknowledged = self._operator.zone(
             _checked(
                 ZoneOrder, action="add", name=name, kind="lethal" if pace_s_per_m is None else "pace",
                 pace_s_per_m=pace_s_per_m, polygon_m=[*map(list, polygon_m)],
-                lasts_s=for_s,
+                lasts_s=for_s, vehicle_class=vehicle_class,
             )
         )  # fmt: skip
         return zones.changed, acknowledged

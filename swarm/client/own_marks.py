@@ -42,15 +42,24 @@ class OwnMarks:
         return bool(self._sets)
 
     def state(
-        self, cells: Iterable[int], kind: MarkKind, pace_s_per_m: float, now_ns: int, until_ns: int = FOREVER
+        self,
+        cells: Iterable[int],
+        kind: MarkKind,
+        pace_s_per_m: float,
+        now_ns: int,
+        until_ns: int = FOREVER,
+        class_number: int = 0,
     ) -> list[MarkSet]:
-        """State the same of all these cells of the grid. Returns the sets to put."""
+        """State the same of all these cells of the grid. Returns the sets to put.
+
+        class_number  for whom: 0 is all vehicles, a class of the scenario counts from 1 on
+        """
         self._stamp_ns = max(self._stamp_ns + 1, now_ns)
         statement = _Statement(kind, pace_s_per_m, self._stamp_ns, until_ns)
         changed: dict[int, None] = {}
         for cell in cells:
             row, col = self._grid.row_col(cell)
-            tile = self._grid.tile_of(cell)
+            tile = self._grid.tile_for(self._grid.tile_of(cell), class_number)
             changed[tile] = None
             self._tiles.setdefault(tile, {})[row % TILE_CELLS * TILE_CELLS + col % TILE_CELLS] = statement
         return [self._set(tile, now_ns) for tile in changed]
@@ -77,7 +86,7 @@ class OwnMarks:
         return Digest(author=self.author, role="rover", held={self.author: rows}, seq=self._digests)
 
     def region_of(self, of: MarkSet) -> int:
-        return self._grid.region_of_tile(of.tile)
+        return self._grid.region_of_tile(self._grid.class_of_tile(of.tile)[1])
 
     def _set(self, tile: int, now_ns: int, epoch: int | None = None) -> MarkSet:
         stated = self._tiles[tile]

@@ -124,6 +124,15 @@ class Session:
         except ConfigError as error:
             raise self.refused(str(error)) from None
 
+    def class_number(self, name: str, argument: str) -> int:
+        """The number of one of the scenario's classes, by which marks name it. Raises ConfigError, and counts it,
+        if there is no such class."""
+        classes = self.run.classes
+        if name not in classes:
+            known = f"there are {', '.join(classes)}" if classes else "the scenario has no [[classes]]"
+            raise self.refused(f"{argument}: there is no class {name!r} beside that of [cost]; {known}")
+        return classes.index(name) + 1
+
     def ask(self, topic: Topic, request: Message, timeout_s: float, **fields: str) -> Future[list[Any]]:
         """All answers to a question. Its failure is a BusError."""
         self.check_open()

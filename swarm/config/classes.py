@@ -81,6 +81,11 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     air: AirConfig | None = None
 
 
+def class_numbers(scenario: Scenario) -> dict[str, int]:
+    """Class -> its number, by which marks name it: from 1 on, as `[[classes]]` lists them."""
+    return {each.name: number for number, each in enumerate(scenario.classes, 1)}
+
+
 def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
     """What was read of a scenario, with the whole cost of every class: that of `[cost]`, then the settings of the
     class's own preset, then what it says itself.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from swarm.config.agents import AddedAgent, crew_of
+from swarm.config.classes import class_numbers
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.fields import MOST_IDS
@@ -58,6 +59,7 @@ class RoleSetup:
             vehicles=self.scenario.vehicle_count,
             crew=[f"{role}-{id}" for role, id in crew_of(self.scenario)][:MOST_IDS],
             restarts=self.restarts,
+            classes=list(class_numbers(self.scenario)),
         )
 
     @property

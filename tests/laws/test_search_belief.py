@@ -162,6 +162,7 @@ def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_lo
 
 @settings(max_examples=60, deadline=None)
 @given(_SIDES, _SIDES, _SEEDS, st.floats(1, 120), st.integers(1, 700))
+@example(1, 25, 0, 1.0, 9)
 def test_who_stands_where_it_was_sent_to_look_sees_something_of_that_block(
     rows: int, cols: int, seed: int, range_m: float, most_blocks: int
 ) -> None:

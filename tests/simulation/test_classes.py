@@ -14,9 +14,10 @@ from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, nodes_of
 from shared_map.class_grounds import ClassGround, class_grounds
+from shared_map.keeper.zones import zones_of
 from shared_map.terrain.terrain import build_truth
 from swarm.config.agents import added_agent
-from swarm.config.classes import ClassConfig
+from swarm.config.classes import ClassConfig, class_numbers
 from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError
 from swarm.wire.messages.orders import ZoneOrder
@@ -174,3 +175,36 @@ def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_
     assert not in_zone.ravel()[list(places.values())].any()
     assert (laws.lethal, laws.collisions) == ([], [])
     assert added.service.agent.plan.group.vehicle_class == "walker"  # type: ignore[union-attr]
+
+
+def test_a_zone_for_walkers_is_left_by_walkers_and_says_nothing_to_rovers() -> None:
+    scenario, terrain = made(_TEXT)
+    simulation = Simulation(scenario, terrain=terrain)
+    laws = Laws(simulation)
+    simulation.run_until(3.0)
+    by_class = {"ground": ("a0", "a1"), "walker": ("a2", "a3")}
+
+    def cells(name: str) -> list[int]:
+        agents = [simulation.nodes[f"agent-{id}"].service for id in by_class[name]]
+        return [each.cell for agent in agents for each in agent.agent.vehicles.values()]  # type: ignore[union-attr]
+
+    row, col = terrain.grid.row_col(cells("walker")[0])
+    corners = [(row + south, col + east) for south, east in ((-6, -6), (-6, 6), (6, 6), (6, -6))]
+    zone = [(min(max(r, 0), 63), min(max(c, 0), 63)) for r, c in corners]
+    order = ZoneOrder(action="add", name="z", polygon=zone, vehicle_class="walker")
+    simulation.order(3.0, order)
+    simulation.order(3.1, ZoneOrder(action="add", name="y", polygon=zone, vehicle_class="boat"))
+    inside = np.zeros((64, 64), bool)
+    inside[zone[0][0] + 1 : zone[2][0] - 1, zone[0][1] + 1 : zone[2][1] - 1] = True
+    simulation.run_until(4.0)
+    for name, agents in by_class.items():
+        for id in agents:
+            own = simulation.nodes[f"agent-{id}"].service._maps.own.pace_s_per_m  # type: ignore[union-attr]
+            passable = np.isfinite(own[inside])
+            assert not passable.any() if name == "walker" else passable.any()
+    simulation.run_until(20.0)
+    assert not inside.ravel()[cells("walker")].any()
+    assert (laws.lethal, laws.collisions) == ([], [])
+    keeper = next(each.service for id, each in simulation.nodes.items() if id.startswith("keeper"))
+    zones = zones_of(keeper.replica, 0, class_numbers(scenario))  # type: ignore[union-attr]
+    assert [(each.name, each.vehicle_class) for each in zones] == [("z", "walker")]

@@ -16,7 +16,7 @@ def run_info(grid: GridSpec, run_id: str = "run") -> RunInfo:
     return RunInfo(
         run_id=run_id, role="keeper", id="0", incarnation=1, scenario="s", terrain="0", rows=grid.rows,
         cols=grid.cols, resolution_m=grid.resolution_m, started_ns=0, west_m=grid.west_m, north_m=grid.north_m,
-        crs=grid.crs,
+        crs=grid.crs, classes=["walker", "truck"],
     )  # fmt: skip
 
 

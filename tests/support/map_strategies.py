@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Bus, Event, Heard
+from swarm.config.classes import MOST_CLASSES
 from swarm.grid import GridSpec
 from swarm.wire.messages.marks import SEQ_STEP, Digest, MarkSet
 from swarm.wire.statements import MarkKind
@@ -58,7 +59,7 @@ def set_of(
 
 def _inside(tile: int) -> list[int]:
     """A few cells of each tile of GRID, so that authors meet."""
-    window = GRID.tile_window(tile)
+    window = GRID.tile_window(GRID.class_of_tile(tile)[1])
     rows, cols = window.row1 - window.row0, window.col1 - window.col0
     return [r * 32 + c for r in range(0, rows, 7) for c in range(0, cols, 5)][:6]
 
@@ -66,7 +67,7 @@ def _inside(tile: int) -> list[int]:
 @st.composite
 def mark_sets(draw: st.DrawFn) -> MarkSet:
     """A valid set on GRID. Stamps and numbers are small, so that ties happen all the time."""
-    tile = draw(st.integers(0, GRID.tiles - 1))
+    tile = GRID.tile_for(draw(st.integers(0, GRID.tiles - 1)), draw(st.sampled_from([0, 0, 1, 3])))
     said = draw(
         st.dictionaries(
             st.sampled_from(_inside(tile)),
@@ -83,22 +84,23 @@ class Composite:
     """A cost sink that remembers what it was told last of each cell."""
 
     def __init__(self, grid: GridSpec = GRID) -> None:
-        self.kinds = np.full(grid.cells, MarkKind.CLEAR, np.uint8)
-        self.paces = np.zeros(grid.cells, np.float32)
+        self.all_kinds = np.full((MOST_CLASSES + 1, grid.cells), MarkKind.CLEAR, np.uint8)
+        self.all_paces = np.zeros((MOST_CLASSES + 1, grid.cells), np.float32)
+        self.kinds, self.paces = self.all_kinds[0], self.all_paces[0]
         self.changed: list[int] = []  # cells of which the last `apply` told
 
-    def apply(self, cells: np.ndarray, kinds: np.ndarray, paces: np.ndarray) -> None:
+    def apply(self, cells: np.ndarray, kinds: np.ndarray, paces: np.ndarray, class_number: int = 0) -> None:
         assert len(np.unique(cells)) == len(cells)
         self.changed = sorted(cells.tolist())
-        self.kinds[cells] = kinds
-        self.paces[cells] = paces
+        self.all_kinds[class_number, cells] = kinds
+        self.all_paces[class_number, cells] = paces
 
     def learn(self, words: object) -> bool:
         """What is learned is about no cell."""
         return False
 
     def same(self, other: Composite) -> bool:
-        return bool((self.kinds == other.kinds).all() and (self.paces == other.paces).all())
+        return bool((self.all_kinds == other.all_kinds).all() and (self.all_paces == other.all_paces).all())
 
 
 def merge_one(replica: MapReplica, each: MarkSet) -> list[int] | None:

@@ -62,6 +62,9 @@ def add(
         str | None, typer.Option(help="How long it lasts: 90s, 10m, 2h. Until it is removed, if not given.")
     ] = None,
     name: Annotated[str, typer.Option(help="Its name; an existing zone of that name is replaced.")] = "",
+    vehicle_class: Annotated[
+        str | None, typer.Option("--class", help="For vehicles of this class of the scenario only.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Close an area, or set its pace. Returns once all maps and trees go by it.
@@ -70,7 +73,7 @@ def add(
 
     swarm zone add --polygon "46.80,9.84 46.81,9.84 46.81,9.86" --kind pace:0.5
 
-    swarm zone add --file quarry.geojson --name quarry
+    swarm zone add --file quarry.geojson --name quarry --class truck
 
     Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several.
     """
@@ -78,6 +81,7 @@ def add(
     from swarm.wire.messages.orders import ZoneOrder
 
     fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _seconds(until)}
+    fields["vehicle_class"] = vehicle_class
     places = _places("--polygon", polygon)
     fields["polygon"] = [(0.0, 0.0) for _ in places]
     fields["polygon_m"] = _corners("--polygon-m", polygon_m)
@@ -213,7 +217,8 @@ def _line(zone: Zone, frame: MapFrame) -> str:
     left = "" if zone.until_ns is None else f", ends in {max(zone.until_ns / 1e9 - time.time(), 0):.0f} s"
     within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
     ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
-    return f"zone {zone.name}: {kind}, {within}{left}" + (f"; {ends}" if ends else "")
+    whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"
+    return f"zone {zone.name}: {kind}{whom}, {within}{left}" + (f"; {ends}" if ends else "")
 
 
 def _ends(zone: Zone, frame: MapFrame) -> list[int]:

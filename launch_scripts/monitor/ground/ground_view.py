@@ -80,6 +80,7 @@ class GroundView:
     layers   tabs of the view
     targets  in order of their colours
     movers   what the legends say of all that moves
+    classes  of vehicles beside "ground", in the order of their numbers
     """
 
     def __init__(
@@ -94,7 +95,9 @@ class GroundView:
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
         movers: Sequence[Look] = (),
+        classes: Sequence[str] = (),
     ) -> None:
+        self._classes = classes
         self._mesh, self._cost_map, self._replica, self._zones = mesh, cost_map, replica, list(zones)
         self._movers = movers
         self._cells = terrain.grid.cells
@@ -191,7 +194,7 @@ class GroundView:
         self._zones_due_ns = now_ns + _ZONES_AGAIN_NS
         if version != self._zones_version:
             self._zones_version = version
-            self._ordered = ordered_areas(self._replica, now_ns)
+            self._ordered = ordered_areas(self._replica, now_ns, self._classes)
             self._colours.close(closed_cells([*self._zones, *self._ordered]))
         self._drawing.ordered(self._ordered)
 

@@ -34,15 +34,20 @@ _LARGEST_FILE = 1 << 25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Area:
-    """A zone: its cells, int64 (n,), and what it does to them."""
+    """A zone: its cells, int64 (n,), and what it does to them.
+
+    vehicle_class  for whom; None: for all
+    """
 
     name: str
     rule: Rule
     cells: NDArray[np.int64]
+    vehicle_class: str | None = None
 
     @property
     def title(self) -> str:
-        return self.name if self.name == self.rule else f"{self.name}: {self.rule}"
+        whom = "" if self.vehicle_class is None else f" for {self.vehicle_class}"
+        return self.name if self.name == self.rule else f"{self.name}: {self.rule}{whom}"
 
 
 def scenario_areas(scenario: Scenario, grid: GridSpec) -> list[Area]:
@@ -62,17 +67,27 @@ def scenario_areas(scenario: Scenario, grid: GridSpec) -> list[Area]:
     return areas
 
 
-def ordered_areas(replica: MapReplica, now_ns: int) -> list[Area]:
-    """The zones of operators that stand."""
+def ordered_areas(replica: MapReplica, now_ns: int, classes: Sequence[str]) -> list[Area]:
+    """The zones of operators that stand.
+
+    classes  of vehicles beside "ground", in the order of their numbers
+    """
     return [
-        Area(name, "no-go" if each.kind == MarkKind.LETHAL else "pace", each.cells)
+        Area(
+            name,
+            "no-go" if each.kind == MarkKind.LETHAL else "pace",
+            each.cells,
+            classes[each.class_number - 1] if each.class_number else None,
+        )
         for name, each in cells_of_zones(replica, now_ns).items()
+        if each.class_number <= len(classes)
     ]
 
 
 def closed_cells(areas: Iterable[Area]) -> NDArray[np.int64]:
-    """Cells that any of these closes."""
-    return np.concatenate([np.empty(0, np.int64), *(area.cells for area in areas if area.rule == "no-go")])
+    """Cells that any of these closes for all vehicles."""
+    closed = (area.cells for area in areas if area.rule == "no-go" and area.vehicle_class is None)
+    return np.concatenate([np.empty(0, np.int64), *closed])
 
 
 def borders(mesh: TerrainMesh, areas: Sequence[Area]) -> Floats:

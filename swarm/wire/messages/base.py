@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swarm.wire.fields import Bounded
 
-WIRE_VERSION = 7
+WIRE_VERSION = 8
 
 
 class Message(Bounded, frozen=True, kw_only=True, tag_field="schema"):

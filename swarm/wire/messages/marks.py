@@ -49,6 +49,9 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     authors: drop from them what others overrule. Such a set without statements is a tombstone: readers forget the
     tile of that author.
 
+    tile       of a grid of N tiles: 0 ... N - 1 for all vehicles; N tells what its author has learned; tile
+               n (N + 1) + t is tile t for the n-th of the scenario's classes alone
+
     cells      uint16  index inside the tile, row-major over 32 x 32, strictly increasing
     kinds      uint8   MarkKind
     paces      float32 s/m for PACE, ignored otherwise

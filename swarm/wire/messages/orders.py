@@ -50,6 +50,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     polygon_m     corners [x_m, y_m] instead, as poses have them
     corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     lasts_s       after so long the zone ends by itself; without it never
+    vehicle_class  for vehicles of this class only, one of the scenario's `[[classes]]`; without it for all
     """
 
     action: Literal["add", "remove", "list"] = "list"
@@ -60,6 +61,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     polygon_m: Corners = []
     lasts_s: _Seconds | None = None
     corners: Annotated[list[PlaceText], Meta(max_length=MOST_CORNERS)] = []
+    vehicle_class: Id | None = None
 
     def relate(self) -> None:
         if self.name and _ZONE_NAME.fullmatch(self.name) is None:
@@ -93,6 +95,7 @@ class Zone(Bounded, frozen=True, kw_only=True):
     cells         how many cells it covers
     window        [row0, col0, row1, col1] around them
     until_ns      when it ends by itself, by the keeper's clock; None if it does not
+    vehicle_class  for whom it is; None: for all
     """
 
     name: Id
@@ -101,6 +104,7 @@ class Zone(Bounded, frozen=True, kw_only=True):
     cells: Count
     window: Annotated[list[CellIndex], Meta(min_length=4, max_length=4)]
     until_ns: StampNs | None
+    vehicle_class: Id | None = None
 
 
 class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):

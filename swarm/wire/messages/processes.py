@@ -38,6 +38,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     now_ns                      its clock when it answered, as of its last tick; 0 before the first
     vehicles, crew              how many vehicles the scenario has, and which processes it needs, as `role-id`
     restarts                    how often the process was started again in this run
+    classes                     the classes of vehicles beside "ground", in the order of their numbers
     """
 
     run_id: Word
@@ -57,6 +58,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     vehicles: Count = 0
     crew: Annotated[list[Word], Meta(max_length=MOST_IDS)] = []
     restarts: Count = 0
+    classes: Annotated[list[Id], IDS] = []
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):

@@ -173,12 +173,12 @@ def test_zones_of_operators_are_those_that_stand() -> None:
             paces=pack_column([0.5] * len(cells), "<f4"), stamps_ns=pack_column([1] * len(cells), "<i8"),
         )  # fmt: skip
 
-    assert ordered_areas(replica, 10) == []
+    assert ordered_areas(replica, 10, []) == []
     replica.merge([order("z1", 0, [33, 34], MarkKind.LETHAL, 1), order("z2", 1, [0], MarkKind.PACE, 1)])
-    z1, z2 = ordered_areas(replica, 10)
+    z1, z2 = ordered_areas(replica, 10, [])
     assert (z1.title, z1.cells.tolist(), z2.title, z2.cells.tolist()) == ("z1: no-go", [51, 52], "z2: pace", [32])
     replica.merge([order("z1", 0, [], MarkKind.LETHAL, 2)])
-    assert [area.name for area in ordered_areas(replica, 10)] == ["z2"]
+    assert [area.name for area in ordered_areas(replica, 10, [])] == ["z2"]
 
 
 @pytest.mark.parametrize(("width_cells", "text"), [(50, "100 m"), (400, "1 km"), (4100, "10 km")])

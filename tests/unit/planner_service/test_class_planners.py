@@ -50,6 +50,9 @@ name = "same"
 """
 
 
+_NUMBERS = {"walker": 1, "low": 2, "same": 3}
+
+
 @cache
 def _made() -> tuple[Scenario, Terrain, dict[str, Terrain]]:
     scenario = parse_scenario(_TEXT)
@@ -78,36 +81,54 @@ _STATEMENTS = st.lists(
 )
 
 
+_BATCHES = st.lists(st.tuples(st.sampled_from([0, 0, 1, 2, 3, 4]), _STATEMENTS), max_size=5)
+"""Statements with the number of the class that they are for; of the fourth there is none."""
+
+
 @settings(max_examples=few(60), deadline=None)
-@given(first=_STATEMENTS, second=_STATEMENTS)
+@given(batches=_BATCHES, seed=st.integers(0, 1 << 30))
 def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(
-    first: list[Any], second: list[Any]
+    batches: list[tuple[int, list[Any]]], seed: int
 ) -> None:
     _, terrain, classes = _made()
-    in_turn, at_once = (ClassMaps(CostMap(terrain), classes) for _ in range(2))
-    for batch in (first, second):
-        _apply(in_turn, batch)
-    _apply(at_once, list({cell: each for each in first + second for cell in each[:1]}.values()))
+    in_turn, at_once = (ClassMaps(CostMap(terrain), classes, _NUMBERS) for _ in range(2))
+    said: dict[int, dict[int, Any]] = {number: {} for number in range(5)}
+    for number, batch in batches:
+        _apply(in_turn, batch, number)
+        said[number] |= {each[0]: each for each in batch}
+    for number in np.random.default_rng(seed).permutation(5).tolist():
+        _apply(at_once, list(said[number].values()), number)
     common = in_turn.common
+    assert np.array_equal(common.pace_s_per_m, at_once.common.pace_s_per_m)
     for name, cost_map in in_turn.of.items():
-        own = classes[name]
+        own, own_said = classes[name], said[_NUMBERS[name]]
         assert np.array_equal(cost_map.pace_s_per_m, at_once.of[name].pace_s_per_m)
         assert np.isinf(cost_map.pace_s_per_m[np.isinf(own.ground_s_per_m)]).all()
         closed_by_mark = np.isinf(common.ground_s_per_m) & np.isfinite(terrain.ground_s_per_m)
         assert np.isinf(cost_map.pace_s_per_m[closed_by_mark]).all()
         truth = read_by(own.ground_s_per_m.ravel(), terrain.ground_s_per_m.ravel(), common.ground_s_per_m.ravel())
         unmarked = np.ones(terrain.grid.cells, bool)
-        unmarked[[each[0] for each in first + second]] = False
+        unmarked[list(said[0])] = False
         assert np.array_equal(truth[unmarked], own.ground_s_per_m.ravel()[unmarked])
+        for cell, kind, pace in own_said.values():
+            for_all = said[0].get(cell, (cell, MarkKind.CLEAR, 0.0))
+            closed = for_all[1] == MarkKind.LETHAL or np.isinf(own.ground_s_per_m.item(cell))
+            if kind == MarkKind.LETHAL:
+                assert np.isinf(cost_map.ground_s_per_m.item(cell))
+            elif kind == MarkKind.PACE and not closed:
+                assert cost_map.ground_s_per_m.item(cell) == max(np.float32(pace), np.float32(own.least_s_per_m))
     same = in_turn.of["same"]
     open_before = np.isfinite(terrain.pace_s_per_m)
-    assert np.array_equal(same.pace_s_per_m[open_before], common.pace_s_per_m[open_before])
+    if not any(each[1] != MarkKind.CLEAR for each in said[_NUMBERS["same"]].values()):
+        assert np.array_equal(same.pace_s_per_m[open_before], common.pace_s_per_m[open_before])
 
 
-def _apply(maps: ClassMaps, batch: list[Any]) -> None:
-    cells = np.array([each[0] for each in batch], np.uint32)
-    kinds = np.array([each[1] for each in batch], np.uint8)
-    maps.apply(cells, kinds, np.array([each[2] for each in batch], np.float32))
+def _apply(maps: ClassMaps, batch: list[Any], class_number: int = 0) -> None:
+    """Makes these the statements, of a cell that is named twice the last."""
+    once = {each[0]: each for each in batch}.values()
+    cells = np.array([each[0] for each in once], np.uint32)
+    kinds = np.array([each[1] for each in once], np.uint8)
+    maps.apply(cells, kinds, np.array([each[2] for each in once], np.float32), class_number)
 
 
 # --- planners -------------------------------------------------------------------------------------------------
@@ -231,7 +252,7 @@ def test_an_unknown_class_is_refused_with_those_there_are(world: _World) -> None
 
 def test_what_is_learned_of_a_kind_of_ground_holds_for_every_class() -> None:
     _, terrain, classes = _made()
-    maps = ClassMaps(CostMap(terrain, learning=True), classes)
+    maps = ClassMaps(CostMap(terrain, learning=True), classes, _NUMBERS)
     writer = MapReplica(terrain.grid, CostMap(terrain, learning=True), author="all.a0.1")
     kinds = np.unique(maps.common.keys[np.isfinite(terrain.pace_s_per_m)])  # type: ignore[index]
     learned = {int(kind): Said(500, round(np.log(3) * ONE), ONE // 10) for kind in kinds}

@@ -151,13 +151,17 @@ def test_tombstones_in_any_order_leave_equal_replicas(sets: list[MarkSet], seed:
             replica.merge(deliveries[at : at + 5])
         prints.add(replica.held.fingerprint())
         winners = held_winners(replica)
-        assert {key: (int(sink.kinds[_flat(*key)]), float(sink.paces[_flat(*key)])) for key in winners} == winners
+        assert {
+            key: (int(sink.all_kinds[_at(*key)]), float(sink.all_paces[_at(*key)])) for key in winners
+        } == winners
     assert len(prints) == 1
 
 
-def _flat(tile: int, cell: int) -> int:
-    window = GRID.tile_window(tile)
-    return GRID.cell(window.row0 + cell // 32, window.col0 + cell % 32)
+def _at(tile: int, cell: int) -> tuple[int, int]:
+    """The number of the class that a tile is for, and the cell of the grid."""
+    class_number, place = GRID.class_of_tile(tile)
+    window = GRID.tile_window(place)
+    return class_number, GRID.cell(window.row0 + cell // 32, window.col0 + cell % 32)
 
 
 # --- two keepers, with different knowledge ------------------------------------------------------------------

@@ -16,6 +16,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
+from swarm.config.classes import MOST_CLASSES
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import MarkKind
 
@@ -195,7 +196,8 @@ def test_operators_do_not_learn_and_no_set_lies_further_beyond() -> None:
     (word,) = sets_of("all.a.1", {0: THRICE})
     replica, cost_map = replica_of(None, GROUND)
     assert word.tile == beyond_tile(cost_map.grid)
-    replica.merge([replace(word, tile=word.tile + 1), replace(word, author="operator.z1", group="operator")])
+    beyond_all = (MOST_CLASSES + 1) * (word.tile + 1)
+    replica.merge([replace(word, tile=beyond_all), replace(word, author="operator.z1", group="operator")])
     assert replica.counts["sets_refused"] == 2
     assert (cost_map.factors == 1).all()
 

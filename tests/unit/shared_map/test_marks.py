@@ -67,7 +67,10 @@ def test_every_tile_is_in_exactly_one_region() -> None:
 @pytest.mark.parametrize(
     ("mark_set", "reason"),
     [
-        (set_of("a", 6, 0, {}), "tile 6 is not in 0..5"),
+        (set_of("a", 6, 0, {}), "tile 6 is none of 6 for all vehicles or for one of 7 classes"),
+        (set_of("a", 7 + 6, 0, {}), "tile 13 is none of 6"),
+        (set_of("a", 8 * 7, 0, {}), "tile 56 is none of 6"),
+        (set_of("a", 7 * 7 + 3, 0, {8 * 32: (LETHAL, 0, 1)}), "a cell of tile 52 lies outside the grid"),
         (set_of("a", 2, 0, {6: (LETHAL, 0, 1)}), "a cell of tile 2 lies outside the grid"),
         (set_of("a", 3, 0, {8 * 32: (LETHAL, 0, 1)}), "a cell of tile 3 lies outside the grid"),
     ],

@@ -35,7 +35,7 @@ def test_merge_returns_the_cells_that_changed_and_nothing_for_what_is_known() ->
 
 def test_a_set_off_the_grid_is_refused() -> None:
     replica, _ = replica_of([])
-    assert merge_one(replica, set_of("a", 7, 0, {})) is None
+    assert merge_one(replica, set_of("a", 8 * 7, 0, {})) is None
     assert merge_one(replica, set_of("a", 6, 0, {1: (LETHAL, 0, 70)})) is None  # of tile 6 words of what is learned
     assert replica.counts["sets_refused"] == 2
     assert replica.held.ledger.held() == {}

@@ -381,9 +381,9 @@ def test_a_zone_of_a_pace_does_not_open_what_the_terrain_closes() -> None:
     order = ZoneOrder(
         action="add", name="z", kind="pace", pace_s_per_m=0.5, polygon=[(2, 2), (2, 8), (5, 8), (5, 2)]
     )
-    sets = zone_sets(order, replica, terrain, store.set_aside, 1)
+    sets = zone_sets(order, replica, terrain, store.set_aside, 1, {})
     assert not isinstance(sets, str)
     assert sum(len(each.kinds) for each in sets) == 3 * 6 - 3
     closed = msgspec.structs.replace(order, polygon=[(3, 3), (3, 6), (4, 6), (4, 3)])
-    refused = zone_sets(closed, replica, terrain, store.set_aside, 1)
+    refused = zone_sets(closed, replica, terrain, store.set_aside, 1, {})
     assert refused == "polygon: a zone of a pace in which all cells of the terrain are lethal, and stay so"

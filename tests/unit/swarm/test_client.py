@@ -166,6 +166,16 @@ def test_a_route_is_the_planners_and_costs_what_it_says(world: Swarm) -> None:
     wire = WireRoute(status=RouteStatus.OK, start=route.cells[0], directions=directions, cost_s=1.0)
     assert driven_s(world.pace, wire) == pytest.approx(route.cost_s, rel=1e-4)
     assert 0 < route.lower_bound_s <= route.cost_s * 1.0001
+    assert route.target_cell == GRID.cell(5, 40)
+
+
+def test_a_route_from_anywhere_needs_no_vehicle(world: Swarm) -> None:
+    swarm = Program(world).swarm
+    asked = swarm.route_soon("t", *GRID.centre_m(GRID.cell(30, 3)))
+    world.run(0.1)
+    assert (asked.result(0).cells[0], asked.result(0).target_cell) == (GRID.cell(30, 3), GRID.cell(5, 40))
+    with pytest.raises(ConfigError, match="outside the terrain"):
+        swarm.route_soon("t", -1e6, 0.0)
 
 
 def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm) -> None:
@@ -273,6 +283,38 @@ def test_what_is_marked_reaches_every_replica_and_the_keeper_and_ends_when_it_sh
     assert keeper is not None
 
 
+def test_what_is_marked_for_one_class_reaches_that_class_alone() -> None:
+    world = SwarmModel()
+    keeper, ear = world.keeper("0", KeeperStore(":memory:")), world.listener("ear")
+    program = Program(world)
+    watcher = program.swarm.observer()
+    rover = program.swarm.vehicle("rover")
+    last = MAP_GRID.cells - 1
+    rover.mark([0, last], lethal=True, only_for="truck")
+    rover.mark([0], pace_s_per_m=0.5)
+    world.run(1.0)
+    sink = ear.replica._cost_map
+    assert (sink.all_kinds[2, 0], sink.all_kinds[2, last], sink.kinds[0], sink.kinds[last]) == (
+        LETHAL,
+        LETHAL,
+        PACE,
+        CLEAR,
+    )
+    assert (sorted(watcher.marks), sorted(watcher.marks_for("truck"))) == ([0], [0, last])
+    assert not watcher.marks_for("walker")
+    rover.mark([0], clear=True, only_for="truck")
+    world.run(1.0)
+    assert (sink.all_kinds[2, 0], sink.kinds[0]) == (CLEAR, PACE)
+    rover.leave()
+    world.run(1.0)
+    late = world.listener("late")
+    world.run(2.0)
+    assert late.replica._cost_map.same(sink), "the keeper has it, though its author is gone"
+    with pytest.raises(ConfigError, match="only_for: there is no class 'boat' beside that of"):
+        rover.mark([1], lethal=True, only_for="boat")
+    assert keeper is not None
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_marks_reach_every_replica_though_messages_are_lost_and_repeated(seed: int) -> None:
     world = SwarmModel(LossyLinks(seed, dropped=0.4, repeated=0.3, jitter_ms=50))
@@ -365,8 +407,9 @@ def test_a_keeper_that_took_us_for_dead_is_told_again_under_a_higher_epoch() -> 
     assert marks.heard(mine, 300) == marks.heard(again, 300) == []
 
 
+AUTHORS = ["all.a.1", "all.b.2", "all.c.3", "operator.north", "operator.south"]
 stated = st.tuples(
-    st.sampled_from(["all.a.1", "all.b.2", "all.c.3"]),
+    st.sampled_from(AUTHORS),
     st.lists(st.integers(0, MAP_GRID.cells - 1), min_size=1, max_size=6),
     st.sampled_from(list(MarkKind)),
     st.integers(0, 40),
@@ -377,7 +420,7 @@ stated = st.tuples(
 @settings(max_examples=few(200), deadline=None)
 @given(st.lists(stated, max_size=12), st.integers(0, 50))
 def test_what_an_observer_shows_as_marked_is_what_a_replica_holds(words: Any, now_ns: int) -> None:
-    authors = {name: OwnMarks(name, "all", MAP_GRID) for name in ("all.a.1", "all.b.2", "all.c.3")}
+    authors = {name: OwnMarks(name, name.partition(".")[0], MAP_GRID) for name in AUTHORS}
     replica = MapReplica(MAP_GRID, Composite())
     sets: dict[tuple[int, str], MarkSet] = {}
     for name, cells, kind, at_ns, until_ns in words:

@@ -1,0 +1,201 @@
+"""How rmw_zenoh names nodes and endpoints: keys of data, liveliness tokens, QoS, attachments. Pure.
+
+Source: rmw_zenoh's design.md and its liveliness_utils; checked against two independent stacks (tests).
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+
+import xxhash
+
+from swarm.errors import ProtocolError
+
+TOKEN_SPACE = "@ros2_lv"
+NO_HASH = "TypeHashNotSupported"
+"""Stands for the hash where a distribution has none: Humble."""
+_GID_BYTES = 16
+_ATTACHMENT = struct.Struct("<qqB")
+_TOKEN_PARTS = 13
+"""Parts of an endpoint's token that every version has. Newer ones append, which is left unread."""
+_NODE_PARTS = 9
+
+
+class Kind(StrEnum):
+    """What an endpoint is, as its token says it."""
+
+    PUBLISHER = "MP"
+    SUBSCRIPTION = "MS"
+    SERVICE = "SS"
+    CLIENT = "SC"
+
+
+class Qos(Enum):
+    """The qualities of service in use, as tokens spell them: reliability:durability:history,depth and the rest.
+
+    Nothing of the first three is left out, for each reader has defaults of its own.
+    """
+
+    DEFAULT = "1:2:1,10:,:,:,,"
+    """Reliable, volatile, the last 10."""
+    LATCHED = "1:1:1,1:,:,:,,"
+    """Reliable, transient local, the last one: who comes late gets it."""
+    SENSOR = "2:2:1,5:,:,:,,"
+    """Best effort, volatile, the last 5."""
+    TRANSFORMS = "1:2:1,100:,:,:,,"
+    """Reliable, volatile, the last 100: /tf."""
+
+    @property
+    def latched(self) -> bool:
+        return self is Qos.LATCHED
+
+    @property
+    def best_effort(self) -> bool:
+        return self is Qos.SENSOR
+
+
+@dataclass(frozen=True, slots=True)
+class NodeName:
+    """A node of a Zenoh session. ROS distinguishes nodes of one session by number; ours has one.
+
+    zid        of the session, 32 hexadecimal digits
+    namespace  "/" or "/robots"
+    """
+
+    domain: int
+    zid: str
+    name: str
+    namespace: str = "/"
+
+    @property
+    def token(self) -> str:
+        return f"{TOKEN_SPACE}/{self.domain}/{self.zid}/0/0/NN/{self.tail}"
+
+    @property
+    def tail(self) -> str:
+        """Enclave, namespace and name: no enclave, as nothing here speaks ROS's own security."""
+        return f"%/{mangled(self.namespace)}/{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A publisher, subscription, service or client of a node.
+
+    number     in its session, from 1 on
+    topic      with its leading slash: "/map"
+    type_name  "nav_msgs/msg/OccupancyGrid", of a service without _Request
+    type_hash  "RIHS01_..." or NO_HASH; of a service, the service's own
+    qos        as the token spells it
+    """
+
+    node: NodeName
+    number: int
+    kind: Kind
+    topic: str
+    type_name: str
+    type_hash: str
+    qos: str
+
+    @property
+    def key(self) -> str:
+        """The Zenoh key of the data, or of the service's queryable."""
+        return f"{self.node.domain}/{self.topic.strip('/')}/{dds_name(self.type_name)}/{self.type_hash}"
+
+    @property
+    def token(self) -> str:
+        node = self.node
+        return (
+            f"{TOKEN_SPACE}/{node.domain}/{node.zid}/0/{self.number}/{self.kind}/{node.tail}/"
+            f"{mangled(self.topic)}/{dds_name(self.type_name)}/{self.type_hash}/{self.qos}"
+        )
+
+    @property
+    def gid(self) -> bytes:
+        """16 bytes that name it in attachments: XXH3-128 of the token, low half first."""
+        return xxhash.xxh3_128_digest(self.token.encode())[::-1]
+
+
+def mangled(name: str) -> str:
+    """A name as a part of a token: slashes are '%'."""
+    return name.replace("/", "%") or "%"
+
+
+def dds_name(type_name: str) -> str:
+    """nav_msgs/msg/Path -> nav_msgs::msg::dds_::Path_"""
+    package, kind, base = type_name.split("/")
+    return f"{package}::{kind}::dds_::{base}_"
+
+
+def ros_name(dds: str) -> str:
+    """nav_msgs::msg::dds_::Path_ -> nav_msgs/msg/Path. Raises ProtocolError."""
+    parts = dds.split("::")
+    if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
+        raise ProtocolError(f"type is {dds!r}, expected package::kind::dds_::Name_")
+    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """What goes with each message, request and reply.
+
+    sequence   counted by the sender from 1 on; a reply repeats its request's
+    stamp_ns   when it was sent, since 1970
+    gid        of the sending endpoint; a reply repeats its request's
+    """
+
+    sequence: int
+    stamp_ns: int
+    gid: bytes
+
+    def packed(self) -> bytes:
+        """33 bytes, as Zenoh serialises int64, int64 and an array."""
+        return _ATTACHMENT.pack(self.sequence, self.stamp_ns, len(self.gid)) + self.gid
+
+    @classmethod
+    def of(cls, content: bytes) -> Attachment:
+        """Raises ProtocolError."""
+        if len(content) != _ATTACHMENT.size + _GID_BYTES or content[_ATTACHMENT.size - 1] != _GID_BYTES:
+            raise ProtocolError(f"attachment has {len(content)} bytes, expected 33 with a gid of 16")
+        sequence, stamp_ns, _ = _ATTACHMENT.unpack_from(content)
+        return cls(sequence, stamp_ns, content[_ATTACHMENT.size :])
+
+
+@dataclass(frozen=True, slots=True)
+class SeenEndpoint:
+    """An endpoint of somebody's, as its token told it."""
+
+    domain: int
+    zid: str
+    kind: Kind
+    node: str
+    topic: str
+    type_name: str
+    type_hash: str
+    qos: str
+
+
+def read_token(key: str) -> SeenEndpoint | None:
+    """What the token of an endpoint tells; None of a node's. Raises ProtocolError of anything else."""
+    parts = key.split("/")
+    if len(parts) >= _NODE_PARTS and parts[0] == TOKEN_SPACE and parts[5] == "NN":
+        return None
+    if len(parts) < _TOKEN_PARTS or parts[0] != TOKEN_SPACE:
+        raise ProtocolError(
+            f"token {key[:200]!r} has {len(parts)} parts, expected {_TOKEN_PARTS} below {TOKEN_SPACE}"
+        )
+    try:
+        domain, kind = int(parts[1]), Kind(parts[5])
+    except ValueError as error:
+        raise ProtocolError(f"token {key[:200]!r}: {error}") from error
+    return SeenEndpoint(
+        domain=domain,
+        zid=parts[2],
+        kind=kind,
+        node=parts[8],
+        topic=parts[9].replace("%", "/"),
+        type_name=ros_name(parts[10]),
+        type_hash=parts[11],
+        qos=parts[12],
+    )

@@ -1,0 +1,322 @@
+"""ROS messages of swarm state: headings, flipped rows and marker numbers are right, and every message packs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from launch_scripts.ros2 import grids, markers
+from launch_scripts.ros2.frames import (
+    RosMap,
+    heading_of,
+    heading_of_quaternion,
+    headings_along,
+    quaternion_of,
+    yaw_of,
+)
+from launch_scripts.ros2.markers import Drawing, Form, MarkerBook
+from launch_scripts.ros2.messages import Level, RosMessages, Severity
+from launch_scripts.ros2.types import Distribution, types_of
+from swarm.grid import GridSpec, Window
+
+STAMP_NS = 1_700_000_000_123_456_789
+HEADINGS = st.floats(-2 * math.tau, 2 * math.tau)
+GRIDS = st.builds(
+    GridSpec,
+    st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 1.0, 10.0, 25.0]),
+    st.floats(-1e6, 1e6), st.floats(-1e7, 1e7), st.just("EPSG:32632"),
+)  # fmt: skip
+GRID = GridSpec(4, 6, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
+
+
+def maker(grid: GridSpec = GRID, distribution: Distribution = Distribution.JAZZY) -> RosMessages:
+    return RosMessages(types_of(distribution), RosMap(grid))
+
+
+def as_sent(messages: RosMessages, message: Any) -> Any:
+    """What a peer reads of it."""
+    name = str(message.__msgtype__)
+    return messages.types.unpack(messages.types.pack(message, name), name)
+
+
+def same_angle(a: float, b: float) -> bool:
+    return math.cos(a - b) == pytest.approx(1, abs=1e-12)
+
+
+# --- headings -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("looks", "heading", "yaw"), [("north", 0, 90), ("east", 90, 0), ("south", 180, -90)])
+def test_yaw_is_counter_clockwise_from_east(looks: str, heading: float, yaw: float) -> None:
+    assert yaw_of(math.radians(heading)) == pytest.approx(math.radians(yaw))
+    assert heading_of(math.radians(yaw)) == pytest.approx(math.radians(heading))
+
+
+@given(HEADINGS)
+def test_headings_survive_yaws_and_quaternions(heading_rad: float) -> None:
+    assert -math.pi <= yaw_of(heading_rad) <= math.pi
+    assert same_angle(heading_of(yaw_of(heading_rad)), heading_rad)
+    read = heading_of_quaternion(*quaternion_of(heading_rad))
+    assert read is not None
+    assert 0 <= read < math.tau
+    assert same_angle(read, heading_rad)
+
+
+@given(HEADINGS, st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
+def test_a_heading_is_read_below_roll_and_pitch_as_where_the_nose_points(
+    heading_rad: float, roll_rad: float, pitch_rad: float
+) -> None:
+    read = heading_of_quaternion(*rolled(yaw_of(heading_rad), pitch_rad, roll_rad))
+    assert read is not None
+    assert math.cos(read - heading_rad) == pytest.approx(1, abs=1e-9)
+
+
+def rolled(yaw: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
+    """The quaternion of Z(yaw) Y(pitch) X(roll), as tf2 has it."""
+    cy, sy, cp, sp, cr, sr = (f(a / 2) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+@given(st.tuples(*[st.floats()] * 4))
+def test_no_quaternion_of_others_raises(quaternion: tuple[float, float, float, float]) -> None:
+    heading = heading_of_quaternion(*quaternion)
+    assert heading is None or 0 <= heading < math.tau
+
+
+@given(npst.arrays(np.float64, st.tuples(st.integers(0, 12), st.just(2)), elements=st.integers(-3, 3)))
+def test_headings_along_a_line_lead_to_the_next_point(points: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+    headings = headings_along(points)
+    assert len(headings) == len(points)
+    before = None
+    for point, after, heading in zip(points, points[1:], headings, strict=False):
+        step = after - point
+        if step.any():
+            length = math.hypot(*step)
+            assert np.array([math.sin(heading), math.cos(heading)]) * length == pytest.approx(step)
+            before = heading
+        elif before is not None:
+            assert heading == before
+    if len(points) > 1:
+        assert headings[-1] == headings[-2]
+
+
+# --- places and grids ---------------------------------------------------------------------------------------------
+
+
+@given(GRIDS, st.data())
+def test_the_cell_under_a_point_of_ros_is_the_cell_under_ours(grid: GridSpec, data: st.DataObject) -> None:
+    messages = maker(grid)
+    numbers = np.arange(grid.cells).reshape(grid.rows, grid.cols)
+    occupancy = (numbers % 97).astype(np.int8)
+    sent = as_sent(messages, grids.occupancy_grid(messages, STAMP_NS, occupancy))
+    cell = data.draw(st.integers(0, grid.cells - 1))
+    x_m, y_m = messages.map.to_ros(*grid.centre_m(cell))
+    assert grids.cell_at(messages.map, x_m, y_m) == cell
+    # As Nav2's costmap_2d finds it: worldToMap.
+    col = int((x_m - sent.info.origin.position.x) / sent.info.resolution)
+    row = int((y_m - sent.info.origin.position.y) / sent.info.resolution)
+    assert sent.data[row * sent.info.width + col] == cell % 97
+    assert messages.map.to_terrain(x_m, y_m) == pytest.approx(grid.centre_m(cell))
+    read = grids.rows_from_north(sent.data, sent.info.height, sent.info.width)
+    assert (read == occupancy).all()
+
+
+@given(GRIDS, st.data())
+def test_an_update_changes_the_cells_of_its_window_and_no_others(grid: GridSpec, data: st.DataObject) -> None:
+    messages = maker(grid)
+    row0, col0 = data.draw(st.integers(0, grid.rows - 1)), data.draw(st.integers(0, grid.cols - 1))
+    window = Window(
+        row0, col0, data.draw(st.integers(row0 + 1, grid.rows)), data.draw(st.integers(col0 + 1, grid.cols))
+    )
+    whole = np.zeros((grid.rows, grid.cols), np.int8)
+    changed = whole.copy()
+    changed[window.row0 : window.row1, window.col0 : window.col1] = (
+        np.arange(window.cells).reshape(window.row1 - window.row0, -1) % 97 + 1
+    )
+    part = changed[window.row0 : window.row1, window.col0 : window.col1]
+    update = as_sent(messages, grids.occupancy_update(messages, STAMP_NS, part, window))
+    shown = np.array(grids.occupancy_grid(messages, STAMP_NS, whole).data).reshape(grid.rows, grid.cols)
+    # As RViz pastes it.
+    pasted = shown[update.y : update.y + update.height, update.x : update.x + update.width]
+    pasted[:] = update.data.reshape(update.height, update.width)
+    assert (shown.reshape(-1) == grids.occupancy_grid(messages, STAMP_NS, changed).data).all()
+    assert grids.flipped(grids.flipped(window, grid.rows), grid.rows) == window
+
+
+@given(GRIDS, st.integers(2, 7), st.data())
+def test_a_grid_of_blocks_lies_over_the_same_places(grid: GridSpec, side: int, data: st.DataObject) -> None:
+    messages = maker(grid)
+    shape = -(-grid.rows // side), -(-grid.cols // side)
+    blocks = (np.arange(shape[0] * shape[1]).reshape(shape) % 97).astype(np.int8)
+    made = grids.occupancy_grid(messages, STAMP_NS, blocks, side)
+    cell = data.draw(st.integers(0, grid.cells - 1))
+    x_m, y_m = messages.map.to_ros(*grid.centre_m(cell))
+    col = int((x_m - made.info.origin.position.x) / made.info.resolution)
+    row = int((y_m - made.info.origin.position.y) / made.info.resolution)
+    assert made.data[row * made.info.width + col] == blocks[cell // grid.cols // side, cell % grid.cols // side]
+
+
+PACES = npst.arrays(
+    np.float32, (3, 5), elements=st.floats(0.0625, 100, width=32) | st.sampled_from([math.inf, math.nan])
+)
+
+
+@given(PACES, st.floats(0.01, 1.0))
+def test_occupancy_is_what_is_lost_of_the_best_speed(pace: np.ndarray[Any, Any], best: float) -> None:
+    occupancy = grids.occupancy_of(pace, best)
+    assert ((occupancy == grids.LETHAL) == np.isinf(pace)).all()
+    assert ((occupancy == grids.UNKNOWN) == np.isnan(pace)).all()
+    finite = np.isfinite(pace)
+    lost = 100 * (1 - best / np.maximum(pace[finite].astype(float), best))
+    assert np.abs(occupancy[finite] - np.minimum(lost, 98)).max(initial=0) <= 0.51
+    order = np.argsort(pace[finite])
+    assert (np.diff(occupancy[finite][order].astype(int)) >= 0).all()
+
+
+def test_occupancy_is_refused_for_another_grid() -> None:
+    with pytest.raises(ValueError, match="not those of 4 x 6 cells"):
+        grids.occupancy_grid(maker(), STAMP_NS, np.zeros((6, 4), np.int8))
+    with pytest.raises(ValueError, match="do not fill"):
+        grids.occupancy_update(maker(), STAMP_NS, np.zeros((1, 1), np.int8), Window(0, 0, 1, 2))
+
+
+# --- markers ------------------------------------------------------------------------------------------------------
+
+LINE_M = np.array([[500_000.0, 5_200_000.0], [500_025.0, 5_199_975.0]])
+DRAWN = st.dictionaries(st.tuples(st.sampled_from("ab"), st.sampled_from("uvwxyz")), st.booleans(), max_size=8)
+
+
+@given(st.lists(DRAWN, max_size=8))
+def test_what_is_drawn_on_screen_is_what_was_drawn_last(histories: list[dict[tuple[str, str], bool]]) -> None:
+    """A viewer that follows actions by layer and number, as RViz does, shows each thing once, and nothing else."""
+    book = MarkerBook(maker())
+    screen: dict[tuple[str, int], str] = {}
+    numbers: dict[tuple[str, str], int] = {}
+    for drawn in histories:
+        drawings = [
+            Drawing(layer, name, Form.LINE, LINE_M if visible else LINE_M[:1], (0, 0, 0, 1.0), 2.0)
+            for (layer, name), visible in drawn.items()
+        ]
+        array = book.array(STAMP_NS, drawings, 2.0)
+        shown = {key for key, visible in drawn.items() if visible}
+        assert set(book.numbers) == shown
+        for key in shown & set(numbers):
+            assert book.numbers[key] == numbers[key], "a number changed while it was drawn"
+        numbers = dict(book.numbers)
+        names = {(layer, number): name for (layer, name), number in numbers.items()}
+        for marker in array.markers:
+            if marker.action == 2:
+                screen.pop((marker.ns, marker.id), None)
+            else:
+                screen[marker.ns, marker.id] = names[marker.ns, marker.id]
+        assert {(layer, name) for (layer, _), name in screen.items()} == shown
+    assert max(numbers.values(), default=0) < 12
+
+
+def test_drawings_lie_where_they_are_in_the_map_frame() -> None:
+    cubes, none = markers.marked_cells(GRID, [0, 23], [])
+    assert len(none.points_m) == 0
+    outline = markers.windows(GRID, "t1", [Window(0, 0, 1, 2)])
+    ring = markers.zone(GRID, "forbidden", "lake", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
+    assert ring.points_m.tolist() == [[0, 0], [1, 0], [1, 1], [0, 0]]
+    messages = maker()
+    array = as_sent(messages, MarkerBook(messages).array(STAMP_NS, [cubes, none, outline, ring], 1.5))
+    lethal, window, zone = array.markers
+    assert [(p.x, p.y) for p in lethal.points] == [(12.5, 87.5), (137.5, 12.5)]
+    assert (lethal.type, lethal.scale.x, lethal.ns, lethal.id) == (6, 25.0, "marks", 0)
+    assert {(p.x, p.y) for p in window.points} == {(0, 100), (50, 100), (50, 75), (0, 75)}
+    assert len(window.points) == 8
+    assert (zone.ns, zone.type) == ("zones/forbidden", 4)
+    assert (zone.lifetime.sec, zone.lifetime.nanosec) == (1, 500_000_000)
+    assert zone.pose.orientation.w == 1
+
+
+# --- every message, every distribution ----------------------------------------------------------------------------
+
+
+def every_message(messages: RosMessages) -> list[Any]:
+    x_m, y_m = 500_010.0, 5_199_990.0
+    places = np.array([[x_m, y_m], [x_m + 5, y_m - 5]])
+    book = MarkerBook(messages)
+    book.array(STAMP_NS, [markers.route(GRID, "a1-0", LINE_M)])
+    return [
+        messages.pose_stamped(STAMP_NS, x_m, y_m, 1.0),
+        messages.pose_array(STAMP_NS, places, [0.5, None]),
+        messages.pose_array(STAMP_NS, places[:0]),
+        messages.odometry(STAMP_NS, "a1-0", x_m, y_m, 0.0, 2.5, 0.25),
+        messages.path(STAMP_NS, places),
+        messages.path(STAMP_NS, []),
+        messages.transforms(
+            [messages.map_transform(STAMP_NS), *messages.vehicle_transforms(STAMP_NS, "a1-0", x_m, y_m, 0.0)]
+        ),
+        messages.fix(STAMP_NS, "a1-0/base_link", 46.9, 9.0),
+        messages.diagnostics(
+            STAMP_NS, [messages.diagnostic("planner t1", Level.WARN, "slow", {"routes": 5, "gap": 1.25})]
+        ),
+        messages.log(STAMP_NS, Severity.INFO, "targets", "t1 was captured"),
+        grids.occupancy_grid(messages, STAMP_NS, np.full((4, 6), -1, np.int8)),
+        grids.occupancy_update(messages, STAMP_NS, np.full((2, 3), 100, np.int8), Window(1, 1, 3, 4)),
+        book.array(STAMP_NS, [markers.route(GRID, "a1-1", LINE_M), *markers.marked_cells(GRID, [3], [4])]),
+    ]
+
+
+@pytest.mark.parametrize("distribution", Distribution)
+def test_every_message_is_read_as_it_was_made(distribution: Distribution) -> None:
+    messages = maker(distribution=distribution)
+    for made in every_message(messages):
+        assert plain(as_sent(messages, made)) == plain(made)
+        assert messages.types.definition_of(made.__msgtype__)
+
+
+def plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list):
+        return [plain(each) for each in value]
+    if getattr(value, "__msgtype__", "") == "std_msgs/msg/ColorRGBA":
+        return [float(np.float32(getattr(value, name))) for name in "rgba"]  # its fields have 32 bits
+    if hasattr(value, "__msgtype__"):
+        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__ if name != "__msgtype__"}
+    return "NaN" if isinstance(value, float) and math.isnan(value) else value
+
+
+def test_frames_twists_and_places_are_those_of_rep_103_and_105() -> None:
+    messages = maker()
+    x_m, y_m = messages.map.origin_m
+    odometry = messages.odometry(STAMP_NS, "a1-0", x_m + 10, y_m + 20, math.pi / 2, 2.5, 0.25)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("a1-0/odom", "a1-0/base_link")
+    place, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
+    assert (place.x, place.y, place.z) == (10, 20, 0)
+    assert (orientation.z, orientation.w) == pytest.approx((0, 1))
+    assert (odometry.twist.twist.linear.x, odometry.twist.twist.angular.z) == (2.5, -0.25)
+    assert (odometry.header.stamp.sec, odometry.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
+    still = messages.map_transform(STAMP_NS)
+    assert (still.header.frame_id, still.child_frame_id) == ("terrain", "map")
+    assert (still.transform.translation.x, still.transform.translation.y) == (500_000, 5_199_900)
+    identity, base = messages.vehicle_transforms(STAMP_NS, "a1-0", x_m + 10, y_m + 20, 0.0)
+    assert (identity.header.frame_id, identity.child_frame_id) == ("map", "a1-0/odom")
+    assert (base.header.frame_id, base.child_frame_id) == ("a1-0/odom", "a1-0/base_link")
+    assert (base.transform.translation.x, base.transform.translation.y) == (10, 20)
+    assert base.transform.rotation.z == pytest.approx(math.sqrt(0.5))
+    path = messages.path(STAMP_NS, [(x_m, y_m), (x_m, y_m + 5), (x_m + 5, y_m + 5)])
+    yaws = [2 * math.atan2(each.pose.orientation.z, each.pose.orientation.w) for each in path.poses]
+    assert yaws == pytest.approx([math.pi / 2, 0, 0], abs=1e-12)
+
+
+@given(st.integers(-(2**63), 2**63 - 1))
+def test_no_stamp_is_too_late_to_be_told(stamp_ns: int) -> None:
+    messages = maker()
+    time = as_sent(messages, messages.header(stamp_ns)).stamp
+    if 0 <= stamp_ns < 2**31 * 10**9:
+        assert time.sec * 10**9 + time.nanosec == stamp_ns

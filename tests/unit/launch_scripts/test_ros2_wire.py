@@ -1,0 +1,112 @@
+"""What the gateway puts on the wire is what ROS 2 peers expect: keys, tokens, attachments, hashes, CDR."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from launch_scripts.ros2.graph import (
+    NO_HASH,
+    Attachment,
+    Endpoint,
+    Kind,
+    NodeName,
+    Qos,
+    SeenEndpoint,
+    read_token,
+)
+from launch_scripts.ros2.types import Distribution, types_of
+from swarm.errors import ProtocolError
+
+# As ROS nodes print them (`ros2 topic info -v`) and other stacks publish them.
+PUBLISHED = {
+    "geometry_msgs/msg/PoseStamped": "10f3786d",
+    "geometry_msgs/msg/PoseArray": "af0cc36d",
+    "nav_msgs/msg/Path": "1957a5bb",
+    "nav_msgs/msg/OccupancyGrid": "8d348150",
+    "map_msgs/msg/OccupancyGridUpdate": "c4095b0b",
+    "nav_msgs/msg/Odometry": "3cc97dc7",
+    "sensor_msgs/msg/NavSatFix": "62223ab3",
+    "visualization_msgs/msg/MarkerArray": "86cb8800",
+    "tf2_msgs/msg/TFMessage": "e369d0f0",
+    "std_msgs/msg/String": "df668c74",
+    "std_srvs/srv/Trigger": "eeff2cd6",
+    "std_srvs/srv/SetBool": "abe9e4bb",
+    "std_srvs/srv/Empty": "5888399d",
+    "nav_msgs/srv/GetPlan": "234f7aff",
+    "nav_msgs/srv/GetMap": "c8ae77c9",
+}
+NODE = NodeName(0, "54c1e0b8e18f2313ebc2c48bce10effe", "swarm_gateway")
+NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,2}", fullmatch=True)
+
+
+@pytest.mark.parametrize("distribution", [each for each in Distribution if each is not Distribution.HUMBLE])
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_hashes_are_those_that_ros_publishes(distribution: Distribution, name: str) -> None:
+    assert types_of(distribution).hash_of(name).startswith(f"RIHS01_{PUBLISHED[name]}")
+
+
+def test_humble_has_no_hashes() -> None:
+    assert types_of(Distribution.HUMBLE).hash_of("nav_msgs/msg/Path") == NO_HASH
+
+
+def test_key_and_token_of_a_latched_map() -> None:
+    hash = types_of(Distribution.JAZZY).hash_of("nav_msgs/msg/OccupancyGrid")
+    endpoint = Endpoint(NODE, 4, Kind.PUBLISHER, "/map", "nav_msgs/msg/OccupancyGrid", hash, Qos.LATCHED.value)
+    assert endpoint.key == f"0/map/nav_msgs::msg::dds_::OccupancyGrid_/{hash}"
+    assert endpoint.token == (
+        "@ros2_lv/0/54c1e0b8e18f2313ebc2c48bce10effe/0/4/MP/%/%/swarm_gateway/%map/"
+        f"nav_msgs::msg::dds_::OccupancyGrid_/{hash}/1:1:1,1:,:,:,,"
+    )
+
+
+@given(
+    domain=st.integers(0, 232), number=st.integers(1, 10**6), kind=st.sampled_from(Kind), topic=NAMES,
+    qos=st.sampled_from(Qos), namespace=NAMES, more=st.sampled_from(["", "/", "/x/y"]),
+)  # fmt: skip
+def test_a_token_reads_back_what_it_says(
+    domain: int, number: int, kind: Kind, topic: str, qos: Qos, namespace: str, more: str
+) -> None:
+    node = NodeName(domain, NODE.zid, "n", f"/{namespace}")
+    said = Endpoint(node, number, kind, f"/{topic}", "nav_msgs/msg/Path", "RIHS01_00", qos.value)
+    seen = SeenEndpoint(domain, NODE.zid, kind, "n", f"/{topic}", "nav_msgs/msg/Path", "RIHS01_00", qos.value)
+    assert read_token(said.token + more) == seen
+    assert read_token(node.token) is None
+
+
+@given(st.text(max_size=80) | NAMES.map(lambda text: f"@ros2_lv/0/{text}/0/0/MP/%/%/n/{text}/{text}/h/q"))
+def test_a_strange_token_raises_only_a_protocol_error(key: str) -> None:
+    with suppress(ProtocolError):
+        read_token(key)
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
+def test_attachments_are_33_bytes_and_read_back(sequence: int, stamp_ns: int, gid: bytes) -> None:
+    packed = Attachment(sequence, stamp_ns, gid).packed()
+    assert (len(packed), packed[16], packed[17:]) == (33, 16, gid)
+    assert int.from_bytes(packed[:8], "little", signed=True) == sequence
+    assert Attachment.of(packed) == Attachment(sequence, stamp_ns, gid)
+
+
+@given(st.binary(max_size=60))
+def test_other_attachments_are_refused(content: bytes) -> None:
+    if len(content) != 33 or content[16] != 16:
+        with pytest.raises(ProtocolError):
+            Attachment.of(content)
+
+
+def test_an_empty_request_is_one_byte() -> None:
+    types = types_of(Distribution.JAZZY)
+    request = types.make("std_srvs/srv/Trigger_Request", structure_needs_at_least_one_member=0)
+    assert types.pack(request, "std_srvs/srv/Trigger_Request") == b"\0\1\0\0\0"
+
+
+@given(st.binary(max_size=200), st.sampled_from(sorted(set(PUBLISHED) - {n for n in PUBLISHED if "/srv/" in n})))
+def test_bytes_that_are_no_message_raise_only_a_protocol_error(content: bytes, name: str) -> None:
+    types = types_of(Distribution.JAZZY)
+    for each in (content, b"\0\1\0\0" + content, b"\0\0\0\0" + content):
+        with suppress(ProtocolError):
+            types.unpack(each, name)
