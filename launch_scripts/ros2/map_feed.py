@@ -58,7 +58,15 @@ class MarksAlone:
         self._cols = grid.cols
         self._dirty: list[Window] = []
 
-    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
+    def apply(
+        self,
+        cells: NDArray[np.uint32],
+        kinds: NDArray[np.uint8],
+        paces: NDArray[np.float32],
+        class_number: int = 0,
+    ) -> None:
+        if class_number:
+            return  # for one class of vehicles alone
         values = np.where(kinds == MarkKind.PACE, paces, np.where(kinds == MarkKind.LETHAL, np.inf, np.nan))
         self.pace_s_per_m.reshape(-1)[cells] = values
         rows, cols = np.divmod(np.asarray(cells, np.int64), self._cols)

@@ -270,8 +270,8 @@ def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
 
 
 def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Mark]:
-    """The winning statements of these sets, which are for the same vehicles, by cell of the grid: the newest wins, of
-    two with one stamp that of the larger author, and an operator's over all others, as in
+    """The winning statements of these sets, which are for the same vehicles, by cell of the grid: the newest wins,
+    of two with one stamp that of the larger author, and an operator's over all others, as in
     `shared_map.replication.merge`."""
     won: dict[int, tuple[bool, int, str, int, float]] = {}
     for each in sets:
