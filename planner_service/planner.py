@@ -12,7 +12,7 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.pulled_routes import Puller
+from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
 from planner_service.search.ways import Ways
@@ -126,8 +126,8 @@ class Planner:
         self._growth_ms = 0.0
         climb = cost_map.terrain.climb
         self._gaps = GapStatistics(self._grid, config, counters, climb)
-        pulls = config.routes == "pulled" and climb is None
-        self._puller = Puller(cost_map.pace_s_per_m, self._grid.resolution_m, config) if pulls else None
+        pace, resolution_m = cost_map.pace_s_per_m, self._grid.resolution_m
+        self._puller = Puller(pace, resolution_m, config, climb) if pulls(config, climb) else None
         self._status_due_ns = 0
         self.target_search = target_search
         """None for one that is not searched for."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.routes import RouteBatch
 
@@ -25,15 +26,24 @@ class Pulled:
     legs: NDArray[np.uint32]
 
 
+def pulls(config: PlannerConfig, climb: Climb | None) -> bool:
+    """Whether a planner pulls its routes: not where uphill is not downhill on the ground, as a climb has a price
+    for each step there, and a limit."""
+    return config.routes == "pulled" and (climb is None or climb.wind is not None)
+
+
 class Puller:
     """Pulls routes over neighbours straight.
 
     pace          (rows, cols) float32, s/m; inf is lethal. It is read at each call
     resolution_m  side of a cell
     config        which corners a segment may pass: where a diagonal step may
+    climb         of what flies: what a segment costs for what it climbs, and for the wind; None of what drives
     """
 
-    def __init__(self, pace: Floats, resolution_m: float, config: PlannerConfig) -> None:
+    def __init__(
+        self, pace: Floats, resolution_m: float, config: PlannerConfig, climb: Climb | None = None
+    ) -> None:
         # Compiled only for those who pull: nobody else waits for it at a first start.
         from planner_service.kernels.compile import load
         from planner_service.kernels.layout import step_offsets
@@ -45,7 +55,8 @@ class Puller:
         if config.neighbours == 4:
             self._corners = NO_CORNERS
         self._kernel = pull_routes
-        load(pull_routes)
+        self._flight = None if climb is None else _flight(climb)
+        load(pull_routes.alike if climb is None else pull_routes.directed)
 
     def pull(
         self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
@@ -63,6 +74,7 @@ class Puller:
         prices = np.empty((3, many))
         self._kernel(
             self._pace,
+            self._flight,
             self._offsets,
             self._corners,
             (starts, directions, ends),
@@ -83,3 +95,14 @@ class Puller:
             routes,
             directions=pulled.directions, ends=pulled.ends, legs=pulled.legs, length_m=length_m
         )  # fmt: skip
+
+
+def _flight(climb: Climb) -> tuple[Floats, Floats, Floats, tuple[float, float]]:
+    """What the kernel knows of a flight. Raises ValueError of what drives."""
+    if climb.wind is None:
+        raise ValueError("routes are not pulled where uphill is not downhill: a climb has a price per step")
+    heights = np.array(climb.elevation_m, np.float32, order="C").reshape(
+        -1
+    )  # kernels know what may be written only
+    factors = np.array(climb.factors, np.float32)
+    return heights, factors, np.array(climb.per_metre, np.float32), (climb.wind.south, climb.wind.east)

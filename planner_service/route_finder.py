@@ -45,9 +45,9 @@ class FoundRoute:
 class PulledRoute:
     """A route of straight segments between centres of cells that a route over neighbours passes.
 
-    Both costs are integrals of the pace along the way, where half of a step lies in the cell that it leaves.
-    `FoundRoute.cost_s` prices a step by the cell that it enters, and its lower bound holds for routes over
-    neighbours alone: a pulled route may cost less than it.
+    Both costs are integrals of the pace along the way, where half of a step lies in the cell that it leaves; those
+    of a flight hold what it climbs, and the wind. `FoundRoute.cost_s` prices a step by the cell that it enters, and
+    its lower bound holds for routes over neighbours alone: a pulled route may cost less than it.
 
     turns        int64 (n, 2), row and col of the cells where it turns, with the start and the target
     cost_s       s, along the segments; never more than `grid_cost_s`
@@ -98,7 +98,7 @@ class RouteFinder:
         rows, cols = self._pace.shape
         self.grid = GridSpec(rows, cols, resolution_m)
         self._config = PlannerConfig(**{"strategy": "full", **settings})
-        self._directional = climb is not None
+        self._climb = climb
         self._tree = TargetTree(self.grid, self._config, climb)
         self._version = 0
         self._target = self.grid.cell(*target)
@@ -139,18 +139,17 @@ class RouteFinder:
         The cheapest chain of segments between the route's own cells, by dynamic programming over some of them:
         those up to 64 cells back, ever farther apart, and where the way to the cell before turned.
 
-        Raises ValueError where uphill is not downhill, on a route that does not lead to a target, and on one
-        that the map's changes have shut.
+        Raises ValueError where uphill is not downhill on the ground, on a route that does not lead to a target, and
+        on one that the map's changes have shut.
         """
-        if self._directional:
-            raise ValueError("routes are not pulled where uphill is not downhill: a climb has a price per step")
+        puller = self._puller
         if route.status is not RouteStatus.OK:
             raise ValueError(
                 f"route is {route.status.value!r}, expected 'ok': only a route to the target is pulled"
             )
         at = route.cells @ np.array((self.grid.cols, 1), np.int64)
         codes = np.frombuffer(bytearray(directions_of(at, self.grid.cols)), np.uint8)
-        pulled, prices = self._puller.pull(at[:1], codes, np.array([codes.size]))
+        pulled, prices = puller.pull(at[:1], codes, np.array([codes.size]))
         if not np.isfinite(prices[0, 0]):
             raise ValueError("the route passes a cell or a corner that is shut by now: ask for it again")
         crossed = np.array(walk(self.grid, int(at[0]), pulled.directions.tobytes()))
@@ -161,7 +160,7 @@ class RouteFinder:
 
     @cached_property
     def _puller(self) -> Puller:
-        return Puller(self._pace, self.grid.resolution_m, self._config)
+        return Puller(self._pace, self.grid.resolution_m, self._config, self._climb)
 
     def cost_to_go_s(self) -> NDArray[np.float32]:
         """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""

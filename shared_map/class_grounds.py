@@ -110,7 +110,7 @@ def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
         return common
     made, key = _MADE.setdefault(common, {}), _key(scenario, name)
     if key not in made and own.air is not None:
-        made[key] = air_terrain(common, own.air, f"class {name}")
+        made[key] = air_terrain(common, own.air, scenario.wind, f"class {name}")
     elif key not in made:
         try:
             terrain = build_terrain(scenario, vehicle_class=name)
@@ -130,4 +130,5 @@ def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
 
 
 def _key(scenario: Scenario, name: str) -> bytes:
-    return msgspec.json.encode([scenario.seed, scenario.terrain, scenario.cost, class_named(scenario, name)])
+    parts = [scenario.seed, scenario.terrain, scenario.cost, scenario.wind, class_named(scenario, name)]
+    return msgspec.json.encode(parts)

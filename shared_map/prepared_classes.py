@@ -59,7 +59,12 @@ def _folder(run_dir: Path, name: str) -> Path:
 
 
 def _key(scenario: Scenario, name: str) -> str:
-    parts = [scenario_key(scenario), scenario_key(of_class(scenario, name)), class_named(scenario, name)]
+    parts = [
+        scenario_key(scenario),
+        scenario_key(of_class(scenario, name)),
+        class_named(scenario, name),
+        scenario.wind,
+    ]
     return hashlib.blake2b(msgspec.json.encode(parts, order="sorted"), digest_size=8).hexdigest()
 
 

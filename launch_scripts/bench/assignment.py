@@ -1,6 +1,6 @@
 """How soon targets are captured by each rule that says which vehicle chases which target.
 
-A light chase on the demo's terrain: the project's trees, targets and `Assignment` of each agent, without messages,
+A light chase on jacksboro's terrain: the project's trees, targets and `Assignment` of each agent, without messages,
 claims or hidden ground. All rules meet the same starts and the same targets.
 """
 
@@ -90,7 +90,7 @@ class Result:
 
 
 class World:
-    """The demo's terrain on cells of 150 m.
+    """The terrain of the scenario jacksboro on cells of 150 m.
 
     per_agent  vehicles that an agent hosts
     """

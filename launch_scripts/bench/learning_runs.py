@@ -1,4 +1,4 @@
-"""What learning gains in the demo where its prior is wrong about a class: the same seeds with it and without it."""
+"""What learning gains in jacksboro where its prior is wrong about a class: the same seeds with it and without."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ WRONG = {"grass": 3.0}
 """Class -> how much slower it is than its prior says."""
 
 
-def demo(learning: bool) -> Scenario:
-    """The demo, of which the prior is wrong about a class."""
+def wrong_prior(learning: bool) -> Scenario:
+    """The scenario jacksboro, of which the prior is wrong about a class."""
     scenario = find_scenario("jacksboro")
     hidden = msgspec.structs.replace(scenario.terrain.hidden, class_factor=WRONG)
     return msgspec.structs.replace(
@@ -35,7 +35,7 @@ def run(seeds: Sequence[int], seconds: float, progress: Progress) -> dict[str, A
     for n, seed in enumerate(seeds):
         row: dict[str, Any] = {"seed": seed}
         for m, learning in enumerate((False, True)):
-            report = simulate(demo(learning), seed, seconds).report
+            report = simulate(wrong_prior(learning), seed, seconds).report
             named = "learning" if learning else "without"
             row[f"captures_{named}"] = report["captures"]
             row[f"km_{named}"] = sum(each["distance_m"] for each in report["by_group"].values()) / 1000
@@ -47,7 +47,7 @@ def run(seeds: Sequence[int], seconds: float, progress: Progress) -> dict[str, A
 
 def tables(report: dict[str, Any]) -> Iterator[Table | str]:
     shown = table(
-        "The demo with a wrong prior, without and with learning",
+        "Jacksboro with a wrong prior, without and with learning",
         "seed", "captures", "learning", "driven km", "learning", "marks", "learning", "<learned",
     )  # fmt: skip
     both = [f"{name}_{which}" for name in ("captures", "km", "marks") for which in ("without", "learning")]

@@ -29,7 +29,7 @@ _STARTS = ((4, 6), (8, 70), (40, 97), (92, 88), (95, 40), (70, 3))
 
 
 def draw(file: Path) -> None:
-    """Write the picture: open ground, and a part of the demo's terrain."""
+    """Write the picture: open ground, and a part of jacksboro's terrain."""
     open_ground = np.full((100, 100), 0.1, np.float32)
     open_ground[30:60, 25:32] = open_ground[66:72, 40:80] = np.inf
     real = build_terrain(load_scenario(_SCENARIO)).pace_s_per_m[_CROP]

@@ -1,13 +1,17 @@
 """What a step's rise does to its cost: the one function by which all kernels price a step.
 
 Where cost depends on direction, a step from v into its neighbour u costs cell_cost[u] * step_price(climbs, v, u,
-odd), which holds its length, too.
+way), which holds its length, too; `way` is its direction 0..7. A step that u offers v leads back: its way is that
+from u to v, turned round.
 
     height  float32  (size,)           m, padded; NaN is a void, and a step from or to it is level
-    prices  float32  (2 * entries,)    of straight steps, then of diagonal ones, by rise: factor times length; the
-                                       least is 1, and inf forbids the step
-    scale   float32  (2,)              of straight and diagonal steps, entries of `prices` per metre of rise, from
+    prices  float32  (tables * entries,)  one table behind the other, by rise: factor times length; the least is 1
+                                       or more, and inf forbids the step. In still air there are two tables, of
+                                       straight steps and of diagonal ones; in wind there is one for each way
+    scale   float32  (2,)              of straight and diagonal steps, entries of a table per metre of rise, from
                                        the middle on
+    begins  int32    (8,)              where the table of each way begins in `prices`; the second table is that of
+                                       way 1, so that begins[1] is how many entries a table has
     keys, best, codes  float32 (stride,)  scratch of a row: offers, s; the least of them; whose that is
     entries            int32   (stride,)  the same: entries of `prices`
 """
@@ -21,65 +25,76 @@ from planner_service.kernels.compile import helper
 
 Floats = NDArray[np.float32]
 
-Climbs = tuple[Floats, Floats, Floats, Floats, Floats, Floats, NDArray[np.int32]]
-"""(height, prices, scale, keys, best, codes, entries)."""
+Climbs = tuple[Floats, Floats, Floats, NDArray[np.int32], Floats, Floats, Floats, NDArray[np.int32]]
+"""(height, prices, scale, begins, keys, best, codes, entries)."""
 
-CLIMBS = "Tuple((f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i4[::1]))"
+CLIMBS = "Tuple((f4[::1], f4[::1], f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], i4[::1]))"
 
 _HALF = np.float32(0.5)
 _LEVEL = np.float32(0.0)
 
 
 @helper
-def _entry(rise, scale, half, begin):
-    """int32: which of `prices`, from `begin` on, a rise (m) has."""
+def _entry(rise, scale, half):
+    """int32: which entry of a table a rise (m) has."""
     at = rise * scale
     at = at if at == at else _LEVEL
-    return np.int32(min(max(at, -half), half) + half + _HALF) + begin
+    return np.int32(min(max(at, -half), half) + half + _HALF)
 
 
 @helper
-def step_price(climbs, v, u, odd):
-    """What the step from v into its neighbour u costs, in cell costs of u; `odd` is 1 of a diagonal step."""
-    height, prices, scale = climbs[0], climbs[1], climbs[2]
-    count = prices.size >> 1
-    begin = np.int32(odd * count)
-    return prices[np.uint64(_entry(height[u] - height[v], scale[odd], np.float32(count >> 1), begin))]
+def _half_of(begins):
+    """float32: the entry of a level step, in the middle of a table."""
+    return np.float32(begins[1] >> 1)
 
 
 @helper
-def offered(base, own, climbs, v, u, odd, length):
-    """What a cell u, which costs `base` and whose cell cost is `own`, offers its neighbour v, s.
+def is_windy(climbs):
+    """Whether each way has a table of its own."""
+    return climbs[3][2] != climbs[3][0]
+
+
+@helper
+def step_price(climbs, v, u, way):
+    """What the step from v into its neighbour u, in direction `way`, costs, in cell costs of u."""
+    height, prices, scale, begins = climbs[0], climbs[1], climbs[2], climbs[3]
+    entry = _entry(height[u] - height[v], scale[way & 1], _half_of(begins))
+    return prices[np.uint64(begins[way] + entry)]
+
+
+@helper
+def offered(base, own, climbs, v, u, way, length):
+    """What a cell u, which costs `base` and whose cell cost is `own`, offers its neighbour v, which enters it in
+    direction `way`, s.
 
     climbs  None where entering a cell costs the same from everywhere: then a step costs its length
     """
     if climbs is None:
         return base + own * length
-    return base + own * step_price(climbs, v, u, odd)
+    return base + own * step_price(climbs, v, u, way)
 
 
 @helper
-def find_entries(rises, first, n, climbs, odd, entries):
-    """entries := int32, which of `prices` each of `n` rises (m) has. A loop of its own vectorises."""
-    prices, scale = climbs[1], climbs[2]
-    length, count = scale[odd], prices.size >> 1
-    half, begin = np.float32(count >> 1), np.int32(odd * count)
+def find_entries(rises, first, n, climbs, way, entries):
+    """entries := int32, which of `prices` each of `n` rises (m) in direction `way` has. A loop of its own
+    vectorises."""
+    length, half, begin = climbs[2][way & 1], _half_of(climbs[3]), climbs[3][way]
     for i in range(n):
-        entries[first + i] = _entry(rises[first + i], length, half, begin)
+        entries[first + i] = begin + _entry(rises[first + i], length, half)
 
 
 @helper
-def offers_of_row(cell_cost, cost, climbs, odd, first, n, o):
-    """keys := what each of `n` cells from `first` on is offered by its neighbour o cells further (unsigned).
+def offers_of_row(cell_cost, cost, climbs, way, first, n, o):
+    """keys := what each of `n` cells from `first` on is offered by its neighbour o cells further (unsigned), in
+    direction `way`.
 
     In three loops, of which the first and the last vectorise: in one, it takes three times as long.
     """
-    height, prices, scale, keys, _, _, entries = climbs
-    length, count = scale[odd], prices.size >> 1
-    half, begin = np.float32(count >> 1), np.int32(odd * count)
+    height, prices, scale, begins, keys, _, _, entries = climbs
+    length, half, begin = scale[way & 1], _half_of(begins), begins[way]
     for i in range(n):
         v = first + i
-        entries[i] = _entry(height[v + o] - height[v], length, half, begin)
+        entries[i] = begin + _entry(height[v + o] - height[v], length, half)
     for i in range(n):
         keys[i] = prices[np.uint64(entries[i])]
     for i in range(n):

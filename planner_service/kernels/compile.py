@@ -92,7 +92,7 @@ def kernel(signature: str) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True, slots=True)
 class StepKernel:
-    """One search over steps, compiled for either kind of map; called with `climbs` as its second argument.
+    """One kernel over steps, compiled for either kind of map; called with `climbs` as its second argument.
 
     alike     where entering a cell costs the same from everywhere: `climbs` is None, and no code for it is left
     directed  where a step costs by what it climbs, too

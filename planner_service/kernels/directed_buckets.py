@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.climbs import CLIMBS, find_entries, step_price
+from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy, step_price
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
 from planner_service.kernels.prefetch import prefetch
@@ -40,6 +40,8 @@ from planner_service.kernels.prefetch import prefetch
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _TWO, _THREE, _FOUR, _FIVE, _SIX, _SEVEN = (np.uint64(n) for n in range(2, 8))
+_WAYS = 4, 2, 6, 0, 3, 5, 1, 7
+"""Directions of the steps into a cell from its neighbours, in the order in which these are offered something."""
 _ZERO32 = np.float32(0.0)
 _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it."""
@@ -125,6 +127,11 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
     find_entries(rises, _ZERO, n * _FOUR, climbs, 0, entries)
     if not straight_only:
         find_entries(rises, n * _FOUR, n * _FOUR, climbs, 1, entries)
+    if is_windy(climbs):
+        for k in range(4 if straight_only else 8):
+            shift = climbs[3][_WAYS[k]] - climbs[3][k >> 2]
+            for i in range(n):
+                entries[n * np.uint64(k) + i] += shift
     for i in range(n):
         u = np.uint64(batch[first + i])
         ahead = np.uint64(batch[first + i + np.uint64(_AHEAD)])
@@ -182,7 +189,7 @@ def _offer_one_by_one(grid, cost, climbs, batch, n, touched):
                 continue
             if odd and not corners and min(cost[u + offsets[k - 1]], cost[u + offsets[(k + 1) & 7]]) == WALL:
                 continue
-            key = base + own * step_price(climbs, v, u, odd)
+            key = base + own * step_price(climbs, v, u, k ^ 4)
             if key < cost[v]:
                 cost[v] = key
                 touched[count] = v

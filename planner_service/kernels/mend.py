@@ -10,7 +10,7 @@ Arrays, beside those of `layout` and `repair`:
     children  uint8    (size,)    of each cell, bit k: its neighbour in direction k leads to it
     steps     int32    (256, 8)   of each value of `children`: how many padded cells away these neighbours are
     lengths   float32  (256, 8)   of the steps from them, in straight ones
-    odd       int64    (256, 8)   1 where these are diagonal
+    ways      int64    (256, 8)   the directions of the steps back
     many      int64    (256,)     how many they are
     queue, keys  uint32, float32 (2 * size + 48,)  cells of a walk over the tree, and their costs, s
 """
@@ -55,22 +55,22 @@ _TURNS = 12
 """How often a tree is improved before a growth costs less: half as often is rare."""
 
 Walk = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]
-"""(children, steps, lengths, odd, many)."""
+"""(children, steps, lengths, ways, many)."""
 _WALK = "Tuple((u1[::1], i4[:, ::1], f4[:, ::1], i8[:, ::1], i8[::1]))"
 
 
 def make_walk(size: int, stride: int, rule: int) -> Walk:
-    """(children, steps, lengths, odd, many) for trees of `size` padded cells."""
+    """(children, steps, lengths, ways, many) for trees of `size` padded cells."""
     offsets = step_offsets(stride)
     steps, lengths = np.zeros((256, 8), np.int32), np.zeros((256, 8), np.float32)
-    odd, many = np.zeros((256, 8), np.int64), np.zeros(256, np.int64)
+    ways, many = np.zeros((256, 8), np.int64), np.zeros(256, np.int64)
     for bits in range(256):
         codes = [k for k in range(8) if bits >> k & 1]
         many[bits] = len(codes)
         steps[bits, : len(codes)] = offsets[codes]
-        odd[bits, : len(codes)] = [k & 1 for k in codes]
+        ways[bits, : len(codes)] = [k ^ 4 for k in codes]
         lengths[bits, : len(codes)] = [SQRT2 if k & 1 and rule == RULE_OCTILE else 1.0 for k in codes]
-    return np.zeros(size, np.uint8), steps, lengths, odd, many
+    return np.zeros(size, np.uint8), steps, lengths, ways, many
 
 
 @helper
@@ -93,7 +93,7 @@ def _find_children(parent, stride, children):
 def _evaluate(grid, climbs, cost, root, walk, queue, keys):
     """Costs := what is driven along the parents, of all cells that have a way. Returns the largest."""
     cell_cost = grid[0]
-    children, steps, lengths, odd, many = walk
+    children, steps, lengths, ways, many = walk
     half = np.uint64(queue.size >> 1)
     begin = np.uint64(0)
     end = _ONE
@@ -125,7 +125,7 @@ def _evaluate(grid, climbs, cost, root, walk, queue, keys):
             for j in range(_TWO if climbs is None else np.uint64(0), count):
                 v = np.uint64(at + steps[bits, j])
                 queue[n + j] = v
-                keys[n + j] = offered(key, own, climbs, v, u, odd[bits, j], lengths[bits, j])
+                keys[n + j] = offered(key, own, climbs, v, u, ways[bits, j], lengths[bits, j])
             n += count
         begin, end = born, n
     return highest
@@ -171,7 +171,7 @@ def _lower_branches(grid, climbs, cost, walk, queue, count, rows):
     cell_cost, _, stride, _, _ = grid
     first, last = rows
     per_row = row_factor(stride)
-    children, steps, lengths, odd, many = walk
+    children, steps, lengths, ways, many = walk
     n, i = np.uint64(count), np.uint64(0)
     room = np.uint64(queue.size - 8)
     while i < n and n < room:
@@ -184,7 +184,7 @@ def _lower_branches(grid, climbs, cost, walk, queue, count, rows):
         bits, at = np.uint64(children[u]), np.int64(u)
         for j in range(np.uint64(many[bits])):
             v = np.uint64(at + steps[bits, j])
-            offer = offered(key, own, climbs, v, u, odd[bits, j], lengths[bits, j])
+            offer = offered(key, own, climbs, v, u, ways[bits, j], lengths[bits, j])
             if offer < cost[v]:
                 cost[v] = offer
                 queue[n] = v

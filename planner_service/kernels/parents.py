@@ -75,7 +75,7 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, leas
 @helper
 def _take_less(climbs, n, code):
     """Where a row's offer is less than the best so far, take it, and whose it is."""
-    keys, best, codes = climbs[3], climbs[4], climbs[5]
+    keys, best, codes = climbs[4], climbs[5], climbs[6]
     for i in range(n):
         codes[i] = code if keys[i] < best[i] else codes[i]
         best[i] = min(best[i], keys[i])
@@ -84,7 +84,7 @@ def _take_less(climbs, n, code):
 @helper
 def _shut_diagonals(cell_cost, climbs, first, n, one, other):
     """No offer where one of the cells beside a diagonal step, so many further (unsigned), is lethal."""
-    keys = climbs[3]
+    keys = climbs[4]
     for i in range(n):
         v = first + i
         keys[i] = keys[i] if max(cell_cost[v + one], cell_cost[v + other]) < INF else INF
@@ -94,7 +94,7 @@ def _shut_diagonals(cell_cost, climbs, first, n, one, other):
 def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
     """As the others here, direction by direction, so that it vectorises."""
     cell_cost, offsets, _, rule, corners = grid
-    best, codes = climbs[4], climbs[5]
+    best, codes = climbs[5], climbs[6]
     n = last - first
     for i in range(n):
         best[i] = INF
@@ -102,7 +102,7 @@ def _parents_by_climb(grid, climbs, cost, first, last, parent, least):
     for j in range(4 if rule == RULE_FOUR else 8):
         # Straight steps come first, of equals.
         k = 2 * j if j < 4 else 2 * j - 7
-        offers_of_row(cell_cost, cost, climbs, k & 1, first, n, np.uint64(offsets[k]))
+        offers_of_row(cell_cost, cost, climbs, k, first, n, np.uint64(offsets[k]))
         if k & 1 and not corners:
             one, other = np.uint64(offsets[k - 1]), np.uint64(offsets[(k + 1) & 7])
             _shut_diagonals(cell_cost, climbs, first, n, one, other)

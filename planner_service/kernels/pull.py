@@ -1,9 +1,16 @@
 """Pulling routes straight: which of its cells a vehicle turns in, when it drives segments from centre to centre.
 
 A segment costs the integral of the pace of the cells that it crosses, found by Amanatides and Woo, "A fast voxel
-traversal algorithm" (1987), with crossings compared as integers. Arrays, of n routes over a map of rows x cols, of
-which the longest has m cells:
+traversal algorithm" (1987), with crossings compared as integers. Of what flies that integral is multiplied by the
+factor of the wind in the segment's direction, and each border between cells costs what it climbs: as much as the
+step over it does, wherever it is crossed. Arrays, of n routes over a map of rows x cols, of which the longest has m
+cells:
     pace       float32  (rows * cols,)  s for a metre; inf is lethal
+    flight     None of what drives; of what flies (height, factors, per_metre, wind):
+        height     float32  (rows * cols,)  m, of the surface on which it flies
+        factors    float32  (entries,)      of a step by its rise in still air, 1 of a level one in the middle
+        per_metre  float32  (2,)   entries of it per metre of rise, of straight steps and of diagonal ones
+        wind       (south, east)   what it blows towards, in air speeds
     offsets    int64    (8,)     of `layout.step_offsets(cols)`
     routes     (starts int64 (n,), directions uint8 (sum of steps,), ends int64 (n,)), as `RouteBatch`
     cells      int64    (m,)     those of one route, neighbours of each other
@@ -23,7 +30,7 @@ import math
 
 import numpy as np
 
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.compile import helper, step_kernel
 
 LOOK_BACK = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """How many cells back a segment may begin, beside the cell before and where the way to that one turned."""
@@ -31,8 +38,37 @@ NO_CORNERS, OPEN_CORNERS, ALL_CORNERS = range(3)
 """Through an exact corner a segment passes never, between two passable cells only, or always."""
 
 
+_FLIGHT = "Tuple((f4[::1], f4[::1], f4[::1], UniTuple(f8, 2)))"
+
+
 @helper
-def segment_cost(pace, cols, corners, start, end, limit):
+def _flown(flight, down, right, length):
+    """float64, cells: how far one comes in still air, while a segment is flown; `shared_map.terrain.wind` has the
+    formula."""
+    if flight is None:
+        return length
+    south, east = flight[3]
+    across, along = east * down - south * right, south * down + east * right
+    return (math.sqrt(length * length - across * across) - along) / (1.0 - south * south - east * east)
+
+
+@helper
+def _climb(flight, pace, before, cell, both):
+    """float64: what it costs to climb from a cell into the next one, in paces times cells; `both` of a step over
+    their corner."""
+    if flight is None:
+        return 0.0
+    height, factors, per_metre, _ = flight
+    half = np.float32(factors.size >> 1)
+    at = (height[cell] - height[before]) * per_metre[np.int64(both)]
+    at = at if at == at else np.float32(0.0)
+    entry = np.uint64(min(max(at, -half), half) + half + np.float32(0.5))
+    length = math.sqrt(2.0) if both else 1.0
+    return (np.float64(factors[entry]) - 1.0) * np.float64(pace[np.uint64(cell)]) * length
+
+
+@helper
+def segment_cost(pace, flight, cols, corners, start, end, limit):
     """float64: a segment's cost, in paces times cells; inf if it is not below `limit`, or meets a lethal cell, or
     an exact corner that it may not pass."""
     down, right = end // cols - start // cols, end % cols - start % cols
@@ -40,6 +76,7 @@ def segment_cost(pace, cols, corners, start, end, limit):
     length = math.sqrt(np.float64(rows_left * rows_left + cols_left * cols_left))
     if length == 0.0:
         return 0.0
+    length = _flown(flight, np.float64(down), np.float64(right), length)
     row_step, col_step = cols if down > 0 else -cols, 1 if right > 0 else -1
     # The k-th line between rows is met at (2k + 1) / (2 * rows) of the way: odd numbers over `whole`, as integers.
     whole = 2 * max(rows_left, 1) * max(cols_left, 1)
@@ -57,19 +94,21 @@ def segment_cost(pace, cols, corners, start, end, limit):
             if beside == np.inf or corners == NO_CORNERS:
                 return np.inf
         on_row, on_col = next_row == crossing, next_col == crossing
+        before = cell
         if on_row:
             cell += row_step
             next_row += 2 * max(cols_left, 1)
         if on_col:
             cell += col_step
             next_col += 2 * max(rows_left, 1)
+        total += _climb(flight, pace, before, cell, on_row and on_col) * (whole / length)
         at = crossing
     total += np.float64(pace[np.uint64(cell)]) * (whole - at)
     return total * (length / whole) if total < limit else np.inf
 
 
 @helper
-def _pull(pace, cols, corners, scratch, size):
+def _pull(pace, flight, cols, corners, scratch, size):
     """Write `costs`, `before` and `turns` of the first `size` cells; returns how many turns there are. Never dearer
     than the route itself: each cell's pulled cost is at most that of the cell before plus the step between."""
     cells, costs, before, turns = scratch
@@ -77,18 +116,18 @@ def _pull(pace, cols, corners, scratch, size):
     along[0] = pulled[0] = 0.0
     before[0] = 0
     for j in range(1, size):
-        step = segment_cost(pace, cols, corners, cells[j - 1], cells[j], np.inf)
+        step = segment_cost(pace, flight, cols, corners, cells[j - 1], cells[j], np.inf)
         along[j] = along[j - 1] + step
         best, turn = pulled[j - 1] + step, j - 1
         for back in LOOK_BACK:
             i = j - back
             if i >= 0:
-                cost = pulled[i] + segment_cost(pace, cols, corners, cells[i], cells[j], best - pulled[i])
+                cost = pulled[i] + segment_cost(pace, flight, cols, corners, cells[i], cells[j], best - pulled[i])
                 if cost < best:
                     best, turn = cost, i
         i = before[j - 1]  # straight ways of any length: where the way to the cell before turned, and before that
         while True:
-            cost = pulled[i] + segment_cost(pace, cols, corners, cells[i], cells[j], best - pulled[i])
+            cost = pulled[i] + segment_cost(pace, flight, cols, corners, cells[i], cells[j], best - pulled[i])
             if cost < best:
                 best, turn = cost, i
             elif turn != i:
@@ -144,11 +183,12 @@ def _lay_out(cols, start, end, directions, at):
     return at
 
 
-@kernel(
-    "void(f4[::1], i8[::1], i8, Tuple((i8[::1], u1[::1], i8[::1])), "
-    "Tuple((i8[::1], f8[:, ::1], i8[::1], i8[::1])), Tuple((u1[::1], i8[::1], u4[::1], i8[::1])), f8[:, ::1])"
+@step_kernel(
+    "void(f4[::1], CLIMBS, i8[::1], i8, Tuple((i8[::1], u1[::1], i8[::1])), "
+    "Tuple((i8[::1], f8[:, ::1], i8[::1], i8[::1])), Tuple((u1[::1], i8[::1], u4[::1], i8[::1])), f8[:, ::1])",
+    _FLIGHT,
 )
-def pull_routes(pace, offsets, corners, routes, scratch, pulled, prices):
+def pull_routes(pace, flight, offsets, corners, routes, scratch, pulled, prices):
     """Write `pulled` and `prices`. A route that meets a lethal cell costs inf and stays as it is, each step a
     segment."""
     cols = offsets[4]
@@ -164,7 +204,7 @@ def pull_routes(pace, offsets, corners, routes, scratch, pulled, prices):
             cells[i] = cells[i - 1] + offsets[directions[begin + i - 1]]
         prices[0, n] = prices[1, n] = prices[2, n] = 0.0
         if size > 1:
-            count = _pull(pace, cols, corners, scratch, size)
+            count = _pull(pace, flight, cols, corners, scratch, size)
             prices[0, n], prices[1, n] = costs[1, size - 1], costs[0, size - 1]
             if prices[0, n] == np.inf:
                 for i in range(size - 1):

@@ -121,9 +121,9 @@ def span_near(first, last, stride, row):
 
 
 @helper
-def _key(cell_cost, cost, climbs, v, u, odd, length):
-    """What v is offered by its neighbour u."""
-    return offered(cost[u], cell_cost[u], climbs, v, u, odd, length)
+def _key(cell_cost, cost, climbs, v, u, way, length):
+    """What v is offered by its neighbour u, which lies in direction `way`."""
+    return offered(cost[u], cell_cost[u], climbs, v, u, way, length)
 
 
 @helper
@@ -140,20 +140,20 @@ def _best_offers(cell_cost, cost, climbs, s, begin, end, diagonal, corners, best
         least = min(
             min(
                 _key(cell_cost, cost, climbs, i, i - s, 0, _STRAIGHT),
-                _key(cell_cost, cost, climbs, i, i + _ONE, 0, _STRAIGHT),
+                _key(cell_cost, cost, climbs, i, i + _ONE, 2, _STRAIGHT),
             ),
             min(
-                _key(cell_cost, cost, climbs, i, i + s, 0, _STRAIGHT),
-                _key(cell_cost, cost, climbs, i, i - _ONE, 0, _STRAIGHT),
+                _key(cell_cost, cost, climbs, i, i + s, 4, _STRAIGHT),
+                _key(cell_cost, cost, climbs, i, i - _ONE, 6, _STRAIGHT),
             ),
         )
         key = _key(cell_cost, cost, climbs, i, i - s + _ONE, 1, diagonal)
         least = min(least, key if corners or max(north, east) < INF else INF)
-        key = _key(cell_cost, cost, climbs, i, i + s + _ONE, 1, diagonal)
+        key = _key(cell_cost, cost, climbs, i, i + s + _ONE, 3, diagonal)
         least = min(least, key if corners or max(south, east) < INF else INF)
-        key = _key(cell_cost, cost, climbs, i, i + s - _ONE, 1, diagonal)
+        key = _key(cell_cost, cost, climbs, i, i + s - _ONE, 5, diagonal)
         least = min(least, key if corners or max(south, west) < INF else INF)
-        key = _key(cell_cost, cost, climbs, i, i - s - _ONE, 1, diagonal)
+        key = _key(cell_cost, cost, climbs, i, i - s - _ONE, 7, diagonal)
         least = min(least, key if corners or max(north, west) < INF else INF)
         best[i - begin] = least
 
@@ -281,13 +281,13 @@ def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, he
             # Branches, unlike in a growth: few neighbours are offered less, so that these are foretold.
             for k in range(4):
                 v = u + np.uint64(offsets[2 * k])
-                straight = offered(key, own, climbs, v, u, 0, _STRAIGHT)
+                straight = offered(key, own, climbs, v, u, (2 * k) ^ 4, _STRAIGHT)
                 if straight < cost[v] and cell_cost[v] < INF:
                     cost[v] = straight
                     lowered[n] = v
                     n += _ONE
                 v = u + np.uint64(offsets[2 * k + 1])
-                diagonal = offered(key, own, climbs, v, u, 1, slant)
+                diagonal = offered(key, own, climbs, v, u, (2 * k + 1) ^ 4, slant)
                 if (
                     diagonal < cost[v]
                     and cell_cost[v] < INF

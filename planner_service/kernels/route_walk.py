@@ -73,8 +73,7 @@ def relabel(grid, climbs, labels, trail):
             v = np.int64(trail[j])
             k = parent[v]
             u = v + offsets[k]
-            odd = np.int64(k & 1)
-            cost[v] = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
+            cost[v] = offered(cost[u], cell_cost[u], climbs, v, u, k, step_length(rule, k & 1))
 
 
 @helper
@@ -83,7 +82,7 @@ def _driven(cell_cost, climbs, lengths, before, cell, code):
     own = np.float64(cell_cost[cell])
     if climbs is None:
         return own * lengths[code]
-    return own * np.float64(step_price(climbs, before, cell, np.int64(code & 1))) if code != NONE else 0.0
+    return own * np.float64(step_price(climbs, before, cell, code)) if code != NONE else 0.0
 
 
 @helper

@@ -84,8 +84,7 @@ def _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trai
         v = np.int64(trail[j])
         k = parent[v]
         u = v + offsets[k]
-        odd = np.int64(k & 1)
-        driven = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
+        driven = offered(cost[u], cell_cost[u], climbs, v, u, k, step_length(rule, k & 1))
         cost[v] = min(cost[v], driven)
         stamp[v] = now
     return many
@@ -197,7 +196,7 @@ def _follow(grid, climbs, labels, network, stamps, link, u, trail):
         if stamp[v] < now:
             visited += _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail)
         odd = k & 1
-        offer = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
+        offer = offered(cost[u], cell_cost[u], climbs, v, u, k ^ 4, step_length(rule, odd))
         shut = max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
         if offer < cost[v] and cell_cost[v] < INF and (corners or not odd or not shut):
             cost[v] = offer

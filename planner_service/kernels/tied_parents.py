@@ -29,7 +29,7 @@ def _leads(grid, climbs, labels, v, k):
         return False
     if odd and not corners and max(cell_cost[v + offsets[k - 1]], cell_cost[v + offsets[(k + 1) & 7]]) == INF:
         return False
-    return offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd)) == cost[v]
+    return offered(cost[u], cell_cost[u], climbs, v, u, k, step_length(rule, odd)) == cost[v]
 
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)

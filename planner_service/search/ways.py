@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.arrivals import arrivals
+from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import NONE, step_offsets
 from planner_service.kernels.route_walk import OK, price_routes
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.padded_climbs import turned_round
 from shared_map.arrays import Floats
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import SEARCHING, RouteBatch
@@ -41,8 +43,8 @@ class Ways:
         self._cost: Floats = np.empty(0, np.float32)
         self._parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._root = -1
-        self._depths: Floats | None = None
-        """Heights below zero, padded: those of the way back. None before they are asked for."""
+        self._back_climbs: Climbs | None = None
+        """Of the way back. None before they are asked for."""
 
     @property
     def grid(self) -> GridSpec:
@@ -64,14 +66,14 @@ class Ways:
     @property
     def _back(self) -> CostGrid:
         """The cell costs as they are now for whoever drives ways backwards: trees lead to their root, and vehicles
-        away from it. What was uphill is downhill."""
+        away from it."""
         climbs = self._costs.climbs
         if climbs is None:
             return self._costs
-        if self._depths is None:
-            self._depths = -climbs[0]
+        if self._back_climbs is None:
+            self._back_climbs = turned_round(climbs)
         back = copy.copy(self._costs)
-        back.climbs = (self._depths, *climbs[1:])
+        back.climbs = self._back_climbs
         return back
 
     @property

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import ENTRIES, Climb
+from shared_map.terrain.wind import STILL, Wind
 from swarm.grid import GridSpec
 
 _GRADES = 0.1, 0.5
@@ -28,11 +29,12 @@ _ROOM = 1.02
 class Flight:
     """How a class flies.
 
-    speed_mps         over the ground, in level flight
+    speed_mps         through the air, in level flight
     clearance_m       least height over the highest ground of a cell and its eight neighbours
     grade             steepest rise and fall of the surface, metres per metre
     climb_s_per_m     time that a metre of climb takes in addition to the way
     descent_s_per_m   the same of a metre of descent
+    wind              in which it flies
     """
 
     speed_mps: float
@@ -40,6 +42,7 @@ class Flight:
     grade: float = 0.15
     climb_s_per_m: float = 1 / 3
     descent_s_per_m: float = 0.02
+    wind: Wind = STILL
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,7 @@ class AirGround:
 
     height_m      float32 (rows, cols), above the same zero as the terrain; NaN where nobody flies
     pace_s_per_m  float32 (rows, cols); inf where nobody flies
-    climb         the factor of a step by its rise
+    climb         the factor of a step by its rise, and by the wind
     grade         of the surface
     """
 
@@ -77,7 +80,7 @@ def air_ground(
     rises = np.linspace(-steepest, steepest, 2 * ENTRIES + 1)
     metres_s = np.where(rises > 0, rises * flight.climb_s_per_m, -rises * flight.descent_s_per_m)
     factors = (1.0 + flight.speed_mps * metres_s).astype(np.float32)
-    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest), flight.grade)
+    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest, flight.wind), flight.grade)
 
 
 def clearance_floor(elevation_m: Floats, clearance_m: float) -> NDArray[np.float64]:

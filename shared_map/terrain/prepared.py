@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.step_climb import ENTRIES, Climb
 from shared_map.terrain.terrain import FORMAT, Terrain, build_terrain, build_truth
+from shared_map.terrain.wind import Wind
 from shared_map.terrain.zones import files_of_zone
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.plugin_names import cost_layers_of
@@ -74,6 +76,7 @@ def save_ground(
         "digest": terrain.digest,
         "vehicle_radius_m": terrain.vehicle_radius_m,
         "steepest": None if terrain.climb is None else terrain.climb.steepest,
+        "wind": None if terrain.climb is None or terrain.climb.wind is None else asdict(terrain.climb.wind),
         "arrays": sorted(every),
         "notes": list(terrain.notes),
     }
@@ -107,6 +110,7 @@ def read_ground(meta_file: Path, meta: Mapping[str, Any], grid: GridSpec, height
             tuple(map(str, meta["notes"])),
         )
         has_ground, steepest = "ground" in meta["arrays"], meta["steepest"]
+        wind = None if meta["wind"] is None else Wind(float(meta["wind"]["south"]), float(meta["wind"]["east"]))
     except (KeyError, TypeError, ValueError) as error:
         raise TerrainError(
             f"prepared {meta_file.stem} {meta_file} is damaged ({error}); delete the folder"
@@ -116,7 +120,7 @@ def read_ground(meta_file: Path, meta: Mapping[str, Any], grid: GridSpec, height
     climb = None
     if steepest is not None:
         factors = read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
-        climb = Climb(grid, heights_m, factors, float(steepest))
+        climb = Climb(grid, heights_m, factors, float(steepest), wind)
     return {
         "pace_s_per_m": pace,
         "ground_s_per_m": read_array(folder, "ground", shape, np.float32) if has_ground else pace,

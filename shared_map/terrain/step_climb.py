@@ -1,8 +1,9 @@
-"""Climb: the factor on the cost of a step by its rise, where cost depends on direction.
+"""Climb: the factor on the cost of a step by its rise, and by the wind, where cost depends on direction.
 
-A cell's pace is then that of level ground, and a step costs its length x the pace of the cell which it enters x the
-factor of its rise. Vehicles and planners read the factor from one table, so a vehicle drives what its route
-promises. A step that is steeper along its way than allowed has an infinite factor: no way leads over it.
+A cell's pace is then that of level ground in still air, and a step costs its length x the pace of the cell which it
+enters x the factor of its rise. Wind adds to that factor, by the direction of the step. Vehicles and planners read
+it from one table, so a vehicle drives what its route promises. A step that is steeper along its way than allowed
+has an infinite factor: no way leads over it.
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from shared_map.terrain.slope_rules import directional_factor, step_limits_deg
+from shared_map.terrain.wind import STILL, Wind
 from swarm.config.ground import CostConfig
-from swarm.grid import GridSpec
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 ENTRIES = 512
 """Entries of the table on each side of level: the rise is resolved to this part of the steepest."""
 _STEEPEST = 4.0
 """As a grade: 76 degrees. Steeper steps cost as this one, so limits beyond it do not count."""
 _HALF, _ROUND = np.float32(ENTRIES), np.float32(0.5)
+_WAYS = np.zeros((3, 3), np.int64)
+"""Direction 0..7 of a step by its rows and columns, each less one."""
+_WAYS[np.array(STEP_ROW) + 1, np.array(STEP_COL) + 1] = range(8)
 _ROOM = ENTRIES / (ENTRIES - 0.51)
 """What a limit is widened by: it then lies on the border between the last entry and the one before, by a hair on
 the side of what is allowed, and the last stands for all that is steeper."""
@@ -37,28 +42,46 @@ class Climb:
     factors      float32  (2 * ENTRIES + 1) for rises from -steepest to steepest; 1 in the middle; inf where no step
                           may be so steep
     steepest     metres per metre; steeper steps cost as much as this
+    wind         of what flies; None of what drives
     """
 
     grid: GridSpec
     elevation_m: Floats
     factors: Floats
     steepest: float
+    wind: Wind | None = None
+
+    @cached_property
+    def table(self) -> Floats:
+        """float32 (8, 2 * ENTRIES + 1): the factor of a step by its direction 0..7 and its rise, wind included. Of
+        the steps without wind all rows are alike."""
+        wind = STILL if self.wind is None else self.wind
+        drifts = [wind.factor(*step) - 1.0 for step in zip(STEP_ROW, STEP_COL, strict=True)]
+        table: Floats = (self.factors.astype(np.float64) + np.array(drifts)[:, None]).astype(np.float32)
+        return table
+
+    @property
+    def windy(self) -> bool:
+        """Whether a step's direction counts beside its rise."""
+        return self.wind is not None and not self.wind.calm
 
     @cached_property
     def lowest(self) -> float:
         """The lowest factor: no step costs less than level ground times this."""
-        return float(self.factors.min())
+        return float(self.table.min())
 
     @cached_property
     def highest(self) -> float:
         """The highest factor of a step that is allowed."""
-        return float(self.factors[np.isfinite(self.factors)].max())
+        return float(self.table[np.isfinite(self.table)].max())
 
     @property
     def note(self) -> str:
         """A sentence for people who look at the paces."""
+        level = "ground" if self.wind is None else "flight in still air"
+        blown = ", and by the wind" if self.windy else ""
         return (
-            "paces are those of level ground; each step costs by what it climbs too,"
+            f"paces are those of level {level}; each step costs by what it climbs too{blown},"
             f" times {self.lowest:.3g} to {self.highest:.3g}{self._limits()}"
         )
 
@@ -92,26 +115,45 @@ class Climb:
         tails, heads  int64 (steps,)  flat indices of a cell and of a neighbour of it
         """
         heights = self.elevation_m.reshape(-1)
-        diagonal = (tails // self.grid.cols != heads // self.grid.cols) & (
-            tails % self.grid.cols != heads % self.grid.cols
-        )
+        rows = heads // self.grid.cols - tails // self.grid.cols
+        cols = heads % self.grid.cols - tails % self.grid.cols
+        diagonal = (rows != 0) & (cols != 0)
         straight_per_m, diagonal_per_m = self.per_metre
         at = (heights[heads] - heights[tails]) * np.where(diagonal, diagonal_per_m, straight_per_m)
         at = np.clip(np.where(np.isnan(at), np.float32(0), at), -_HALF, _HALF)
-        factors: Floats = self.factors[(at + _HALF + _ROUND).astype(np.intp)]
+        ways = _WAYS[rows + 1, cols + 1] if self.windy else 0
+        factors: Floats = self.table[ways, (at + _HALF + _ROUND).astype(np.intp)]
         return factors
 
     def of_step(self, tail: int, head: int) -> float:
         """The factor of one step between neighbours (flat indices). Without arrays: vehicles ask many times a
         second. With the roundings of `along`, so that a step which one allows is allowed by the other."""
+        return 1.0 if tail == head else self.table.item(self._entry(tail, head))
+
+    def flown(self, tail: int, head: int, length_m: float, south: float, east: float) -> float:
+        """The factor of a stretch of a straight flight that leads from somewhere in a cell to somewhere in a
+        neighbour: the wind in its direction, and what the step between these cells climbs, over its length.
+
+        length_m     of the flight between both
+        south, east  direction of the stretch
+        """
+        if self.wind is None:
+            raise ValueError("only what flies does so between the middles of cells")
+        if tail == head or not length_m:
+            return self.wind.factor(south, east)
+        way, entry = self._entry(tail, head)
+        step_m = self.grid.resolution_m * (math.sqrt(2) if way & 1 else 1.0)
+        return self.wind.factor(south, east) + (self.factors.item(entry) - 1.0) * step_m / length_m
+
+    def _entry(self, tail: int, head: int) -> tuple[int, int]:
+        """Where in the table a step between neighbours is."""
         cols = self.grid.cols
         row0, col0 = divmod(tail, cols)
         row1, col1 = divmod(head, cols)
+        way = _WAYS.item(row1 - row0 + 1, col1 - col0 + 1)
         climbed_m = self.elevation_m[row1, col1] - self.elevation_m[row0, col0]
-        if tail == head or climbed_m != climbed_m:
-            return 1.0
-        at = float(climbed_m * self.per_metre[row0 != row1 and col0 != col1])
-        return float(self.factors[int(np.float32(min(max(at, -ENTRIES), ENTRIES) + ENTRIES) + _ROUND)])
+        at = float(climbed_m * self.per_metre[way & 1]) if climbed_m == climbed_m else 0.0
+        return way, int(np.float32(min(max(at, -ENTRIES), ENTRIES) + ENTRIES) + _ROUND)
 
 
 def climb_of(grid: GridSpec, elevation_m: Floats, cost: CostConfig) -> Climb | None:

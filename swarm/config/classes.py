@@ -26,10 +26,21 @@ SHARED = ("zones", "layers", "directional")
 """Settings of `[cost]` that hold for every class."""
 
 
+class WindConfig(Section, frozen=True, kw_only=True):
+    """The wind in which vehicles fly: everywhere and at every height alike. What drives does not feel it.
+
+    speed_m_per_s  less than the speed of every class that flies, so that each makes headway in every direction
+    from_deg       where it comes from, clockwise from the map's north: 270 is a wind from the west
+    """
+
+    speed_m_per_s: Annotated[float, Meta(ge=0, le=340)] = 0.0
+    from_deg: Annotated[float, Meta(ge=0, le=360)] = 0.0
+
+
 class AirConfig(Section, frozen=True, kw_only=True):
     """What makes a class fly: over a surface that keeps its clearance and is no steeper than it can climb.
 
-    speed_m_per_s    in level flight
+    speed_m_per_s    in level flight, through the air; over the ground the wind adds to it, or takes from it
     clearance_m      it is never lower over the highest ground of a cell and its eight neighbours
     climb_m_per_s    a metre of climb takes this much longer: 1 / climb_m_per_s
     descent_m_per_s  the same of a metre of descent
@@ -121,6 +132,12 @@ def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
             check_cost(each.cost, f"{source}: classes[{n}]")
         except ConfigError as error:
             yield str(error)
+        if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
+            yield (
+                f"{source}: classes[{n}].air.speed_m_per_s: expected more than wind.speed_m_per_s,"
+                f" {scenario.wind.speed_m_per_s:g}, as {each.name} makes no headway else; found"
+                f" {each.air.speed_m_per_s:g}"
+            )
         for k, zone in enumerate(each.air.no_fly if each.air is not None else ()):
             drawn = zone.polygon is not None or zone.polygon_m is not None
             if zone.kind != "forbidden" or not drawn or zone.file is not None or zone.mask is not None:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from swarm.config.classes import GROUND, MOST_CLASSES, ClassConfig
+from swarm.config.classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.values import (
     MOST_TARGETS,
@@ -165,7 +165,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     cpu_budget        auto: share of one core that this planner may use
     push_s            newer routes are pushed to a vehicle at most this often
     routes            grid: vehicles drive from the middle of a cell to that of a neighbour; pulled: straight from
-                      cell to distant cell, where that is no slower. Where `cost.directional` they are not pulled
+                      cell to distant cell, where that is no slower. Where `cost.directional` only flights are
     """
 
     strategy: Annotated[str, plugin_name(Strategy)] = "auto"
@@ -288,6 +288,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     targets        what is chased
     groups         which vehicles there are
     classes        kinds of vehicles that differ from `cost` and `vehicles`
+    wind           in which classes that fly do so
     rovers         simulated outside vehicles that the swarm's must not drive into
     vehicles       how vehicles behave
     planner        how a planner keeps its tree
@@ -307,6 +308,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
     groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
     classes: Annotated[tuple[ClassConfig, ...], Meta(max_length=MOST_CLASSES)] = ()
+    wind: WindConfig = WindConfig()
     rovers: Annotated[tuple[RoverConfig, ...], Meta(max_length=256)] = ()
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()

@@ -31,6 +31,7 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.wind import Wind
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import SlopeRule
@@ -42,7 +43,7 @@ SLOPES: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
 
 def random_climb(rng: np.random.Generator, rows: int, cols: int, relief_m: float, steepest: float) -> Climb:
     """Rough ground with a void or two. Steps that rise or fall by more than `steepest` are forbidden; falls may be
-    by twice as much, so that some lead one way only."""
+    by twice as much, so that some lead one way only. In some of all it is windy."""
     heights = rng.normal(0, relief_m, (rows, cols)).astype(np.float32)
     heights[rng.random((rows, cols)) < 0.03] = np.nan
     rule = SLOPES[int(rng.integers(3))]
@@ -52,7 +53,8 @@ def random_climb(rng: np.random.Generator, rows: int, cols: int, relief_m: float
     factors = climb.factors.copy()
     factors[ENTRIES + entry + 1 :] = np.inf
     factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
-    return replace(climb, factors=factors)
+    blown = float(rng.choice([0.0, 0.0, 0.3])), float(rng.choice([0.0, -0.2]))
+    return replace(climb, factors=factors, wind=Wind(*blown))
 
 
 @st.composite

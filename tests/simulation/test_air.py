@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from functools import cache
+import itertools
+import math
+import statistics
 
 import numpy as np
+import pytest
+from support.class_world import captures_by_class, made
 
+from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial
-from launch_scripts.world.service import TargetsService
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.air_floor import clearance_floor
-from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.agents import agent_of, plan_agents
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
-from swarm.runtime.stats import CAPTURES_BY
 from vehicle_agent.service import AgentService
 
 SECONDS = 12.0
@@ -47,16 +47,18 @@ per_agent = 4
 sense_range_m = 60.0
 capture_range_m = 30.0
 """
+WINDY = """
+[wind]
+speed_m_per_s = 7.0
+from_deg = 250.0
+[planner]
+routes = "pulled"
+"""
 
 
-@cache
-def made() -> tuple[Scenario, Terrain]:
-    scenario = parse_scenario(_TEXT)
-    return scenario, build_terrain(scenario)
-
-
-def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other() -> None:
-    scenario, terrain = made()
+@pytest.mark.parametrize("added", ["", WINDY], ids=["still", "windy"])
+def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(added: str) -> None:
+    scenario, terrain = made(_TEXT + added)
     simulation = Simulation(scenario, terrain=terrain)
     cells: dict[str, set[int]] = {"ground": set(), "drone": set()}
     together = 0
@@ -83,7 +85,7 @@ def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(
     assert report["collisions"] == report["lethal_entries"] == 0
     assert together > 0, "nobody flew over anybody"
     assert plots == {"ground": {False}, "drone": {True}}
-    captures = captures_of(simulation)
+    captures = captures_by_class(simulation)
     assert min(captures.values()) > 0
     ground = class_grounds(scenario, terrain, simulation.truth)["drone"].terrain
     assert ground.flight_m is not None
@@ -96,11 +98,55 @@ def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(
     assert np.isinf(terrain.pace_s_per_m.ravel()[flown]).any(), "a drone flies where no rover drives"
 
 
-def captures_of(simulation: Simulation) -> dict[str, int]:
-    targets = simulation.nodes["targets-0"].service
-    assert isinstance(targets, TargetsService)
-    classes = {plan.id: plan.group.vehicle_class for plan in plan_agents(simulation.scenario)}
-    counts = dict.fromkeys(classes.values(), 0)
-    for vehicle, captures in targets.counters.counts_by[CAPTURES_BY].items():
-        counts[classes[agent_of(vehicle)]] += captures
-    return counts
+_PLAIN = """
+name = "plain"
+terrain = { source = "synthetic", rows = 48, cols = 64, resolution_m = 10.0, relief_m = 0.0 }
+[[targets]]
+walk = "still"
+start = END
+[[groups]]
+name = "drones"
+class = "drone"
+vehicles = 1
+cells = [START]
+[[classes]]
+name = "drone"
+[classes.air]
+speed_m_per_s = 12.0
+[wind]
+speed_m_per_s = 6.0
+from_deg = 270.0
+[planner]
+routes = "ROUTES"
+[vehicles]
+capture_range_m = 5.0
+reserve_cells = 8
+"""
+WEST, EAST, SOUTH_EAST = (9, 9), (9, 52), (45, 45)
+
+
+def speed_mps(routes: str, start: tuple[int, int], end: tuple[int, int]) -> float:
+    """How fast a drone is over the ground on its way, as the median of its ticks."""
+    text = _PLAIN.replace("START", str([*start])).replace("END", str([*end])).replace("ROUTES", routes)
+    simulation = Simulation(parse_scenario(text))
+    places: list[tuple[float, float, float]] = []
+
+    def look(node: Node) -> None:
+        if isinstance(node.service, AgentService):
+            places.extend(
+                (simulation.now_s, *each.motion.place_m()) for each in node.service.agent.vehicles.values()
+            )
+
+    simulation.after_tick.append(look)
+    simulation.run_until(20.0)
+    speeds = [math.dist(a[1:], b[1:]) / (b[0] - a[0]) for a, b in itertools.pairwise(places)]
+    return statistics.median(speed for speed in speeds if speed)
+
+
+@pytest.mark.parametrize("routes", ["grid", "pulled"])
+def test_the_wind_says_how_fast_a_drone_is_over_the_ground_in_each_direction(routes: str) -> None:
+    """12 m/s through the air, in a wind of 6 m/s from the west."""
+    assert speed_mps(routes, WEST, EAST) == pytest.approx(18.0, rel=0.01)
+    assert speed_mps(routes, EAST, WEST) == pytest.approx(6.0, rel=0.01)
+    across = math.sqrt(0.5) * 6.0
+    assert speed_mps(routes, WEST, SOUTH_EAST) == pytest.approx(math.sqrt(12**2 - across**2) + across, rel=0.01)

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from functools import cache
-
 import msgspec
 import numpy as np
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
+from support.class_world import captures_by_class, made
 from support.effort import few
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, nodes_of
-from launch_scripts.world.service import TargetsService
 from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.keeper.zones import zones_of
-from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
-from swarm.config.agents import added_agent, agent_of, plan_agents
+from shared_map.terrain.terrain import build_truth
+from swarm.config.agents import added_agent
 from swarm.config.classes import ClassConfig, class_numbers
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
-from swarm.runtime.stats import CAPTURES_BY
 from swarm.wire.messages.orders import ZoneOrder
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.service import AgentService
@@ -59,12 +54,6 @@ capture_range_m = 30.0
 """
 
 
-@cache
-def made() -> tuple[Scenario, Terrain]:
-    scenario = parse_scenario(_TEXT)
-    return scenario, build_terrain(scenario)
-
-
 class Driven:
     """Where vehicles were, by class."""
 
@@ -78,22 +67,12 @@ class Driven:
             cells.update(vehicle.cell for vehicle in service.agent.vehicles.values())
 
 
-def captures_by_class(simulation: Simulation) -> Counter[str]:
-    targets = simulation.nodes["targets-0"].service
-    assert isinstance(targets, TargetsService)
-    classes = {plan.id: plan.group.vehicle_class for plan in plan_agents(simulation.scenario)}
-    counts: Counter[str] = Counter()
-    for vehicle, captures in targets.counters.counts_by[CAPTURES_BY].items():
-        counts[classes[agent_of(vehicle)]] += captures
-    return counts
-
-
 def grounds_of(simulation: Simulation) -> dict[str, ClassGround]:
     return class_grounds(simulation.scenario, simulation.terrain, simulation.truth)
 
 
 def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_own() -> None:
-    scenario, terrain = made()
+    scenario, terrain = made(_TEXT)
     simulation = Simulation(scenario, terrain=terrain)
     trial, driven = Trial(simulation), Driven(simulation)
     assert trial.run(SECONDS) == []
@@ -146,7 +125,7 @@ def test_whatever_a_class_may_drive_and_whatever_goes_wrong_it_enters_nothing_el
 
 
 def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None:
-    scenario, terrain = made()
+    scenario, terrain = made(_TEXT)
     rovers, walkers = scenario.groups
     tracks, following = [], []
     for name in ("ground", "same"):
@@ -173,7 +152,7 @@ def places_of(service: object) -> list[tuple[str, int, float]]:
 
 
 def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_them_join() -> None:
-    scenario, terrain = made()
+    scenario, terrain = made(_TEXT)
     spawns = spawn_cells(scenario, terrain.grid, class_grounds(scenario, terrain, build_truth(scenario, terrain)))
     steep = np.isinf(terrain.ground_s_per_m).ravel()
     stands = next(cell for agent in ("a2", "a3") for cell in spawns[agent].values() if steep[cell])
@@ -199,7 +178,7 @@ def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_
 
 
 def test_a_zone_for_walkers_is_left_by_walkers_and_says_nothing_to_rovers() -> None:
-    scenario, terrain = made()
+    scenario, terrain = made(_TEXT)
     simulation = Simulation(scenario, terrain=terrain)
     laws = Laws(simulation)
     simulation.run_until(3.0)

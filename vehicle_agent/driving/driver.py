@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import pairwise
 
+from shared_map.terrain.step_climb import Climb
 from swarm.right_of_way.holdings import Holdings
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.driving.motion import Point
+from vehicle_agent.driving.motion import Motion, Point
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.local_map import LocalMap
 
@@ -22,7 +23,8 @@ class Driver:
               and not what the cell that it enters does
     measures  whether to note how fast they drove
 
-    driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs taken out:
+    driven    (cell, s/m) of each step into a cell that was driven without a stop, with what it climbs, and the
+              wind, taken out:
               what vehicles measure; the owner empties it
     entered   cells that vehicles have entered and not looked around from; the owner empties it
     """
@@ -48,7 +50,8 @@ class Driver:
         self._passable = passable
         self._dynamics = dynamics
         self._cols = local_map.grid.cols
-        self._pulled = pulled and local_map.climb is None
+        # On the ground no route is pulled where uphill is not downhill.
+        self._pulled = pulled and (local_map.climb is None or local_map.climb.wind is not None)
         self._left_s: dict[str, float] = {}
         self._rolling: set[str] = set()
         """Vehicles that did not stop when they came to the middle of the cell where they are."""
@@ -74,7 +77,7 @@ class Driver:
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
         """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
-        motion, climb = vehicle.motion, self._climb
+        motion = vehicle.motion
         while left_s > 0.0:
             if motion.at_rest:
                 if stopped(vehicle.id):
@@ -91,7 +94,7 @@ class Driver:
                     self._steps[vehicle.id] = (path[1], 0.0)
             before = motion.cell
             pace_s_per_m = self._physics.item(before if self._pulled else motion.head)
-            climbing = 1.0 if climb is None else climb.driven(motion.tail, motion.head)
+            climbing = climbing_of(motion, self._climb, self._pulled)
             pace_s_per_m *= climbing
             had_s, head, length_m = left_s, motion.head, motion.length_m
             if self._pulled:
@@ -148,3 +151,16 @@ class Driver:
     def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
         """Give back all but the first cells, and the one that it drives into."""
         self._holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))
+
+
+def climbing_of(motion: Motion, climb: Climb | None, pulled: bool) -> float:
+    """What a metre of the stretch on which a vehicle is takes, over one on the level and in still air.
+
+    pulled  whether it leads along a segment, in any direction
+    """
+    if climb is None:
+        return 1.0
+    if not pulled:
+        return climb.driven(motion.tail, motion.head)
+    (row0, col0), (row1, col1), _ = motion.stretch()
+    return climb.flown(motion.tail, motion.head, motion.length_m, row1 - row0, col1 - col0)

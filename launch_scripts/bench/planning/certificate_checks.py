@@ -23,6 +23,7 @@ from planner_service.kernel_build import load_all
 from planner_service.target_tree import TargetTree
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.wind import Wind
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import SlopeRule, Strategy
@@ -273,8 +274,8 @@ def _random_pace(rng: np.random.Generator, rows: int, cols: int) -> Floats:
 
 
 def _random_climb(rng: np.random.Generator, grid: GridSpec) -> Climb:
-    """Rough ground with voids; steps that rise too steeply are forbidden, and falls from twice as steep on, so that
-    some lead one way only."""
+    """Rough ground with voids, in some winds; steps that rise too steeply are forbidden, and falls from twice as
+    steep on, so that some lead one way only."""
     heights = rng.normal(0, rng.choice([0.0, 0.1, 0.5]), (grid.rows, grid.cols)).astype(np.float32)
     heights *= np.float32(grid.resolution_m)
     heights[rng.random(heights.shape) < 0.03] = np.nan
@@ -286,7 +287,8 @@ def _random_climb(rng: np.random.Generator, grid: GridSpec) -> Climb:
     factors = climb.factors.copy()
     factors[ENTRIES + entry + 1 :] = np.inf
     factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
-    return replace(climb, factors=factors)
+    wind = Wind(float(rng.choice([0.0, 0.0, 0.3])), float(rng.choice([0.0, 0.0, -0.2])))
+    return replace(climb, factors=factors, wind=wind)
 
 
 def tables(report: dict[str, Any]) -> Iterator[Table | str]:

@@ -106,7 +106,7 @@ def learning(
     agents: Annotated[int, typer.Option(min=1, max=10, help="Authors that ten vehicles report to.")] = 1,
     right: Annotated[bool, typer.Option("--right", help="The prior is right: count false alarms.")] = False,
     simulated: Annotated[
-        bool, typer.Option("--simulated", help="The demo instead, with and without learning, as simulated.")
+        bool, typer.Option("--simulated", help="The scenario jacksboro, with and without learning.")
     ] = False,
     seconds: Annotated[float, typer.Option(min=1, help="--simulated: how long each run is.")] = 60.0,
     as_json: AsJson = False,
@@ -118,17 +118,17 @@ def learning(
     swarm bench learning --right --seeds 0:50
     swarm bench learning --simulated --seeds 7:11
 
-    --simulated runs the whole demo, where grass is three times as slow as its prior says: captures, and how far
-    vehicles came. Two runs of some 40 s of CPU a seed.
+    --simulated runs the scenario jacksboro, where grass is three times as slow as its
+    prior says: captures, and how far vehicles came. Two runs of some 40 s of CPU a seed.
     """
     if simulated:
-        from launch_scripts.bench.learning_runs import run as run_demo
-        from launch_scripts.bench.learning_runs import tables as demo_tables
+        from launch_scripts.bench.learning_runs import run as run_jacksboro
+        from launch_scripts.bench.learning_runs import tables as tables_of_jacksboro
         from launch_scripts.simulation.campaign import parse_seeds
 
         with progress_of("learning") as progress:
-            report = run_demo(parse_seeds(seeds), seconds, progress)
-        show(report, as_json, demo_tables)
+            report = run_jacksboro(parse_seeds(seeds), seconds, progress)
+        show(report, as_json, tables_of_jacksboro)
         return
     from launch_scripts.bench.planning.learning import run_learning, tables
     from launch_scripts.simulation.campaign import parse_seeds

@@ -184,9 +184,17 @@ def _cost(panel: Axes, key: Axes, terrain: Terrain, level: Level, shade: Floats)
     # A partly lethal pixel is tinted in part, so that walls thinner than a pixel are seen.
     share = np.sqrt(np.where(driven, level.lethal_share, np.float32(1)))[..., None]
     _show(panel, level, colours * (1 - share) + np.array(to_rgb(_LETHAL), np.float32) * share)
-    _named(panel, "cost" if terrain.climb is None else "cost of level ground (steps cost by their climb too)")
+    _named(panel, _name_of_cost(terrain))
     lethal = Patch(color=_LETHAL, label=f"lethal {level.lethal_share.mean():.1%}")
     _bar(key, _PACES, scale, "seconds per metre", [lethal], extend="max")
+
+
+def _name_of_cost(terrain: Terrain) -> str:
+    climb = terrain.climb
+    if climb is None:
+        return "cost"
+    level = "ground" if climb.wind is None else "flight"
+    return f"cost of level {level} (steps cost by their climb{' and the wind' if climb.windy else ''} too)"
 
 
 # --- keys -------------------------------------------------------------------------------------------------------

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.points import cell_at
 from launch_scripts.monitor.movers.strips import Strips, ragged
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 Cells = NDArray[np.int64]
+Corners = NDArray[np.float64]
+"""(n, 2): rows and cols of the places between which a line is straight; whole numbers are middles of cells."""
 
 _STEP_ROW, _STEP_COL = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
 
@@ -35,23 +40,38 @@ class RouteNow:
 
     gap       its cost over its proven lower bound; None if nothing is proven
     begun_ns  when that was heard
+    turns     of a pulled route the indices of the cells in which it turns, its first and last included; else None
     """
 
     target: str
     cells: Cells
     gap: float | None = None
     begun_ns: int = 0
+    turns: Cells | None = None
 
     def ahead_of(self, cell: int) -> Cells:
         """The route from a cell on; the whole route if the cell is not on it."""
         found = np.flatnonzero(self.cells == cell)
         return self.cells[found[-1] :] if len(found) else self.cells
 
+    def corners_ahead(self, grid: GridSpec, east_m: float, south_m: float) -> Corners:
+        """Of a pulled route: from where the vehicle is to where it turns, and on to the end; the whole route if
+        that place is not on it."""
+        assert self.turns is not None
+        corners = self.cells[self.turns]
+        found = np.flatnonzero(self.cells == cell_at(grid, east_m, south_m))
+        if not len(found):
+            return np.stack(np.divmod(corners, grid.cols), axis=1).astype(np.float64)
+        ahead = corners[self.turns > found[-1]]
+        place = south_m / grid.resolution_m - 0.5, east_m / grid.resolution_m - 0.5
+        return np.vstack([place, np.stack(np.divmod(ahead, grid.cols), axis=1)])
+
 
 class RouteLines:
     """Routes to one target as lines in which no part of the ground is drawn twice.
 
     Routes to one target join, as the branches of its tree do: a thousand of them have few cells more than the tree.
+    Pulled ones meet where they turn.
     """
 
     def __init__(self, mesh: TerrainMesh, stride: int) -> None:
@@ -59,14 +79,19 @@ class RouteLines:
         self._stride = stride
         self._drawn = np.zeros(mesh.grid.cells, np.bool_)
 
-    def lines(self, routes: Iterable[Cells]) -> Strips:
-        """Each route up to where it meets one that is drawn already, the longest first."""
+    def lines(self, routes: Iterable[Cells], pulled: Iterable[Corners] = ()) -> Strips:
+        """Each route up to where it meets one that is drawn already, the longest first; of pulled ones each segment
+        once."""
         pieces = list(self._pieces(sorted(routes, key=len, reverse=True)))
         for piece in pieces:
             self._drawn[piece] = False
         thin = [thinned(piece, self._stride) for piece in pieces]
-        cells = np.concatenate(thin) if thin else np.empty(0, np.int64)
-        return ragged(self._mesh.place_cells(cells, 0.2 * self._mesh.scale_m), list(map(len, thin)))
+        cols = self._mesh.grid.cols
+        along = [np.stack(np.divmod(piece, cols), axis=1).astype(np.float64) for piece in thin]
+        along += [filled(piece, self._stride) for piece in _segments_once(pulled)]
+        rows_cols = np.concatenate(along) if along else np.empty((0, 2))
+        south_m, east_m = ((rows_cols + 0.5) * self._mesh.grid.resolution_m).astype(np.float32).T
+        return ragged(self._mesh.place(east_m, south_m, 0.2 * self._mesh.scale_m), list(map(len, along)))
 
     def _pieces(self, routes: Iterable[Cells]) -> Iterator[Cells]:
         drawn = self._drawn
@@ -82,3 +107,26 @@ def thinned(cells: Cells, stride: int) -> Cells:
     """Every so many cells of a line, with both of its ends."""
     kept = cells[::stride]
     return kept if (len(cells) - 1) % stride == 0 else np.append(kept, cells[-1])
+
+
+def _segments_once(routes: Iterable[Corners]) -> Iterator[Corners]:
+    """Parts of routes of which no segment is in another one."""
+    drawn: set[tuple[float, ...]] = set()
+    for corners in routes:
+        known = []
+        for start, end in pairwise(corners.tolist()):
+            segment = (*start, *end)
+            known.append(segment in drawn)
+            drawn.add(segment)
+        borders = np.flatnonzero(np.diff(known, prepend=True, append=True))
+        for begin, end in zip(borders[::2].tolist(), borders[1::2].tolist(), strict=True):
+            yield corners[begin : end + 1]
+
+
+def filled(corners: Corners, stride: int) -> Corners:
+    """A line with a point for so many cells at least, so that it lies on the ground; its corners are among them."""
+    parts = [corners[:1]]
+    for start, end in pairwise(corners):
+        many = max(math.ceil(np.abs(end - start).max() / stride), 1)
+        parts.append(start + (end - start) * (np.arange(1, many + 1) / many)[:, None])
+    return np.concatenate(parts)

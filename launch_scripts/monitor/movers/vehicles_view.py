@@ -48,7 +48,8 @@ class _Roll:
 
 def trails_of(scenario: Scenario, mesh: TerrainMesh, level: Level) -> Trails:
     """Trails that break where something jumped further than anything drives."""
-    flown = (each.air.speed_m_per_s for each in scenario.classes if each.air is not None)
+    blown = scenario.wind.speed_m_per_s
+    flown = (each.air.speed_m_per_s + blown for each in scenario.classes if each.air is not None)
     quickest_m_per_s = scenario.time_scale * max(scenario.cost.road_speed_m_per_s, 1.0, *flown)
     return Trails(max(8 * level.trail_every_s * quickest_m_per_s, 4 * mesh.grid.resolution_m))
 
@@ -95,7 +96,9 @@ class VehiclesView:
         if len(self._routes) >= _ROUTES_KEPT:
             self._routes.clear()
         gap = followed.cost_s / followed.lower_bound_s if followed.lower_bound_s > 0 else None
-        self._routes[followed.vehicle] = RouteNow(followed.target, cells, gap, now_ns)
+        legs = np.frombuffer(followed.legs, "<u4").astype(np.int64)
+        turns = np.concatenate([[0], np.cumsum(legs)]) if len(legs) else None
+        self._routes[followed.vehicle] = RouteNow(followed.target, cells, gap, now_ns, turns)
         return True
 
     def draw(
@@ -174,13 +177,17 @@ class VehiclesView:
             return
         target = self._target_ids[self._next_target % len(self._target_ids)]
         self._next_target += 1
-        ahead = []
+        ahead, pulled = [], []
+        grid = self._mesh.grid
         for n in vehicles.chasing(target).tolist():
             route = self._routes.get(vehicles.ids[n])
             if route is not None and route.target == target:
                 place = float(vehicles.east_m[n]), float(vehicles.south_m[n])
-                ahead.append(route.ahead_of(cell_at(self._mesh.grid, *place)))
-        strips = self._route_lines.lines(ahead)
+                if route.turns is None:
+                    ahead.append(route.ahead_of(cell_at(grid, *place)))
+                else:
+                    pulled.append(route.corners_ahead(grid, *place))
+        strips = self._route_lines.lines(ahead, pulled)
         if self._routes_drawn.get(target) != strips:
             self._routes_drawn[target] = strips
             self._drawing.lines(f"world/routes/{target}", strips)

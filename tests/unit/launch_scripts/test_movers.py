@@ -20,7 +20,7 @@ from launch_scripts.monitor.movers.due import Due
 from launch_scripts.monitor.movers.levels import LEVELS, level_for
 from launch_scripts.monitor.movers.looks import ALARM_COLOUR, HUES, LOST_COLOUR, Looks, shaded
 from launch_scripts.monitor.movers.points import cell_at, label_places, target_points, vehicle_points
-from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along
+from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along, filled
 from launch_scripts.monitor.movers.searches import SILENT_NS, Searches, searched_points
 from launch_scripts.monitor.movers.strips import Trails, poles, rings
 from launch_scripts.report.results.certified_gap import CertifiedGap
@@ -266,6 +266,50 @@ def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
     route = RouteNow("t0", np.array([1, 2, 3, 4]))
     assert route.ahead_of(3).tolist() == [3, 4]
     assert route.ahead_of(9).tolist() == [1, 2, 3, 4]
+
+
+def test_what_is_left_of_a_pulled_route_is_straight_from_where_the_vehicle_is_to_its_turns() -> None:
+    """From the middle of cell (0, 0) straight to (2, 4), and east to (2, 6), on cells of 10 m."""
+    grid = hill(10, 20).grid
+    cells = np.array([0, 1, 21, 22, 23, 43, 44, 45, 46])
+    route = RouteNow("t0", cells, turns=np.array([0, 6, 8]))
+    assert route.corners_ahead(grid, 25.0, 15.0).tolist() == [[1.0, 2.0], [2, 4], [2, 6]]
+    assert route.corners_ahead(grid, 27.0, 16.0) == pytest.approx(np.array([[1.1, 2.2], [2, 4], [2, 6]]))
+    assert route.corners_ahead(grid, 45.0, 25.0).tolist() == [[2, 4], [2, 6]]
+    assert route.corners_ahead(grid, 65.0, 25.0).tolist() == [[2, 6]], "it has arrived"
+    assert route.corners_ahead(grid, 95.0, 95.0).tolist() == [[0, 0], [2, 4], [2, 6]]
+
+
+CORNERS = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=6).map(
+    lambda corners: [each for each, _ in itertools.groupby(corners)]
+)
+
+
+@given(st.lists(CORNERS, max_size=6))
+def test_of_pulled_routes_each_segment_is_drawn_once(routes: list[list[tuple[int, int]]]) -> None:
+    mesh = TerrainMesh(hill(10, 10))
+    lines = RouteLines(mesh, 10).lines([], [np.array(each, np.float64).reshape(-1, 2) for each in routes])
+    drawn = []
+    for n in range(len(lines)):
+        places = (lines.line(n)[:, :2] * [1, -1] / 10 - 0.5).round(3).tolist()
+        drawn += [(a, b, c, d) for (b, a), (d, c) in itertools.pairwise(places)]
+    assert sorted(drawn) == sorted({(*a, *b) for each in routes for a, b in itertools.pairwise(each)})
+
+
+@given(CORNERS.filter(len), st.integers(1, 5))
+def test_a_straight_line_has_a_point_for_so_many_cells_and_keeps_its_corners(
+    corners: list[tuple[int, int]], stride: int
+) -> None:
+    line = filled(np.array(corners, np.float64), stride)
+    assert np.abs(np.diff(line, axis=0)).max(initial=0) <= stride
+    at = 0
+    for start, end in itertools.pairwise(corners):
+        assert line[at].tolist() == [*start]
+        many = next(n for n in range(1, len(line)) if np.allclose(line[at + n], end, rtol=0, atol=1e-12))
+        straight = np.linspace(start, end, many + 1)
+        assert np.allclose(line[at : at + many + 1], straight, rtol=0, atol=1e-12)
+        line[at := at + many] = end
+    assert at == len(line) - 1
 
 
 def test_the_cells_of_a_route_are_those_of_a_walk_along_it_and_none_off_the_map() -> None:

@@ -89,6 +89,11 @@ def test_cost_of_a_class_that_flies_is_that_of_its_surface(tmp_path: Path) -> No
     said = run("cost", scenario, "--class", "drone")
     assert "0.0% lethal, pace 0.05 to 0.05 s/m" in said
     assert "flies at" in said
+    assert "wind" not in said
+    scenario.write_text(scenario.read_text() + "[wind]\nspeed_m_per_s = 5\nfrom_deg = 270\n")
+    windy = run("cost", scenario, "--class", "drone")
+    assert "in a wind of 5 m/s from 270 degrees: 15 m/s over the ground against it, 25 m/s with it" in windy
+    assert "and by the wind, times 0.8 to" in windy
 
 
 @pytest.mark.parametrize("shape", [(70, 90), (1, 1), (9, 400), (400, 9)])

@@ -76,3 +76,29 @@ def test_a_class_that_can_stand_nowhere_in_truth_is_said() -> None:
     terrain = module.build_terrain(scenario)
     with pytest.raises(TerrainError, match="class walker: no cell that it can drive by the map is so in truth"):
         class_grounds(scenario, terrain, np.full_like(terrain.pace_s_per_m, np.inf))
+
+
+def test_a_surface_that_is_prepared_keeps_its_wind_and_another_wind_is_another_surface(tmp_path: Path) -> None:
+    text = """
+terrain = { source = "synthetic", rows = 32, cols = 48, relief_m = 200.0 }
+groups = [{ vehicles = 1 }, { name = "drones", class = "drone", vehicles = 1 }]
+classes = [{ name = "drone", air = { speed_m_per_s = 10 } }]
+"""
+    west, south = (parse_scenario(f"{text}wind = {{ speed_m_per_s = 4, from_deg = {of} }}") for of in (270, 180))
+    terrain, truth = prepare(tmp_path, west)
+    prepare_classes(tmp_path, west, terrain, truth)
+    made = class_terrains(west, terrain)["drone"]
+    again, _ = prepare(tmp_path, west)
+    load_classes(RoleSetup(west, "run", "agent", "a0", 1, 1, run_dir=tmp_path), again)
+    found = class_terrains(west, again)["drone"]
+    assert found is not made
+    assert found.climb is not None
+    assert made.climb is not None
+    assert found.climb.wind == made.climb.wind
+    assert found.climb.windy
+    assert np.array_equal(found.climb.table, made.climb.table)
+    assert (found.digest, found.notes) == (made.digest, made.notes)
+    other = class_terrains(south, again)["drone"]
+    assert other.digest != found.digest
+    assert other.climb is not None
+    assert other.climb.wind != found.climb.wind
