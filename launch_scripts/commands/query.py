@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -278,3 +278,60 @@ def metrics(
         typer.echo(command.dashboard())
     else:
         command.serve_metrics(where.network(tls), port)
+
+
+_ROS = "The ROS side"
+
+
+@app.command(rich_help_panel=panels.ASK)
+@spread
+def ros2(
+    where: Where,
+    tls: Tls,
+    settings: Annotated[
+        Path | None, typer.Argument(metavar="[SETTINGS]", help="A .toml file: topics, rates, names, both sides.")
+    ] = None,
+    ros: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Router of the ROS side, rmw_zenohd; tcp/127.0.0.1:7447 if not given.",
+            rich_help_panel=_ROS,
+        ),
+    ] = None,
+    domain: Annotated[
+        int | None, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID; 0 if not given.", rich_help_panel=_ROS)
+    ] = None,
+    distribution: Annotated[
+        str | None,
+        typer.Option(help="humble, jazzy, kilted, lyrical or rolling; jazzy if not given.", rich_help_panel=_ROS),
+    ] = None,
+    vehicles: Annotated[
+        list[str] | None,
+        typer.Option(help="Ids of vehicles that ROS hears of, with * and ?; may be given several times."),
+    ] = None,
+    topics: Annotated[bool, typer.Option("--list", help="Print what is forwarded, and exit.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --list: as JSON.")] = False,
+) -> None:
+    """Show a running swarm to ROS 2 (rmw_zenoh), until Ctrl-C: map, transforms, odometry, plans, targets, markers.
+    ROS need not be installed here.
+
+    swarm ros2 --ros tcp/127.0.0.1:7447
+
+    swarm ros2 gateway.toml --run LAST
+
+    swarm ros2 --list
+    """
+    from launch_scripts.commands import ros2 as command
+
+    chosen = command.settings_of(
+        settings,
+        {"ros.endpoint": ros, "ros.domain": domain, "ros.distribution": distribution, "vehicles": vehicles},
+    )
+    if topics:
+        command.list_topics(chosen, as_json=as_json)
+        return
+    side = chosen.swarm
+    where = replace(where, connect=where.connect or side.connect, namespace=where.namespace or side.namespace)
+    tls = tls if tls.tls_ca else Tls(side.ca, side.certificate, side.key)
+    command.serve_ros2(chosen, where.network(tls), where.runs)

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from launch_scripts.reference import cli_page, cover_page, scenario_page, ways_page, wire_page
+from launch_scripts.reference import cli_page, cover_page, ros2_page, scenario_page, ways_page, wire_page
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
@@ -20,6 +20,7 @@ PAGES: dict[Path, Callable[[], str]] = {
     cli_page.PATH: cli_page.document,
     cover_page.PATH: cover_page.document,
     ways_page.PATH: ways_page.document,
+    ros2_page.PATH: ros2_page.document,
 }
 
 

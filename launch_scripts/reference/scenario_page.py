@@ -58,7 +58,12 @@ class UndocumentedKeyError(Exception):
 
 def document(root: Section = Scenario) -> str:
     """The page."""
-    return "\n".join([_INTRO, *(line for path, section in _sections(root) for line in _section(path, section))])
+    return "\n".join([_INTRO, *sections(root)])
+
+
+def sections(root: Section) -> list[str]:
+    """Headings and tables of all sections of a file, as lines."""
+    return [line for path, section in _sections(root) for line in _section(path, section)]
 
 
 def schema(root: Section = Scenario) -> str:

@@ -24,6 +24,7 @@ from swarm.errors import BusError, ProtocolError
 
 log = logging.getLogger(__name__)
 
+RosSession = zenoh.Session
 _HEARTBEAT_S = 0.5
 
 
@@ -34,14 +35,18 @@ class Publisher:
         self.endpoint = endpoint
         self._types, self._put = types, put
         self._sequence = itertools.count(1)
+        self._gid = endpoint.gid
 
     def put(self, message: Any) -> None:
         self.put_packed(self._types.pack(message, self.endpoint.type_name))
 
     def put_packed(self, content: bytes) -> None:
-        """CDR that was made before."""
-        attachment = Attachment(next(self._sequence), time.time_ns(), self.endpoint.gid)
-        self._put(content, attachment=attachment.packed())
+        """CDR that was made before. Raises BusError if Zenoh refuses it."""
+        attachment = Attachment(next(self._sequence), time.time_ns(), self._gid)
+        try:
+            self._put(content, attachment=attachment.packed())
+        except zenoh.ZError as error:
+            raise BusError(f"{self.endpoint.topic} is not put: {error}") from error
 
 
 class Newest:
@@ -99,6 +104,17 @@ class Node:
         self._declared: dict[Endpoint, list[Any]] = {}
         self._own: list[Any] = [session.liveliness().declare_token(self.name.token)]
         self._lock = threading.Lock()
+
+    @property
+    def endpoints(self) -> list[Endpoint]:
+        """Those that are declared now."""
+        with self._lock:
+            return list(self._declared)
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is connected now. Zenoh connects again by itself, and declares all anew there."""
+        return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, type_name: str, qos: Qos = Qos.DEFAULT) -> Publisher:
         endpoint = self._endpoint(Kind.PUBLISHER, topic, type_name, qos)
@@ -278,3 +294,9 @@ def open_ros(endpoint: str, timeout_s: float = 10.0) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise BusError(f"no router of the ROS side answers at {endpoint}: {error}") from error
+
+
+def close_ros(session: RosSession) -> None:
+    """Close what `open_ros` has opened."""
+    close: Callable[[], object] = session.close
+    close()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm.client.frame import Frame
-from swarm.client.observer import Observer
+from swarm.client.observer import EVERY_S, Observer
 from swarm.client.orders import Orders
 from swarm.client.right_of_way import RightOfWay
 from swarm.client.route import Route
@@ -19,7 +19,7 @@ from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
-from swarm.errors import BusError, ConfigError, RunMismatchError
+from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
 from swarm.wire.fields import check_id
 from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.processes import RunInfo
@@ -79,6 +79,21 @@ class Swarm:
     def connected(self) -> bool:
         """Whether the link to the router is up, as far as is known."""
         return self._session.connected
+
+    @property
+    def run(self) -> RunInfo:
+        """What a process of the run said of it when the connection began."""
+        return self._session.run
+
+    @property
+    def now_ns(self) -> int:
+        """The time by the swarm's clocks, in ns since 1970: that by which marks begin and end."""
+        return self._session.swarm_now_ns()
+
+    @property
+    def ended(self) -> SwarmError | None:
+        """Why nothing can be said any more: it is closed, or another run is in the namespace. None while it can."""
+        return self._session.ended
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -157,9 +172,15 @@ class Swarm:
         """Orders to the swarm: pause, close areas, add targets ... With certificates for `operator.NAME` only."""
         return Orders(self._session)
 
-    def observer(self) -> Observer:
-        """What happens in the swarm, from now on."""
-        return Observer(self._session)
+    def observer(self, *, every_s: float = EVERY_S) -> Observer:
+        """What happens in the swarm, from now on.
+
+        every_s  positions of the swarm's vehicles are read once in so many seconds
+        """
+        every_s = self._session.number("every_s", every_s)
+        if not 0 < every_s < 1e6:
+            raise self._session.refused(f"every_s is {every_s!r}, expected seconds, more than 0")
+        return Observer(self._session, every_s)
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
         """Call with a sentence when something goes wrong that no call can raise: another process uses one of our

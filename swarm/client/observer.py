@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 
 CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
-_EVERY_S = 0.2
+EVERY_S = 0.2
 _HEARD = (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS)
 _SAMPLED = (FLEET,)
-"""Of these only the newest is read, five times a second: they come at every tick, of every vehicle."""
+"""Of these only the newest is read, some times a second: they come at every tick, of every vehicle."""
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
+_ZONES = "operator."
+"""Authors that begin so are zones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +84,7 @@ class Observer:
     notes  sentences for people, as they come: `for note in observer.notes`; captures have the kind "capture"
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, every_s: float = EVERY_S) -> None:
         self._session = session
         self.notes: Stream[Note] = Stream()
         self._on_note: list[Callable[[Note], None]] = []
@@ -95,11 +97,14 @@ class Observer:
         self._routes: dict[str, Followed] = {}
         self._sets: dict[tuple[int, str], MarkSet] = {}
         """(tile, author) -> its newest set."""
+        self._new_routes: dict[str, None] = {}
+        self._new_sets: dict[tuple[int, str], None] = {}
+        """What has changed since `take_routes` and `take_mark_sets`."""
         session.add(self)
         bus, post = session.bus, session.post
         for topic in _HEARD:
             if topic in _SAMPLED:
-                bus.subscribe(topic, post, every_s=_EVERY_S)
+                bus.subscribe(topic, post, every_s=every_s)
             else:
                 bus.subscribe(topic, post)
         self._ask_marks()
@@ -142,11 +147,24 @@ class Observer:
     def routes(self) -> Mapping[str, list[tuple[float, float]]]:
         """Points in metres of the routes that vehicles of the swarm have begun last, by vehicle."""
         with self._session.lock:
-            frame = self._session.frame
-            return {
-                id: [frame.centre_m(cell) for cell in walk(frame.grid, each.start, each.directions)]
-                for id, each in self._routes.items()
-            }
+            return {id: self._points(id) for id in self._routes}
+
+    def take_routes(self) -> Mapping[str, list[tuple[float, float]]]:
+        """Those of `routes` that have come since the last call."""
+        with self._session.lock:
+            taken, self._new_routes = self._new_routes, {}
+            return {id: self._points(id) for id in taken}
+
+    def take_mark_sets(self) -> list[MarkSet]:
+        """The newest set of marks of each tile and author, of those that have come since the last call: what a
+        replica merges."""
+        with self._session.lock:
+            taken, self._new_sets = self._new_sets, {}
+            return [self._sets[key] for key in taken]
+
+    def _points(self, vehicle: str) -> list[tuple[float, float]]:
+        frame, route = self._session.frame, self._routes[vehicle]
+        return [frame.centre_m(cell) for cell in walk(frame.grid, route.start, route.directions)]
 
     @property
     def marks(self) -> Mapping[int, Mark]:
@@ -203,10 +221,11 @@ class Observer:
         newer = held is None or (marks.epoch, marks.seq) > (held.epoch, held.seq)
         if (
             newer
-            and marks.tile < self._session.frame.grid.tiles
+            and marks.tile <= self._session.frame.grid.tiles  # beyond the last: what authors have learned
             and (held is not None or len(self._sets) < _MOST_SETS)
         ):
             self._sets[marks.tile, marks.author] = marks
+            self._new_sets[marks.tile, marks.author] = None
 
     def _hear_followed(self, followed: Followed) -> None:
         try:
@@ -215,6 +234,7 @@ class Observer:
             self._session.problem("routes_refused", f"a route of {followed.vehicle} leaves the terrain")
         else:
             self._routes[followed.vehicle] = followed
+            self._new_routes[followed.vehicle] = None
 
 
 def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
@@ -241,9 +261,10 @@ def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
 
 def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Mark]:
     """The winning statements of these sets, by cell of the grid: as `shared_map.replication.merge` has it, the
-    newest wins, and of two with one stamp that of the larger author."""
-    won: dict[int, tuple[int, str, int, float]] = {}
+    newest wins, of two with one stamp that of the larger author, and an operator's over all others."""
+    won: dict[int, tuple[bool, int, str, int, float]] = {}
     for each in sets:
+        zone = each.author.startswith(_ZONES)
         row, col = divmod(each.tile, grid.tile_cols)
         corner_row, corner_col = row * TILE_CELLS, col * TILE_CELLS
         untils_ns = memoryview(each.untils_ns).cast("q") if each.untils_ns else None
@@ -258,11 +279,11 @@ def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Ma
             if not grid.inside(row, col):
                 continue  # in a tile that the border cuts
             at = grid.cell(row, col)
-            said = (stamp_ns, each.author, kind, pace)
-            if at not in won or said[:2] > won[at][:2]:
+            said = (zone, stamp_ns, each.author, kind, pace)
+            if at not in won or said[:3] > won[at][:3]:
                 won[at] = said
     return {
         cell: Mark(kind == MarkKind.LETHAL, pace if kind == MarkKind.PACE else None)
-        for cell, (_, _, kind, pace) in sorted(won.items())
+        for cell, (*_, kind, pace) in sorted(won.items())
         if kind != MarkKind.CLEAR
     }

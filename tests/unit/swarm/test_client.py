@@ -375,8 +375,9 @@ def test_a_keeper_that_took_us_for_dead_is_told_again_under_a_higher_epoch() -> 
     assert marks.heard(mine, 300) == marks.heard(again, 300) == []
 
 
+AUTHORS = ["all.a.1", "all.b.2", "all.c.3", "operator.north", "operator.south"]
 stated = st.tuples(
-    st.sampled_from(["all.a.1", "all.b.2", "all.c.3"]),
+    st.sampled_from(AUTHORS),
     st.lists(st.integers(0, MAP_GRID.cells - 1), min_size=1, max_size=6),
     st.sampled_from(list(MarkKind)),
     st.integers(0, 40),
@@ -387,7 +388,7 @@ stated = st.tuples(
 @settings(max_examples=few(200), deadline=None)
 @given(st.lists(stated, max_size=12), st.integers(0, 50))
 def test_what_an_observer_shows_as_marked_is_what_a_replica_holds(words: Any, now_ns: int) -> None:
-    authors = {name: OwnMarks(name, "all", MAP_GRID) for name in ("all.a.1", "all.b.2", "all.c.3")}
+    authors = {name: OwnMarks(name, name.partition(".")[0], MAP_GRID) for name in AUTHORS}
     replica = MapReplica(MAP_GRID, Composite())
     sets: dict[tuple[int, str], MarkSet] = {}
     for name, cells, kind, at_ns, until_ns in words:

@@ -1,0 +1,241 @@
+"""The process of `swarm ros2`: one session to the swarm, one to ROS, and the gateway between them. Shell only.
+
+Both sides may come and go. What ROS hears is put without waiting, so a ROS side that hangs costs the swarm nothing,
+and misses messages.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+
+from launch_scripts.ros2.actions import Action, Channel, Declare, Put, Remove
+from launch_scripts.ros2.diagnostics import Health
+from launch_scripts.ros2.frames import RosMap
+from launch_scripts.ros2.gateway import Gateway
+from launch_scripts.ros2.graph import SeenEndpoint
+from launch_scripts.ros2.map_feed import MapFeed
+from launch_scripts.ros2.node import Node, Publisher, RosSession, close_ros, open_ros
+from launch_scripts.ros2.peers import PeerWatch
+from launch_scripts.ros2.run_terrain import find_terrain
+from launch_scripts.ros2.settings import Settings
+from launch_scripts.ros2.topics import ROWS
+from launch_scripts.ros2.types import Distribution, types_of
+from launch_scripts.ros2.vehicle_topics import ToWgs84
+from swarm.client import Observer, Swarm, SwarmError, connect
+from swarm.client.frame import Frame
+from swarm.config.scenario import NetworkConfig
+from swarm.errors import BusError, ConfigError
+
+log = logging.getLogger(__name__)
+
+_LOOK_S = 1.0
+"""Links are looked at so often."""
+_LONGEST_SLEEP_S = 0.1
+_AGAIN_S = 2.0
+_MOST_SEEN = 4096
+"""Peers' endpoints that wait to be looked at; the oldest are dropped first."""
+_POSITIONS_S = 0.1
+Say = Callable[[str], None]
+
+
+class Sides:
+    """Both links as far as is known; says when one goes or comes back."""
+
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._up = {"swarm": True, "ROS": True}
+
+    def look(self, side: str, up: bool, where: str) -> None:
+        if up != self._up[side]:
+            self._up[side] = up
+            self._say(f"the {side} router at {where} {'is back' if up else 'is gone: waiting for it'}")
+
+    def up(self, side: str) -> bool:
+        return self._up[side]
+
+
+class RosOut:
+    """The publishers of a node, by channel. Nothing here waits for ROS."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publishers: dict[Channel, Publisher] = {}
+        self.counts: Counter[str] = Counter()
+
+    def perform(self, action: Action) -> None:
+        match action:
+            case Put(channel=channel, message=message):
+                publisher = self._publishers[channel]
+                try:
+                    if isinstance(message, bytes):
+                        publisher.put_packed(message)
+                    else:
+                        publisher.put(message)
+                except BusError as error:
+                    self.counts["put_failed"] += 1
+                    log.debug("%s: %s", channel.topic, error)
+                else:
+                    self.counts["put"] += 1
+            case Declare(channels=channels):
+                for channel in channels:
+                    row = ROWS[channel.row]
+                    self._publishers[channel] = self._node.publisher(channel.topic, row.type_name, row.qos)
+            case Remove(channels=channels):
+                for channel in channels:
+                    self._node.remove(self._publishers.pop(channel).endpoint)
+
+
+class Ros2Service:
+    """One gateway, from run to run of a namespace.
+
+    settings  checked
+    network   of the swarm, with the gateway's own certificate
+    runs      folder of the runs of this machine, where the terrain may be
+    say       is told what people should know, a sentence each
+    """
+
+    def __init__(self, settings: Settings, network: NetworkConfig, runs: Path, say: Say) -> None:
+        self._settings = settings
+        self._network = network
+        self._runs = runs
+        self._say = say
+        self._types = types_of(Distribution(settings.ros.distribution))
+
+    def run(self, until_s: float | None = None) -> None:
+        """Forward until a time of `time.monotonic`, or for ever. Raises BusError if one of the sides does not
+        answer at the start; after that both are waited for."""
+        ros = open_ros(self._settings.ros.endpoint)
+        try:
+            swarm = self._connect()
+            while True:
+                try:
+                    with swarm:
+                        self._forward(ros, swarm, until_s)
+                except _RunOverError:
+                    self._say(f"{swarm.ended}")
+                if until_s is not None and time.monotonic() >= until_s:
+                    return
+                swarm = self._connect_again(until_s)
+        finally:
+            close_ros(ros)
+
+    def _connect(self) -> Swarm:
+        network, tls = self._network, self._network.tls
+        files = {} if tls is None else {"ca": tls.ca, "certificate": tls.certificate, "key": tls.key}
+        return connect(
+            network.connect[0], namespace=network.namespace, timeout_s=network.connect_timeout_s, **files
+        )
+
+    def _connect_again(self, until_s: float | None) -> Swarm:
+        while True:
+            try:
+                return self._connect()
+            except SwarmError as error:
+                if until_s is not None and time.monotonic() >= until_s:
+                    raise
+                log.info("%s", error)
+                time.sleep(_AGAIN_S)
+
+    def _forward(self, ros: RosSession, swarm: Swarm, until_s: float | None) -> None:
+        """One run. Raises _RunOverError when another one is in its place."""
+        settings = self._settings
+        node = Node(ros, settings.ros.node, self._types, settings.ros.domain)
+        try:
+            with swarm.observer(every_s=_POSITIONS_S) as observer:
+                gateway = self._gateway(swarm)
+                self._say(
+                    f"node /{settings.ros.node} in domain {settings.ros.domain} at {settings.ros.endpoint}, "
+                    f"{settings.ros.distribution}; run {swarm.run_id}, scenario {swarm.scenario}"
+                )
+                _Loop(self, node, swarm, observer, gateway, self._say).run(until_s)
+        finally:
+            node.close()
+
+    def _gateway(self, swarm: Swarm) -> Gateway:
+        settings, grid = self._settings, swarm.frame.grid
+        folder = Path(settings.swarm.terrain) if settings.swarm.terrain else None
+        terrain = find_terrain(swarm.run.terrain, folder, self._runs)
+        if terrain is None and any(row.name == "map" for row in settings.rows()):
+            self._say(
+                f"the terrain of the run is not on this machine (no run in {self._runs} has it): /map holds marks "
+                "alone; swarm.terrain in the settings names a folder"
+            )
+        map = RosMap(grid, settings.frames.map)
+        return Gateway(settings, self._types, map, MapFeed(grid, terrain), self._to_wgs84(swarm.frame))
+
+    def _to_wgs84(self, frame: Frame) -> ToWgs84 | None:
+        if frame.crs == "local" or all(row.name != "fix" for row in self._settings.rows()):
+            return None
+        try:
+            frame.to_wgs84(*frame.centre_m(0))
+        except ConfigError as error:
+            self._say(f"there are no fixes: {error}")
+            return None
+        return frame.to_wgs84
+
+    @property
+    def where(self) -> tuple[str, str]:
+        """Endpoints of the swarm's router and of ROS's."""
+        return self._network.connect[0], self._settings.ros.endpoint
+
+
+class _RunOverError(Exception):
+    """Another run is in the namespace."""
+
+
+class _Loop:
+    """One run's turns, on one thread."""
+
+    def __init__(
+        self, service: Ros2Service, node: Node, swarm: Swarm, observer: Observer, gateway: Gateway, say: Say
+    ) -> None:
+        self._where = service.where
+        self._node, self._swarm, self._observer, self._gateway = node, swarm, observer, gateway
+        self._say = say
+        self._sides = Sides(say)
+        self._out = RosOut(node)
+        self._watch = PeerWatch()
+        self._seen: deque[SeenEndpoint] = deque(maxlen=_MOST_SEEN)
+        self._look_due_s = 0.0
+
+    def run(self, until_s: float | None) -> None:
+        self._node.watch("*", lambda seen, there: self._seen.append(seen) if there else None)
+        while until_s is None or time.monotonic() < until_s:
+            if time.monotonic() >= self._look_due_s:
+                self._look_due_s = time.monotonic() + _LOOK_S
+                self._look()
+            now_ns = time.time_ns()
+            for action in self._gateway.tick(now_ns, self._swarm.now_ns, self._observer, self._health()):
+                self._out.perform(action)
+            self._tell()
+            due_s = (self._gateway.due_ns - time.time_ns()) / 1e9
+            time.sleep(min(max(due_s, 0.001), _LONGEST_SLEEP_S))
+
+    def _look(self) -> None:
+        swarm_at, ros_at = self._where
+        self._sides.look("swarm", self._swarm.connected, swarm_at)
+        self._sides.look("ROS", self._node.connected, ros_at)
+        if self._swarm.ended is not None:
+            raise _RunOverError
+
+    def _health(self) -> Health:
+        counts = {
+            **self._out.counts,
+            **self._node.counts,
+            **{f"swarm_{k}": v for k, v in self._swarm.counts.items()},
+        }
+        return Health(self._swarm.run_id, self._sides.up("swarm"), self._sides.up("ROS"), counts)
+
+    def _tell(self) -> None:
+        problems = self._gateway.take_problems()
+        ours = None
+        while self._seen:
+            ours = self._node.endpoints if ours is None else ours
+            if (sentence := self._watch.sentence(self._seen.popleft(), ours)) is not None:
+                problems.append(sentence)
+        for sentence in problems:
+            self._say(sentence)

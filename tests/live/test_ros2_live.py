@@ -1,0 +1,211 @@
+"""`swarm ros2` beside a real swarm: heard by a foreign stack, by plain Zenoh, by a node of ours that comes late."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import zenoh
+from support.live_swarm import SWARM, LiveSwarm
+from support.processes import eventually
+from support.ros_peer import RosPeer, ros_router, write_definitions
+
+from launch_scripts.ros2.graph import Attachment, Qos
+from launch_scripts.ros2.node import Node, close_ros, open_ros
+from launch_scripts.ros2.topics import ROWS
+from launch_scripts.ros2.types import Distribution, types_of
+
+pytestmark = pytest.mark.network
+
+TYPES = types_of(Distribution.JAZZY)
+NEW_MARKS = "map_updates"
+"""Put when a mark comes: not in any given second."""
+
+
+@dataclass
+class Gateway:
+    """A gateway at a router of the ROS side, and the swarm behind it."""
+
+    swarm: LiveSwarm
+    port: int
+    folder: Path
+
+    @property
+    def endpoint(self) -> str:
+        return f"tcp/127.0.0.1:{self.port}"
+
+    def start(self, *options: str) -> subprocess.Popen[str]:
+        with (self.folder / "ros2.log").open("w") as log:
+            return subprocess.Popen(
+                [*SWARM, "ros2", "--connect", self.swarm.endpoint, "--ros", self.endpoint,
+                 "--runs", str(self.swarm.runs), *options],
+                stdout=log, stderr=log, text=True,
+            )  # fmt: skip
+
+    @property
+    def said(self) -> str:
+        return (self.folder / "ros2.log").read_text()
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
+    live = LiveSwarm(tmp_path_factory.mktemp("swarm"), "--no-live")
+    try:
+        live.wait_until_up()
+        yield live
+    finally:
+        live.kill()
+
+
+@pytest.fixture(scope="module")
+def gateway(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    with ros_router() as port:
+        yield Gateway(live, port, tmp_path_factory.mktemp("ros"))
+
+
+@pytest.fixture
+def running(gateway: Gateway) -> Iterator[Gateway]:
+    process = gateway.start()
+    try:
+        eventually(lambda: "run " in gateway.said or process.poll() is not None, 30, "the gateway's first word")
+        assert process.poll() is None, gateway.said
+        yield gateway
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+@pytest.fixture(scope="module")
+def definitions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_definitions(tmp_path_factory.mktemp("definitions"), TYPES)
+
+
+def topic_of(row: str) -> str:
+    return ROWS[row].topic.format(vehicle="a0_01", target="t0")
+
+
+def test_a_foreign_stack_hears_every_type_and_lists_every_topic(running: Gateway, definitions: Path) -> None:
+    # The SDK subscribes plainly: of what is latched it hears what comes later.
+    heard = [row for row in ROWS if row not in ("map", "tf_static", "fix", NEW_MARKS)]
+    with RosPeer(running.port, definitions) as peer:
+        for row in heard:
+            peer.hear(topic_of(row), ROWS[row].type_name)
+        eventually(lambda: all(peer.heard[topic_of(row)] for row in heard), 30, "a message of each topic")
+        pose = peer.heard[topic_of("pose")][-1]
+        assert pose["header"]["frame_id"] == "map"
+        assert pose["header"]["stamp"]["sec"] == pytest.approx(time.time(), abs=60)
+        assert 0 <= pose["pose"]["position"]["x"] <= 128 * 30
+        assert len(peer.heard["/swarm/poses"][-1]["poses"]) == 12
+        assert len(peer.heard[topic_of("plan")][-1]["poses"]) >= 1
+    program = "from zenoh_ros2_sdk.cli import main; main()"
+    listed = subprocess.run(
+        [sys.executable, "-c", program, "--no-daemon", "--router", f"127.0.0.1:{running.port}",
+         "topic", "list", "-t"],
+        capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+    for row in ROWS:
+        if row != "fix":  # this terrain has no coordinates
+            assert f"{topic_of(row)} [{ROWS[row].type_name}]" in listed.stdout, listed
+
+
+def test_a_latched_map_comes_to_who_comes_late(running: Gateway) -> None:
+    session = open_ros(running.endpoint)
+    try:
+        node = Node(session, "late", TYPES)
+        maps, frames = [], []
+        time.sleep(1.5)  # the map was put long before
+        node.subscribe("/map", ROWS["map"].type_name, maps.append, Qos.LATCHED)
+        node.subscribe("/tf_static", ROWS["tf_static"].type_name, frames.append, Qos.LATCHED)
+        eventually(lambda: maps and frames, 15, "the map and the frames")
+        grid = maps[0]
+        assert (grid.info.width, grid.info.height, grid.info.resolution) == (128, 96, 30.0)
+        assert grid.data.min() >= 0, "the terrain of the run is on this machine: every cell is known"
+        assert {each.child_frame_id for each in frames[-1].transforms} == {
+            f"a{agent}_{n:02}/odom" for agent in (0, 1) for n in range(6)
+        }
+        node.close()
+    finally:
+        close_ros(session)
+
+
+def test_each_message_has_33_bytes_that_name_sender_number_and_time(running: Gateway) -> None:
+    session = open_ros(running.endpoint)
+    try:
+        attachments: list[bytes] = []
+
+        def hear(sample: zenoh.Sample) -> None:
+            assert sample.attachment is not None
+            attachments.append(sample.attachment.to_bytes())
+
+        session.declare_subscriber(f"0/a0_01/odom/*/{TYPES.hash_of(ROWS['odom'].type_name)}", hear)
+        eventually(lambda: len(attachments) >= 3, 15, "three messages")
+        read = [Attachment.of(each) for each in attachments[:3]]
+        assert {len(each) for each in attachments} == {33}
+        assert attachments[0][16] == 16
+        assert struct.unpack_from("<q", attachments[0]) == (read[0].sequence,)
+        assert [each.sequence - read[0].sequence for each in read] == [0, 1, 2]
+        assert len({each.gid for each in read}) == 1
+        assert read[0].stamp_ns == pytest.approx(time.time_ns(), abs=60e9)
+    finally:
+        close_ros(session)
+
+
+def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(running: Gateway) -> None:
+    session = open_ros(running.endpoint)
+    try:
+        elsewhere = Node(session, "far", TYPES, domain=7)
+        elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
+        eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")
+        elsewhere.close()
+    finally:
+        close_ros(session)
+    session = open_ros(running.endpoint)
+    try:
+        older = Node(session, "old", types_of(Distribution.HUMBLE))
+        older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
+        eventually(
+            lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble"
+        )
+        older.close()
+    finally:
+        close_ros(session)
+
+
+def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway) -> None:
+    session = open_ros(gateway.endpoint)
+    there: set[str] = set()
+    try:
+        node = Node(session, "watcher", TYPES)
+        node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
+        process = gateway.start()
+        try:
+            eventually(lambda: {topic_of(row) for row in ROWS if row != "fix"} <= there, 40, "all topics")
+        finally:
+            process.kill()
+            process.wait(10)
+        eventually(lambda: not there, 15, "the end of all tokens")
+        node.close()
+    finally:
+        close_ros(session)
+
+
+def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> None:
+    process = gateway.start()
+    eventually(lambda: "run " in gateway.said, 30, "the gateway's first word")
+    process.send_signal(2)
+    assert process.wait(20) == 0, gateway.said
+    assert "Traceback" not in gateway.said
+    alone = subprocess.run(
+        [*SWARM, "ros2", "--connect", gateway.swarm.endpoint, "--ros", "tcp/127.0.0.1:9"],
+        capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+    assert alone.returncode == 4
+    assert alone.stderr == (
+        "swarm: no router of the ROS side listens at tcp/127.0.0.1:9: start rmw_zenohd, or name it by --ros\n"
+    )

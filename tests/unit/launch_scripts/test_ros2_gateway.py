@@ -1,0 +1,405 @@
+"""What ROS is told of a swarm: on topics that are declared, at most at their rates, and the map whole."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.effort import few
+
+from launch_scripts.ros2.actions import Channel, Declare, Put, Remove
+from launch_scripts.ros2.diagnostics import Health
+from launch_scripts.ros2.frames import RosMap
+from launch_scripts.ros2.gateway import Gateway
+from launch_scripts.ros2.graph import NO_HASH, Endpoint, Kind, NodeName, Qos, SeenEndpoint
+from launch_scripts.ros2.map_feed import MapFeed
+from launch_scripts.ros2.map_topics import corners, outline
+from launch_scripts.ros2.messages import RosMessages
+from launch_scripts.ros2.names import ros_name
+from launch_scripts.ros2.packed_path import PATH, packed_path
+from launch_scripts.ros2.peers import PeerWatch
+from launch_scripts.ros2.settings import Settings, parse_settings
+from launch_scripts.ros2.topics import ROWS
+from launch_scripts.ros2.types import Distribution, types_of
+from swarm.client.observer import SeenTarget, SeenVehicle
+from swarm.client.own_marks import OwnMarks
+from swarm.clock import NS_PER_S
+from swarm.errors import ConfigError
+from swarm.grid import GridSpec
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import FOREVER, MarkKind
+
+GRID = GridSpec(40, 70, 10.0, 300_000.0, 5_200_000.0, "EPSG:32632")
+TYPES = types_of(Distribution.JAZZY)
+BEGAN_NS = 1_700_000_000 * NS_PER_S
+
+
+@dataclass
+class World:
+    """A swarm as an observer shows it."""
+
+    vehicles: Mapping[str, SeenVehicle] = field(default_factory=dict)
+    targets: Mapping[str, SeenTarget] = field(default_factory=dict)
+    routes: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    sets: list[MarkSet] = field(default_factory=list)
+
+    def take_routes(self) -> Mapping[str, list[tuple[float, float]]]:
+        taken, self.routes = self.routes, {}
+        return taken
+
+    def take_mark_sets(self) -> list[MarkSet]:
+        taken, self.sets = self.sets, []
+        return taken
+
+
+def vehicle(
+    id: str, x_m: float = 300_100.0, y_m: float = 5_199_900.0, heading_rad: float | None = 0.5
+) -> SeenVehicle:
+    return SeenVehicle(id, "all", x_m, y_m, heading_rad, "following", "t0")
+
+
+def gateway(text: str = "", fixes: bool = True) -> Gateway:
+    feed = MapFeed(GRID, None)
+    return Gateway(parse_settings(text), TYPES, RosMap(GRID), feed, (lambda x, y: (48.0, 9.0)) if fixes else None)
+
+
+def told(gateway: Gateway, world: World, at_s: float) -> list[Any]:
+    now_ns = BEGAN_NS + int(at_s * NS_PER_S)
+    return gateway.tick(now_ns, now_ns, world, Health())
+
+
+def puts(actions: list[Any], row: str) -> list[Any]:
+    return [each.message for each in actions if isinstance(each, Put) and each.channel.row == row]
+
+
+# --- the core -----------------------------------------------------------------------------------------------------
+
+IDS = st.sampled_from(["a0-00", "a0-01", "a0_00", "7", "rover.1"])
+PLACES = st.tuples(st.floats(299_000, 301_000), st.floats(5_199_000, 5_201_000))
+HEADINGS = st.none() | st.floats(-6, 6)
+MOMENTS = st.tuples(
+    st.floats(0.01, 0.7),
+    st.dictionaries(IDS, st.tuples(PLACES, HEADINGS), max_size=4),
+    st.dictionaries(IDS, st.lists(PLACES, max_size=4), max_size=2),
+    st.dictionaries(st.sampled_from(["t0", "t-1", "t_1"]), st.tuples(PLACES, st.booleans()), max_size=3),
+)
+
+
+@settings(max_examples=few(60), deadline=None)
+@given(st.lists(MOMENTS, min_size=1, max_size=12), st.booleans(), st.sampled_from(["", 'vehicles = ["a*"]']))
+def test_messages_go_to_topics_that_are_declared_and_none_comes_more_often_than_its_rate(
+    moments: list[Any], bare: bool, text: str
+) -> None:
+    core = gateway(f"{text}\nframes.bare = {str(bare).lower()}")
+    declared: set[Channel] = set()
+    times: dict[Channel, list[float]] = {}
+    at_s = 0.0
+    for step_s, vehicles, routes, targets in moments:
+        at_s += step_s
+        world = World(
+            {id: vehicle(id, *place, heading) for id, (place, heading) in vehicles.items()},
+            {id: SeenTarget(id, *place, 0, None, lost) for id, (place, lost) in targets.items()},
+            routes,
+        )
+        for action in told(core, world, at_s):
+            match action:
+                case Declare(channels=channels):
+                    assert not declared & set(channels)
+                    assert len(set(channels)) == len(channels)
+                    declared |= set(channels)
+                case Remove(channels=channels):
+                    assert declared >= set(channels)
+                    declared -= set(channels)
+                case Put(channel=channel, message=message):
+                    assert channel in declared
+                    times.setdefault(channel, []).append(at_s)
+                    content = (
+                        message if isinstance(message, bytes) else TYPES.pack(message, ROWS[channel.row].type_name)
+                    )
+                    TYPES.unpack(content, ROWS[channel.row].type_name)
+        named = {channel.topic.split("/")[1] for channel in declared if channel.row == "odom"}
+        wanted = {ros_name(id) for id in vehicles if not text or id.startswith("a")}
+        assert named == wanted or step_s <= 0.1, "looked at once in a period"
+    for channel, at in times.items():
+        if (hz := ROWS[channel.row].hz) is not None and channel.row != "map_updates":
+            assert len(at) <= (at[-1] - at[0]) * hz + 2
+
+
+def test_a_vehicle_that_leaves_takes_its_topics_along_and_frees_its_name() -> None:
+    core = gateway()
+    both = World({"a-1": vehicle("a-1"), "a_1": vehicle("a_1")})
+    told(core, both, 0.0)
+    assert core.take_problems() == ["vehicle a_1 is not told to ROS: a-1 is called a_1, too"]
+    actions = told(core, World({"a_1": vehicle("a_1")}), 0.2)
+    (removed,) = [each.channels for each in actions if isinstance(each, Remove)]
+    (declared,) = [each.channels for each in actions if isinstance(each, Declare)]
+    assert removed == declared
+    assert {each.topic for each in declared} == {"/a_1/odom", "/a_1/pose", "/a_1/plan", "/a_1/fix"}
+    assert told(core, World({"a_1": vehicle("a_1")}), 0.4)
+    assert core.take_problems() == []
+
+
+def test_frames_lead_from_the_map_to_the_vehicle() -> None:
+    actions = told(gateway(), World({"a-1": vehicle("a-1", 300_120.0, 5_199_700.0, math.pi / 2)}), 0.0)
+    (static,), (moved,) = puts(actions, "tf_static"), puts(actions, "tf")
+    assert [(each.header.frame_id, each.child_frame_id) for each in static.transforms] == [("map", "a_1/odom")]
+    assert [(each.header.frame_id, each.child_frame_id) for each in moved.transforms] == [
+        ("a_1/odom", "a_1/base_link")
+    ]
+    here = moved.transforms[0].transform
+    assert (here.translation.x, here.translation.y, here.rotation.z, here.rotation.w) == pytest.approx(
+        (120.0, 100.0, 0.0, 1.0)
+    ), "metres from the south-west corner, looking east"
+    assert static.transforms[0].transform.translation.x == 0.0
+
+
+def test_bare_frames_have_a_tree_for_each_vehicle() -> None:
+    actions = told(gateway("frames.bare = true"), World({"a-1": vehicle("a-1")}), 0.0)
+    channels = {each.channel.topic for each in actions if isinstance(each, Put)}
+    assert {"/a_1/tf", "/a_1/tf_static"} <= channels
+    assert not {"/tf", "/tf_static"} & channels
+    (odometry,), (moved,) = puts(actions, "odom"), puts(actions, "tf")
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+    assert moved.transforms[0].child_frame_id == "base_link"
+
+
+def test_velocity_is_the_difference_of_places_along_the_heading() -> None:
+    core = gateway()
+    for step in range(8):
+        east_m = 300_100.0 + 0.5 * step
+        actions = told(core, World({"a": vehicle("a", east_m, 5_199_900.0, math.pi / 2 + 0.01 * step)}), 0.1 * step)
+    (odometry,) = puts(actions, "odom")
+    assert odometry.twist.twist.linear.x == pytest.approx(5.0, rel=0.01)
+    assert odometry.twist.twist.angular.z == pytest.approx(-0.1, rel=0.01), "counter-clockwise is positive"
+    for step in range(8, 16):
+        actions = told(core, World({"a": vehicle("a", east_m, 5_199_900.0, math.pi / 2 + 0.07)}), 0.1 * step)
+    (odometry,) = puts(actions, "odom")
+    assert odometry.twist.twist.linear.x == 0.0, "it stands"
+
+
+def test_a_plan_is_put_when_it_is_new_and_at_most_once_a_second() -> None:
+    core, counts = gateway(), Counter[float]()
+    for step in range(30):
+        world = World(
+            {"a": vehicle("a")}, routes={"a": [(300_000.0 + step, 5_199_900.0), (300_100.0, 5_199_990.0)]}
+        )
+        counts[step // 10] += len(puts(told(core, world, 0.1 * step), "plan"))
+    assert counts == {0: 1, 1: 1, 2: 1}
+    assert len(puts(told(core, World({"a": vehicle("a")}), 4.0), "plan")) == 1, "the newest is not forgotten"
+    assert len(puts(told(core, World({"a": vehicle("a")}), 6.0), "plan")) == 0
+
+
+def test_targets_that_nobody_tracks_are_not_told() -> None:
+    seen = {id: SeenTarget(id, 300_010.0, 5_199_610.0, 0, None, lost) for id, lost in (("t0", False), ("t1", True))}
+    actions = told(gateway(), World(targets=seen), 0.0)
+    assert [
+        each.channel.topic for each in actions if isinstance(each, Put) and each.channel.row == "target_pose"
+    ] == ["/targets/t0/pose"]
+    (array,) = puts(actions, "targets")
+    assert [(each.position.x, each.position.y) for each in array.poses] == [(10.0, 10.0)]
+    (diagnostics,) = puts(actions, "diagnostics")
+    assert "nobody tracks t1" in [each.message for each in diagnostics.status]
+
+
+def test_what_is_not_listed_is_not_forwarded() -> None:
+    core = gateway('forward = ["poses"]\n[topics.poses]\ntopic = "/fleet"\nhz = 1')
+    actions = told(core, World({"a": vehicle("a")}), 0.0)
+    assert {each.channel.topic for each in actions if isinstance(each, Put)} == {"/fleet"}
+    assert [each.channels for each in actions if isinstance(each, Declare)] == [(Channel("poses", "/fleet"),), ()]
+
+
+def test_without_coordinates_there_are_no_fixes() -> None:
+    actions = told(gateway(fixes=False), World({"a": vehicle("a")}), 0.0)
+    assert not puts(actions, "fix")
+    assert all(
+        "fix" not in channel.topic for each in actions if isinstance(each, Declare) for channel in each.channels
+    )
+
+
+# --- the map ------------------------------------------------------------------------------------------------------
+
+STATED = st.tuples(
+    st.sampled_from(["all.a.1", "all.b.2", "operator.north"]),
+    st.lists(st.integers(0, GRID.cells - 1), min_size=1, max_size=30),
+    st.sampled_from(list(MarkKind)),
+    st.sampled_from([0.1, 0.5, 3.0]),
+    st.none() | st.floats(0.2, 3.0),
+)
+
+
+@settings(max_examples=few(60), deadline=None)
+@given(st.lists(st.lists(STATED, max_size=3), min_size=1, max_size=8), st.booleans())
+def test_a_map_and_the_updates_since_are_the_map(turns: list[Any], sparse: bool) -> None:
+    core = gateway()
+    authors = {
+        name: OwnMarks(name, name.partition(".")[0], GRID) for name in ("all.a.1", "all.b.2", "operator.north")
+    }
+    heard: Any = None
+    for number, turn in enumerate(turns):
+        at_s = number * (12.0 if sparse else 1.0)
+        now_ns = BEGAN_NS + int(at_s * NS_PER_S)
+        world = World()
+        for n, (author, cells, kind, pace, for_s) in enumerate(turn):
+            until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
+            world.sets += authors[author].state(cells, kind, pace, now_ns + n, until_ns)
+        for action in told(core, world, at_s):
+            if isinstance(action, Put) and action.channel.row == "map":
+                heard = action.message.data.reshape(GRID.rows, GRID.cols).copy()
+            if isinstance(action, Put) and action.channel.row == "map_updates":
+                m = action.message
+                heard[m.y : m.y + m.height, m.x : m.x + m.width] = m.data.reshape(m.height, m.width)
+        assert heard is not None
+        assert (heard[::-1] == core._feed.occupancy(GRID.window)).all()
+
+
+def test_without_the_terrain_the_map_holds_marks_alone() -> None:
+    marks = OwnMarks("all.a.1", "all", GRID)
+    world = World(
+        sets=marks.state([0], MarkKind.LETHAL, 0.0, BEGAN_NS) + marks.state([71], MarkKind.PACE, 0.2, BEGAN_NS)
+    )
+    (grid,) = puts(told(gateway(), world, 0.0), "map")
+    cells = grid.data.reshape(GRID.rows, GRID.cols)
+    assert (cells[-1, 0], cells[-2, 1]) == (100, 50), "row 0 is in the south"
+    assert Counter(cells.reshape(-1).tolist())[-1] == GRID.cells - 2
+
+
+def test_zones_and_marks_are_drawn_until_they_are_gone() -> None:
+    core = gateway()
+    zone = OwnMarks("operator.north", "operator", GRID)
+    closed = zone.state([0, 1, 70], MarkKind.LETHAL, 0.0, BEGAN_NS, BEGAN_NS + 2 * NS_PER_S)
+    (array,) = puts(told(core, World(sets=closed), 0.0), "markers")
+    drawn = {each.ns: each for each in array.markers}
+    assert set(drawn) == {"zones/closed", "marks"}
+    assert len(drawn["zones/closed"].points) == 2 * 8, "the outline of three cells has eight sides"
+    for at_s in range(1, 14):
+        found = puts(told(core, World(), at_s), "markers")
+        if gone := [each.ns for each in found[0].markers if each.action == 2]:
+            break
+    assert "zones/closed" in gone
+
+
+CELLS = st.sets(st.integers(0, 41), min_size=0, max_size=25)
+
+
+@given(CELLS)
+def test_an_outline_has_the_sides_between_cells_of_the_set_and_others(cells: set[int]) -> None:
+    grid = GridSpec(6, 7, 2.0, 100.0, 50.0)
+    lines = outline(grid, np.array(sorted(cells), np.uint32)).reshape(-1, 4)
+    drawn = Counter(tuple(sorted([(a, b), (c, d)])) for a, b, c, d in lines.tolist())
+    wanted: Counter[Any] = Counter()
+    for cell in cells:
+        row, col = divmod(cell, 7)
+        west, north = 100.0 + 2 * col, 50.0 - 2 * row
+        east, south = west + 2, north - 2
+        for other, inside, a, b in (
+            (cell - 7, row > 0, (west, north), (east, north)),
+            (cell + 7, row < 5, (west, south), (east, south)),
+            (cell - 1, col > 0, (west, north), (west, south)),
+            (cell + 1, col < 6, (east, north), (east, south)),
+        ):
+            if not inside or other not in cells:
+                wanted[tuple(sorted([a, b]))] += 1
+    assert drawn == wanted
+
+
+@given(st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), max_size=12))
+def test_the_corners_of_a_line_are_the_same_line(points: list[tuple[int, int]]) -> None:
+    whole = np.array(points, np.float64).reshape(-1, 2)
+    kept = corners(whole)
+    dropped = len(whole) - len(kept)
+    assert dropped >= 0
+    assert _length(kept) == pytest.approx(_length(whole))
+    assert kept[:1].tolist() + kept[-1:].tolist() == whole[:1].tolist() + whole[-1:].tolist()
+
+
+def _length(points: Any) -> float:
+    return float(np.hypot(*np.diff(points, axis=0).T).sum())
+
+
+# --- bytes -------------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.text("abcmap/_", min_size=1, max_size=17),
+    st.lists(st.tuples(st.floats(-1e7, 1e7), st.floats(-1e7, 1e7)), max_size=6),
+    st.integers(0, 2**31 * NS_PER_S - 1),
+)
+def test_a_path_from_columns_has_the_bytes_of_one_from_objects(frame: str, points: Any, stamp_ns: int) -> None:
+    map = RosMap(GRID, frame)
+    assert packed_path(map, stamp_ns, points) == TYPES.pack(RosMessages(TYPES, map).path(stamp_ns, points), PATH)
+
+
+# --- peers -------------------------------------------------------------------------------------------------------
+
+NODE = NodeName(0, "54c1", "swarm_gateway")
+HASH = TYPES.hash_of("nav_msgs/msg/OccupancyGrid")
+OURS = Endpoint(NODE, 4, Kind.PUBLISHER, "/map", "nav_msgs/msg/OccupancyGrid", HASH, Qos.LATCHED.value)
+
+
+def peer(**changes: Any) -> SeenEndpoint:
+    fields = {"domain": 0, "zid": "ab", "kind": Kind.SUBSCRIPTION, "node": "rviz", "topic": "/map"}
+    fields |= {"type_name": OURS.type_name, "type_hash": HASH, "qos": ""}
+    return SeenEndpoint(**fields | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"domain": 7}, "in domain 7, and this gateway is in domain 0"),
+        ({"type_name": "nav_msgs/msg/Path"}, "as nav_msgs/msg/Path, and here it is nav_msgs/msg/OccupancyGrid"),
+        ({"type_hash": "RIHS01_00"}, "another definition of nav_msgs/msg/OccupancyGrid"),
+        ({"type_hash": NO_HASH}, "as humble does, and this gateway speaks as a later one"),
+    ],
+)
+def test_a_peer_that_will_never_hear_us_is_named_once(changes: dict[str, Any], says: str) -> None:
+    watch = PeerWatch()
+    sentence = watch.sentence(peer(**changes), [OURS])
+    assert sentence is not None
+    assert sentence.startswith("node rviz subscribes to /map")
+    assert says in sentence
+    assert watch.sentence(peer(**changes), [OURS]) is None
+
+
+@pytest.mark.parametrize("changes", [{}, {"topic": "/other", "domain": 7}, {"kind": Kind.PUBLISHER, "domain": 7}])
+def test_a_peer_that_hears_us_or_asks_for_something_else_is_not_named(changes: dict[str, Any]) -> None:
+    assert PeerWatch().sentence(peer(**changes), [OURS]) is None
+
+
+# --- settings ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('forward = ["mpa"]', "settings: forward: no topic 'mpa' in the table; did you mean 'map'?"),
+        ('[topics.odom]\ntopic = "/x"', "topics.odom.topic: '/x', expected {vehicle} once"),
+        ('[topics.odom]\ntopic = "/{vehicle}/o d"', "topics.odom.topic: '/{vehicle}/o d' is no name of a topic"),
+        ('[topics.poses]\ntopic = "/targets"', "two topics are called /targets"),
+        ("[topics.odom]\nhz = 200", "topics.odom.hz: found 200"),
+        ("[topics.map]\nhz = 2", "topics.map.hz: map is put when something changes"),
+        ('[ros]\nendpoint = "tcp/10.0.0.1:7447"', "leaves this machine in the clear"),
+        ('[ros]\nendpoint = "udp/x:1"', "is not an endpoint"),
+        ('[ros]\ndistribution = "foxy"', "ros.distribution: found 'foxy'"),
+        ("[ros]\ndomain = 233", "ros.domain: found 233"),
+        ('[frames]\nmap = "{vehicle}"', "frames.map: found"),
+        ("[rso]\ndomain = 3", "rso"),
+    ],
+)
+def test_a_mistake_in_the_settings_is_one_sentence_that_names_the_key(text: str, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_settings(text)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_ros_nodes_beyond_this_machine_need_a_word() -> None:
+    text = '[ros]\nendpoint = "tcp/10.0.0.1:7447"\nin_the_clear = true'
+    assert parse_settings(text).ros.endpoint == "tcp/10.0.0.1:7447"
+    assert parse_settings("") == Settings()
