@@ -137,11 +137,8 @@ class _Sides:
         while time.monotonic() < until_s:
             self._flood(0.0, 1000)
             time.sleep(0.2)
-            try:
-                if self.plan_of_ros(0) is not None and self.plan_of_swarm(0) is not None:
-                    return
-            except SwarmError:
-                continue
+            if self.plan_of_ros(0) is not None and self.plan_of_swarm(0) is not None:
+                return
         raise SwarmError("the gateway and the planners were not ready in time")
 
     def plan_of_ros(self, _: int) -> float | None:
@@ -151,14 +148,17 @@ class _Sides:
         goal.header.frame_id = f"targets/{_TARGET}"
         request = _TYPES.make(f"{_PLAN}_Request", start=there, goal=goal, tolerance=0.0)
         began_ns = time.monotonic_ns()
-        response = self._ask(request, _LONGEST_S)
+        try:
+            response = self._ask(request, _LONGEST_S)
+        except SwarmError:
+            return None
         return (time.monotonic_ns() - began_ns) / 1e6 if response.plan.poses else None
 
     def plan_of_swarm(self, _: int) -> float | None:
         """A route query to the same target."""
         began_ns = time.monotonic_ns()
         route = self._route(_TARGET)
-        return (time.monotonic_ns() - began_ns) / 1e6 if route.ok else None
+        return (time.monotonic_ns() - began_ns) / 1e6 if route is not None and route.ok else None
 
     def goal_of_ros(self, cell: int) -> float | None:
         """From a goal that is put to the first plan that ends there."""
@@ -177,7 +177,8 @@ class _Sides:
         began_ns = time.monotonic_ns()
         target.at(*self._swarm.frame.centre_m(cell))
         while time.monotonic_ns() - began_ns < _LONGEST_S * 1e9:
-            if self._route(_OWN_GOAL).target_cell == cell:
+            route = self._route(_OWN_GOAL)
+            if route is not None and route.target_cell == cell:
                 return (time.monotonic_ns() - began_ns) / 1e6
         return None
 
@@ -197,9 +198,12 @@ class _Sides:
         figures = _figures({"ros": took_ms["flood"], "swarm": took_ms["quiet"]})
         return figures | {"messages": sent, "hz": hz}
 
-    def _route(self, target: str) -> Route:
-        found: Route = self._swarm.route_soon(target, *self._start).result(_LONGEST_S)
-        return found
+    def _route(self, target: str) -> Route | None:
+        """None if there is no answer in time: the machine may be busy."""
+        try:
+            return self._swarm.route_soon(target, *self._start).result(_LONGEST_S)
+        except (SwarmError, TimeoutError):
+            return None
 
     def _flood(self, seconds: float, hz: int) -> None:
         asked(self._robot, self._odometry(), seconds, hz)
