@@ -179,9 +179,12 @@ class Node:
         self._declare(endpoint, made)
 
     def serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> Endpoint:
-        """Answer a service. `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is
-        called once, then or later, on any thread. A client of ROS waits for ever for what is never answered, so
-        errors go into the response."""
+        """Answer a service.
+
+        `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is called once, then or
+        later, on any thread, with a response or its CDR. A client of ROS waits for ever for what is never answered,
+        so errors go into the response.
+        """
         endpoint = self._endpoint(Kind.SERVICE, name, type_name, Qos.DEFAULT)
 
         def take(query: zenoh.Query) -> None:
@@ -195,7 +198,8 @@ class Node:
 
             def reply(response: Any) -> None:
                 attachment = Attachment(asked.sequence, time.time_ns(), asked.gid).packed()
-                content = self.types.pack(response, type_name + RESPONSE)
+                packed = isinstance(response, bytes)
+                content = response if packed else self.types.pack(response, type_name + RESPONSE)
                 with query, suppress(zenoh.ZError):  # the session may be closed, or the link cut
                     query.reply(endpoint.key, content, attachment=attachment)
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import threading
+import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.live_swarm import LiveSwarm
+from support.live_swarm import SWARM, LiveSwarm
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
 from launch_scripts.ros2.frames import RosMap
-from launch_scripts.ros2.incoming.incoming import Incoming
-from launch_scripts.ros2.incoming.settings import AreaSettings, IncomingSettings, Robots
-from launch_scripts.ros2.node import Node, open_ros
 from launch_scripts.ros2.types import Distribution, types_of
 from swarm.client import Observer, Swarm, connect
 
@@ -36,21 +32,31 @@ walk = "external"
 """
 ODOMETRY, POSE, PLAN = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "nav_msgs/srv/GetPlan"
 CERTIFICATE = "diagnostic_msgs/msg/DiagnosticStatus"
-SETTINGS = IncomingSettings(
-    robots=(Robots(target="fox", lease_s=1.5, radius_m=2.0),),
-    targets=("fox",),
-    goal_targets=("goal0", "goal1"),
-    zones=(AreaSettings(name="works", topic="/works"),),
-    grids=(AreaSettings(name="seen", topic="/seen"),),
-    orders=True,
-)
+LEASE_S = 1.5
+SETTINGS = f"""
+[incoming]
+targets = ["fox"]
+goal_targets = ["goal0", "goal1"]
+orders = true
+
+[[incoming.robots]]
+target = "fox"
+lease_s = {LEASE_S}
+radius_m = 2.0
+
+[[incoming.zones]]
+name = "works"
+topic = "/works"
+
+[[incoming.grids]]
+name = "seen"
+topic = "/seen"
+"""
 
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
     live = LiveSwarm(tmp_path_factory.mktemp("ros2"), "--no-live", also=TARGETS)
-    text = live.path.read_text()
-    assert "vehicles = 12" in text
     try:
         live.wait_until_up()
         yield live
@@ -71,31 +77,24 @@ def seen(swarm: Swarm) -> Iterator[Observer]:
 
 
 @pytest.fixture(scope="module")
-def port(live: LiveSwarm) -> Iterator[int]:
-    """Of the ROS side's router, with what comes in at work."""
-    with ros_router() as port, connect(live.endpoint) as swarm, open_ros(f"tcp/127.0.0.1:{port}") as session:
-        node = Node(session, "swarm_gateway", TYPES)
-        with _ticking(Incoming(node, swarm, SETTINGS)):
+def port(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """Of the ROS side's router, with a gateway at work."""
+    folder = tmp_path_factory.mktemp("gateway")
+    (folder / "gateway.toml").write_text(SETTINGS)
+    with ros_router() as port, (folder / "log").open("w") as log:
+        process = subprocess.Popen(
+            [*SWARM, "ros2", str(folder / "gateway.toml"), "--connect", live.endpoint,
+             "--ros", f"tcp/127.0.0.1:{port}", "--runs", str(live.runs)],
+            stdout=log, stderr=log,
+        )  # fmt: skip
+        try:
+            said = folder / "log"
+            eventually(lambda: "run " in said.read_text() or process.poll() is not None, 60, "the gateway")
+            assert process.poll() is None, said.read_text()
             yield port
-        node.close()
-
-
-@contextmanager
-def _ticking(incoming: Incoming) -> Iterator[None]:
-    ended = threading.Event()
-
-    def tick() -> None:
-        while not ended.wait(0.02):
-            incoming.tick(time.monotonic_ns())
-
-    thread = threading.Thread(target=tick, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join(5.0)
-        incoming.close()
+        finally:
+            process.kill()
+            process.wait(10)
 
 
 @pytest.fixture
@@ -146,7 +145,7 @@ def test_a_robot_is_a_vehicle_that_is_seen_follows_its_target_and_leaves_within_
     peer.kill()
     killed_s = time.monotonic()
     eventually(lambda: "uav1" not in seen.vehicles, 8, "its leaving")
-    assert time.monotonic() - killed_s < SETTINGS.robots[0].lease_s + 2.0
+    assert time.monotonic() - killed_s < LEASE_S + 2.0
 
 
 def test_a_goal_that_ros_gives_is_answered_with_a_plan_and_its_certificate(swarm: Swarm, peer: RosPeer) -> None:
@@ -183,6 +182,19 @@ def test_a_client_of_a_foreign_stack_gets_plans_and_reasons(swarm: Swarm, peer: 
         ),
         5,
     )
+
+
+def test_the_map_is_answered_and_the_robot_is_not_told_twice(swarm: Swarm, peer: RosPeer) -> None:
+    answered = peer.ask("/map_server/map", "nav_msgs/srv/GetMap")["message"]["map"]
+    grid = swarm.frame.grid
+    assert (answered["info"]["width"], answered["info"]["height"]) == (grid.cols, grid.rows)
+    assert {-1, 100}.intersection(answered["data"]) != set(answered["data"])
+    peer.hear("/uav4/odom", ODOMETRY)
+    peer.hear("/uav4/pose", POSE)
+    drive(peer, swarm, "uav4", 30, 40)
+    eventually(lambda: peer.heard["/uav4/odom"], 5, "its own odometry")
+    time.sleep(1.5)
+    assert not peer.heard["/uav4/pose"]
 
 
 def test_pause_is_an_order_that_a_service_gives_and_takes_back(swarm: Swarm, peer: RosPeer) -> None:

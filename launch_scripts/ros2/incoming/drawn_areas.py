@@ -10,7 +10,7 @@ from launch_scripts.ros2.graph import Qos
 from launch_scripts.ros2.incoming.areas import closed_cells, corners_of
 from launch_scripts.ros2.incoming.order_desk import OrderDesk
 from launch_scripts.ros2.incoming.places import FrameReader
-from launch_scripts.ros2.incoming.settings import AreaSettings
+from launch_scripts.ros2.incoming.settings import GridSettings, ZoneSettings
 from launch_scripts.ros2.node import Newest, Node
 from swarm.client import ConfigError, Swarm, Vehicle
 from swarm.clock import NS_PER_S
@@ -24,8 +24,9 @@ _MOST_POLYGON_BYTES = 1 << 14
 class _Drawn:
     """An area whose newest message is worked on once a second at most, on the thread of orders."""
 
-    def __init__(self, settings: AreaSettings, newest: Newest, desk: OrderDesk) -> None:
-        self._settings, self._newest, self._desk = settings, newest, desk
+    def __init__(self, name: str, newest: Newest, desk: OrderDesk) -> None:
+        self._topic, self._what = newest.endpoint.topic, f"{name} of {newest.endpoint.topic}"
+        self._newest, self._desk = newest, desk
         self._due_ns = 0
         self._held: Any = None
         """What there was no room for yet."""
@@ -37,8 +38,7 @@ class _Drawn:
         if message is None:
             return
         self._due_ns = now_ns + _EVERY_NS
-        what = f"{self._settings.name} of {self._settings.topic}"
-        given = self._desk.give(what, lambda: self._draw(message), self._told)
+        given = self._desk.give(self._what, lambda: self._draw(message), self._told)
         self._held = None if given else message
 
     def _draw(self, message: Any) -> str:
@@ -47,9 +47,9 @@ class _Drawn:
 
     def _told(self, done: bool, sentence: str) -> None:
         if done:
-            log.debug("topic %s: %s", self._settings.topic, sentence)
+            log.debug("topic %s: %s", self._topic, sentence)
         else:
-            log.warning("topic %s: %s", self._settings.topic, sentence)
+            log.warning("topic %s: %s", self._topic, sentence)
 
     def close(self) -> None:
         self._newest.close()
@@ -59,12 +59,13 @@ class DrawnZone(_Drawn):
     """A zone that is drawn by polygons. One whose corners are those of the last is not ordered again, unless the
     zone ends by itself."""
 
-    def __init__(self, settings: AreaSettings, node: Node, swarm: Swarm, desk: OrderDesk, map: RosMap) -> None:
+    def __init__(self, settings: ZoneSettings, node: Node, swarm: Swarm, desk: OrderDesk, map: RosMap) -> None:
         super().__init__(
-            settings,
+            settings.name,
             node.newest(settings.topic, "geometry_msgs/msg/PolygonStamped", Qos.LATCHED, _MOST_POLYGON_BYTES),
             desk,
         )
+        self._settings = settings
         self._orders, self._reader = swarm.orders(), FrameReader(map)
         self._corners: list[tuple[float, float]] | None = None
 
@@ -88,8 +89,11 @@ class DrawnZone(_Drawn):
 class DrawnMarks(_Drawn):
     """Cells that grids close. Those that the next grid does not close are again as the map had them."""
 
-    def __init__(self, settings: AreaSettings, node: Node, swarm: Swarm, desk: OrderDesk, map: RosMap) -> None:
-        super().__init__(settings, node.newest(settings.topic, "nav_msgs/msg/OccupancyGrid", Qos.LATCHED), desk)
+    def __init__(self, settings: GridSettings, node: Node, swarm: Swarm, desk: OrderDesk, map: RosMap) -> None:
+        super().__init__(
+            settings.name, node.newest(settings.topic, "nav_msgs/msg/OccupancyGrid", Qos.LATCHED), desk
+        )
+        self._settings = settings
         self._swarm, self._map = swarm, map
         self._author: Vehicle | None = None
         self._closed: set[int] = set()

@@ -23,7 +23,11 @@ from swarm.orders import Acknowledged
 
 log = logging.getLogger(__name__)
 
+TICK_S = 0.02
+"""How often `tick` is best called."""
 MOST_ROBOTS = 256
+_MOST_ASKED = 16
+_MAP = "nav_msgs/srv/GetMap"
 _MOST_NEWS = 1 << 14
 _TRIGGER = "std_srvs/srv/Trigger"
 Paused = Callable[[], Acknowledged]
@@ -43,9 +47,17 @@ class Incoming:
     swarm     a connection; it is not closed here
     settings  checked
     map       the frame in which ROS has the terrain
+    map_now   makes a nav_msgs/OccupancyGrid, on the thread of `tick`; None: nobody can ask for the map
     """
 
-    def __init__(self, node: Node, swarm: Swarm, settings: IncomingSettings, map: RosMap | None = None) -> None:
+    def __init__(
+        self,
+        node: Node,
+        swarm: Swarm,
+        settings: IncomingSettings,
+        map: RosMap | None = None,
+        map_now: Callable[[], Any] | None = None,
+    ) -> None:
         self._node, self._swarm, self._settings = node, swarm, settings
         self._map = map or RosMap(swarm.frame.grid)
         self._messages = RosMessages(node.types, self._map)
@@ -56,6 +68,8 @@ class Incoming:
         """Topic of a robot -> how many publish it, as their tokens say."""
         self._news: deque[tuple[SeenEndpoint, bool]] = deque(maxlen=_MOST_NEWS)
         self._full_said = False
+        self._strange: set[str] = set()
+        """Robots whose type is of another distribution; said once each."""
         reader = FrameReader(self._map)
         self._targets = [MovedTarget(id, settings.set_pose, node, swarm, reader) for id in settings.targets]
         self._areas = [
@@ -63,6 +77,11 @@ class Incoming:
             *(DrawnMarks(each, node, swarm, self._desk, self._map) for each in settings.grids),
         ]
         self._services: list[Endpoint] = []
+        self._map_now = map_now
+        self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
+        """Replies to those who ask for the map."""
+        if map_now is not None:
+            self._services.append(node.serve("/map_server/map", _MAP, lambda _, reply: self._asked.append(reply)))
         if settings.orders:
             orders = swarm.orders()
             self._serve_order("/swarm/pause", orders.pause)
@@ -94,12 +113,13 @@ class Incoming:
     def tick(self, now_ns: int) -> None:
         """Take in what has come.
 
-        now_ns  of a clock that never goes back
+        now_ns  by time.monotonic_ns
         """
         for _ in range(len(self._news)):
             self._hear(*self._news.popleft())
         for part in self._parts:
             part.tick(now_ns)
+        self._answer_map()
         self._routes.tick()
 
     def close(self) -> None:
@@ -112,6 +132,14 @@ class Incoming:
         self._routes.close()
         self._desk.close()
 
+    def _answer_map(self) -> None:
+        """All who ask get one map. Of more than `_MOST_ASKED` the oldest get none: their question ends so."""
+        if not self._asked or self._map_now is None:
+            return
+        response = self._node.types.make(f"{_MAP}_Response", map=self._map_now())
+        while self._asked:
+            self._asked.popleft()(response)
+
     def _hear(self, seen: SeenEndpoint, there: bool) -> None:
         """An endpoint of somebody has come or gone."""
         if seen.kind is not Kind.PUBLISHER or seen.node == self._node.name.name:
@@ -120,7 +148,14 @@ class Incoming:
             id = robots.robot_of(seen.topic)
             if id is None or robots.id is not None or seen.type_name != POSE_TYPES[robots.type]:
                 continue
-            if self._node.types.hash_of(seen.type_name) != seen.type_hash:
+            ours = self._node.types.hash_of(seen.type_name)
+            if ours != seen.type_hash:
+                if there and id not in self._strange and len(self._strange) < MOST_ROBOTS:
+                    self._strange.add(id)
+                    log.warning(
+                        "robot %s is not taken in: it publishes %s as %s, expected %s (--distribution)",
+                        id, seen.topic, seen.type_hash[:20], ours[:20],
+                    )  # fmt: skip
                 continue
             self._publishers[seen.topic] += 1 if there else -1
             known = self._robots.get(id)

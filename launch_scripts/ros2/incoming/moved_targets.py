@@ -7,6 +7,7 @@ import logging
 from launch_scripts.ros2.incoming.place_routes import TRACKER
 from launch_scripts.ros2.incoming.places import FrameReader
 from launch_scripts.ros2.incoming.settings import TARGET
+from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.node import Node
 from swarm.client import Swarm, SwarmError, Target
 from swarm.clock import NS_PER_S
@@ -27,7 +28,7 @@ class MovedTarget:
         self._due_ns = 0
         self._said: str | None = None
         self._poses = node.newest(
-            set_pose.replace(TARGET, id), "geometry_msgs/msg/PoseStamped", most_bytes=_MOST_BYTES
+            set_pose.replace(TARGET, ros_name(id)), "geometry_msgs/msg/PoseStamped", most_bytes=_MOST_BYTES
         )
 
     def tick(self, now_ns: int) -> None:

@@ -150,17 +150,13 @@ class PlaceRoutes:
 
     def _hear(self, question: _Question, done: Future[Route]) -> None:
         error = done.exception()
-        if error is not None:
-            self._end(question, f"{error}: is it a target of the scenario?")
-            return
-        route = done.result()
-        if question.cell is None or route.target_cell == question.cell:
+        route = None if error is not None else done.result()
+        if route is not None and question.cell in (None, route.target_cell):
             self._end(question, route)
         elif time.monotonic_ns() >= question.until_ns:
-            self._end(
-                question, f"the planner of {question.target} finds no way to the goal: nobody may stand there"
-            )
-        elif question.asked < _AT_ONCE:
+            no_way = f"the planner of {question.target} finds no way to the goal: nobody may stand there"
+            self._end(question, no_way if error is None else f"{error}: is it a target of the scenario?")
+        elif error is None and question.asked < _AT_ONCE:
             self._ask(question)
         else:
             with self._lock:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from launch_scripts.ros2.frames import RosMap
 from launch_scripts.ros2.messages import Level, RosMessages
+from launch_scripts.ros2.packed_path import packed_path
 from swarm.client import Route
 
 CERTIFICATE_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
 
 
-def path_of(messages: RosMessages, stamp_ns: int, route: Route | str) -> Any:
-    """nav_msgs/Path of a route; without poses where there is none, or a reason why."""
+def path_of(map: RosMap, stamp_ns: int, route: Route | str) -> bytes:
+    """CDR of a nav_msgs/Path of a route; without poses where there is none, or a reason why. A response of GetPlan,
+    which is nothing but a path, has the same bytes."""
     points = () if isinstance(route, str) or not (route.ok or route.searching) else route.points_m
-    return messages.path(stamp_ns, points)
+    return packed_path(map, stamp_ns, points)
 
 
 def certificate_of(messages: RosMessages, stamp_ns: int, robot: str, route: Route | str) -> Any:

@@ -15,8 +15,8 @@ from launch_scripts.ros2.incoming.plan_messages import CERTIFICATE_TYPE, certifi
 from launch_scripts.ros2.incoming.settings import POSE_TYPES, ROBOT, Robots
 from launch_scripts.ros2.incoming.tracks import Track
 from launch_scripts.ros2.messages import RosMessages
-from launch_scripts.ros2.node import Node
-from swarm.client import Route, Swarm, SwarmError, Vehicle
+from launch_scripts.ros2.node import Node, Publisher
+from swarm.client import BusError, Route, Swarm, SwarmError, Vehicle
 from swarm.clock import NS_PER_S
 
 log = logging.getLogger(__name__)
@@ -67,11 +67,7 @@ class Robot:
     def tick(self, now_ns: int) -> None:
         """Tell the swarm where it is, if that was said; end its life if it was not for too long."""
         with self._lock:
-            if self._track.due(now_ns) and (message := self._poses.take()) is not None:
-                self.counts["poses"] += 1
-                place = self._track.hear(message, now_ns)
-                if place is not None:
-                    self._tell(place)
+            self._hear_pose(now_ns)
             if self._track.gone(now_ns):
                 self._leave()
         self._take_goal()
@@ -87,6 +83,13 @@ class Robot:
         self._node.remove(self._service)
 
     # --- where it is --------------------------------------------------------------------------------------------
+
+    def _hear_pose(self, now_ns: int) -> None:
+        if self._track.due(now_ns) and (message := self._poses.take()) is not None:
+            self.counts["poses"] += 1
+            place = self._track.hear(message, now_ns)
+            if place is not None:
+                self._tell(place)
 
     def _tell(self, place: Place) -> None:
         robots = self._robots
@@ -146,6 +149,7 @@ class Robot:
                 return
             self._goal_ns = now_ns
             self.counts["goals"] += 1
+            self._hear_pose(now_ns)  # which may have come just before
             fault = self._go(message)
         if fault is not None:
             log.warning("topic %s: %s", self._goals.endpoint.topic, fault)
@@ -198,16 +202,23 @@ class Robot:
         self._put_plan(route)
         if moved and end is not None:
             x_m, y_m = self._swarm.frame.centre_m(end)
-            self._goal_out.put(self._messages.pose_stamped(time.time_ns(), x_m, y_m))
+            self._put(self._goal_out, self._messages.pose_stamped(time.time_ns(), x_m, y_m))
 
     def _put_plan(self, route: Route | str) -> None:
         stamp_ns = time.time_ns()
-        path = path_of(self._messages, stamp_ns, route)
+        path = path_of(self._messages.map, stamp_ns, route)
         certificate = certificate_of(self._messages, stamp_ns, self.id, route)
-        with self._lock:  # one thread at a time may put
-            self._plan.put(path)
-            self._certificate.put(certificate)
-            self.counts["plans"] += 1
+        self.counts["plans"] += 1
+        self._put(self._plan, path)
+        self._put(self._certificate, certificate)
+
+    def _put(self, publisher: Publisher, message: Any) -> None:
+        """From any thread, one at a time. What a lost link does not take is counted."""
+        with self._lock:
+            try:
+                publisher.put_packed(message) if isinstance(message, bytes) else publisher.put(message)
+            except BusError:
+                self.counts["put_failed"] += 1
 
     # --- questions ----------------------------------------------------------------------------------------------
 
@@ -216,11 +227,8 @@ class Robot:
 
         def answer(found: Route | str) -> None:
             stamp_ns = time.time_ns()
-            path = path_of(self._messages, stamp_ns, found)
-            certificate = certificate_of(self._messages, stamp_ns, self.id, found)
-            with self._lock:
-                self._certificate.put(certificate)
-            reply(self._messages.types.make("nav_msgs/srv/GetPlan_Response", plan=path))
+            reply(path_of(self._messages.map, stamp_ns, found))
+            self._put(self._certificate, certificate_of(self._messages, stamp_ns, self.id, found))
 
         self.counts["questions"] += 1
         start = self._start_of(request.start)
@@ -241,6 +249,7 @@ class Robot:
             found = self._reader.pose(start.header, start.pose)
             return f"start: {found}" if isinstance(found, str) else found
         with self._lock:
+            self._hear_pose(time.monotonic_ns())
             return self._track.place or f"robot {self.id} has not said where it is: give a start with a frame"
 
     def _own(self, topic: str) -> str:

@@ -73,20 +73,32 @@ class Robots(Section, frozen=True, kw_only=True):
         return found[1] if found else None
 
 
-class AreaSettings(Section, frozen=True, kw_only=True):
-    """An area that ROS may draw: a polygon becomes a zone, as operators order one; a grid becomes marks.
+class ZoneSettings(Section, frozen=True, kw_only=True):
+    """A zone that ROS draws by a polygon, as operators order one. A polygon without corners takes it away.
 
-    name          of the zone, or of the author of the marks
-    topic         of the polygon (geometry_msgs/PolygonStamped) or grid (nav_msgs/OccupancyGrid)
-    pace_s_per_m  of a polygon: how long a metre takes there; not given: nobody enters
-    occupied      of a grid: from this value on its cells are closed
-    for_s         it ends by itself after so long; not given: it stands until it is drawn again. A polygon without
-                  corners takes the zone away, as does the end of the gateway the marks of a grid with `for_s`
+    name          of the zone
+    topic         of the polygon, geometry_msgs/PolygonStamped
+    pace_s_per_m  how long a metre takes there; not given: nobody enters
+    for_s         it ends by itself so long after it was drawn last; not given: it stands until it is taken away
     """
 
     name: RosName
     topic: Topic
     pace_s_per_m: Positive | None = None
+    for_s: Positive | None = None
+
+
+class GridSettings(Section, frozen=True, kw_only=True):
+    """Cells that ROS closes by a grid. The next grid opens those that it does not close.
+
+    name      of the author of the marks
+    topic     of the grid, nav_msgs/OccupancyGrid
+    occupied  from this value on, up to 100, its cells are closed
+    for_s     they open by themselves so long after the last grid; not given: they stay closed
+    """
+
+    name: RosName
+    topic: Topic
     occupied: Annotated[int, Meta(ge=1, le=100)] = 100
     for_s: Positive | None = None
 
@@ -108,8 +120,8 @@ class IncomingSettings(Section, frozen=True, kw_only=True):
     targets: tuple[Name, ...] = ()
     set_pose: Topic = "/targets/{target}/set_pose"
     goal_targets: tuple[Name, ...] = ()
-    zones: tuple[AreaSettings, ...] = ()
-    grids: tuple[AreaSettings, ...] = ()
+    zones: tuple[ZoneSettings, ...] = ()
+    grids: tuple[GridSettings, ...] = ()
     orders: bool = False
 
     @property
@@ -118,7 +130,8 @@ class IncomingSettings(Section, frozen=True, kw_only=True):
         return [
             *(each.topic for each in self.robots),
             *(self.set_pose.replace(TARGET, each) for each in self.targets),
-            *(each.topic for each in (*self.zones, *self.grids)),
+            *(each.topic for each in self.zones),
+            *(each.topic for each in self.grids),
         ]
 
 

@@ -19,9 +19,10 @@ from launch_scripts.ros2.frames import RosMap, quaternion_of
 from launch_scripts.ros2.incoming.areas import MOST_CELLS, closed_cells, corners_of
 from launch_scripts.ros2.incoming.goals import GoalTargets
 from launch_scripts.ros2.incoming.places import FrameReader, Place, robot_place
-from launch_scripts.ros2.incoming.settings import AreaSettings, IncomingSettings, Robots, check_incoming
+from launch_scripts.ros2.incoming.settings import IncomingSettings, Robots, ZoneSettings, check_incoming
 from launch_scripts.ros2.incoming.tracks import Track
 from launch_scripts.ros2.messages import RosMessages
+from launch_scripts.ros2.packed_path import packed_path
 from launch_scripts.ros2.types import Distribution, types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
@@ -269,7 +270,7 @@ def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
         (IncomingSettings(targets=("fox",), goal_targets=("fox",)), "'fox' is there twice"),
         (IncomingSettings(robots=(Robots(), Robots())), "topics: '/{robot}/odom' is there twice"),
         (
-            IncomingSettings(zones=(AreaSettings(name="z", topic="/a"), AreaSettings(name="z", topic="/b"))),
+            IncomingSettings(zones=(ZoneSettings(name="z", topic="/a"), ZoneSettings(name="z", topic="/b"))),
             "zones: 'z' is there twice",
         ),
     ],
@@ -291,3 +292,10 @@ def test_good_settings_pass() -> None:
 )
 def test_a_robot_is_found_by_its_topic(topic: str, robot: str | None) -> None:
     assert Robots().robot_of(topic) == robot
+
+
+def test_a_response_of_getplan_has_the_bytes_of_its_path() -> None:
+    points = [GRID.centre_m(cell) for cell in (3, 4, 21, 22)]
+    path = RosMessages(TYPES, MAP).path(7, points)
+    response = TYPES.make("nav_msgs/srv/GetPlan_Response", plan=path)
+    assert TYPES.pack(response, "nav_msgs/srv/GetPlan_Response") == packed_path(MAP, 7, points)
