@@ -78,6 +78,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     pieces_mend.mend_tiles,
     pieces.relabel_tiles,
     pieces.evaluate,
+    pieces.find_risen,
     pieces_mend.cut_ways,
     pieces_mend.merge_parents,
     pieces_mend.drop_lost,

@@ -36,8 +36,9 @@ A tile is worked on with one cell around, WIDE ** 2 cells that are called its be
     cost     float64  (WIDE ** 2,)  s; what a cell costs
     own      float64  (WIDE ** 2,)  s; cell costs
     less     int32    (WIDE ** 2,)  whether a cell is offered less
-    queue    int32    (WIDE ** 2,)  cells
-    waits    uint8    (WIDE ** 2,)  whether a cell is in the queue; 0 between calls
+    queue    int32    (WIDE ** 2,)  cells; while costs spread, the items of a `kernels.heap`
+    keys     float32  (WIDE ** 2,)  s; of the heap
+    place    int32    (WIDE ** 2,)  of the heap; -1 between calls
     code     uint8    (WIDE ** 2,)  parents; NONE around the tile
     name     uint8    (WIDE ** 2,)  pieces
     around   int64    (8,)          what each direction adds to a cell of these arrays
@@ -94,28 +95,29 @@ Bench = tuple[
     NDArray[np.float64],
     NDArray[np.int32],
     NDArray[np.int32],
-    NDArray[np.uint8],
+    NDArray[np.float32],
+    NDArray[np.int32],
     NDArray[np.uint8],
     NDArray[np.uint8],
     NDArray[np.int64],
 ]
-"""(names, cost, own, less, queue, waits, code, name, around)."""
+"""(names, cost, own, less, queue, keys, place, code, name, around)."""
 
 LABELLED = "Tuple((u1[::1], u1[::1], f8[::1], i8))"
 PIECES = "Tuple((f8[:, ::1], i4[:, ::1]))"
 TILES = "Tuple((u1[::1], i4[::1], f8[::1], u1[::1], f8[:, ::1], f8[:, ::1], i8))"
-BENCH = "Tuple((i2[::1], f8[::1], f8[::1], i4[::1], i4[::1], u1[::1], u1[::1], u1[::1], i8[::1]))"
+BENCH = "Tuple((i2[::1], f8[::1], f8[::1], i4[::1], i4[::1], f4[::1], i4[::1], u1[::1], u1[::1], i8[::1]))"
 
 
 def make_bench() -> Bench:
-    """(names, cost, own, less, queue, waits, code, name, around)."""
+    """(names, cost, own, less, queue, keys, place, code, name, around)."""
     tile = np.arange(CELLS, dtype=np.int16).reshape(SIDE, SIDE)
     names = np.zeros(ROOM, np.int16)
     names[: 4 * SIDE - 4] = np.concatenate((tile[0], tile[-1], tile[1:-1, 0], tile[1:-1, -1]))
     size = WIDE * WIDE
     return (
         *(names, np.full(size, np.inf), np.full(size, np.inf), np.zeros(size, np.int32), np.empty(size, np.int32)),
-        *(np.zeros(size, np.uint8), np.full(size, NONE), np.full(size, NO_PIECE), step_offsets(WIDE)),
+        *(np.zeros(size, np.float32), np.full(size, -1, np.int32), np.full(size, NONE), np.full(size, NO_PIECE), step_offsets(WIDE)),
     )
 
 
@@ -188,7 +190,7 @@ def relabel_tile(t, grid, labels, tiles, bench):
     cell_cost, _, stride, rule, _ = grid
     parent, piece, local, root = labels
     exits, many, span, _, _, _, across = tiles
-    names, cost, own, _, queue, _, code, name, around = bench
+    names, cost, own, _, queue, _, _, code, name, around = bench
     origin, rows, cols = corner_of(grid, across, t)
     for row in range(SIDE):
         at = np.uint64((row + 1) * WIDE + 1)
@@ -351,10 +353,9 @@ def _note_changes(t, pieces, tiles):
     ends[1, t] = far
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i8[::1], i4, i4[::1], i8[::1])")
-def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
-    """Totals := what is driven from each exit to the root. Returns how many tiles are to be looked at, and writes
-    them to `todo`: those where it is wanted, and where totals have risen by more than others about them.
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i8[::1], i4, i4[::1])")
+def evaluate(grid, labels, pieces, tiles, names, order, now, stack):
+    """Totals := what is driven from each exit to the root.
 
     order  all tiles, those nearest the root first
     now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
@@ -362,10 +363,8 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
     where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way it ends, as
     no piece leads to itself.
     """
-    _, many, _, wanted, falls, ends, across = tiles
-    down = many.size // across
+    many, wanted = tiles[1], tiles[3]
     for t in range(many.size):
-        falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
         if wanted[t] & REHOOK:
             _hook_tile(t, grid, labels, pieces, tiles, names)
             wanted[t] = (wanted[t] & ~REHOOK) | _WAITS | _CHANGED
@@ -384,7 +383,16 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
                 want(tiles, t, _WAITS)
                 wanted[t] &= ~_WAITS
                 again = True
+
+
+@kernel(f"({PIECES}, {TILES}, i8[::1])")
+def find_risen(pieces, tiles, todo):
+    """Returns how many tiles are to be looked at, and writes them to `todo`: those where it is wanted, and where
+    totals have risen by more than others about them since this was last called."""
+    _, many, _, wanted, falls, ends, across = tiles
+    down = many.size // across
     for t in range(many.size):
+        falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
         if wanted[t] & _CHANGED:
             wanted[t] &= ~_CHANGED
             _note_changes(t, pieces, tiles)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.heap import heap_lower, heap_pop
 from planner_service.kernels.layout import (
     BOX,
     GRID,
@@ -144,7 +145,7 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
     """Have a cell of a tile, `at` on the bench, take the least that it is offered. Returns whether that is less."""
     _, _, stride, rule, corners = grid
     parent, piece, local, _ = labels
-    _, cost, own, _, _, _, _, _, around = bench
+    _, cost, own, _, _, _, _, _, _, around = bench
     across = tiles[6]
     best, by = np.inf, 0
     for code in range(8):
@@ -180,20 +181,18 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
 
 @helper
 def _spread(t, grid, labels, tiles, bench, count, least):
-    """Spread what the first `count` cells of the queue cost, inside the tile. Cells around that are offered less
-    have their tile looked at."""
+    """Spread what the `count` cells of the heap cost, inside the tile, the least first: where a way around is found,
+    most cells behind it are written once. Cells around that are offered less have their tile looked at."""
     _, offsets, stride, rule, corners = grid
     parent, piece, local, _ = labels
     span, wanted, across = tiles[2], tiles[3], tiles[6]
-    _, cost, own, _, queue, waits, _, _, around = bench
+    _, cost, own, _, queue, keys, place, _, _, around = bench
     first = t * CELLS
     origin, rows, cols = corner_of(grid, across, t)
-    head, tail = 0, count
     while count > 0:
-        at = np.int64(queue[head])
-        head = head + 1 if head + 1 < queue.size else 0
+        at = np.int64(queue[0])
+        heap_pop(keys, queue, place, count)
         count -= 1
-        waits[at] = 0
         row, col = at // WIDE - 1, at % WIDE - 1
         v = origin + row * stride + col
         rim = row == 0 or col == 0 or row == rows - 1 or col == cols - 1
@@ -220,11 +219,7 @@ def _spread(t, grid, labels, tiles, bench, count, least):
             local[j] = local[i] + step_cost(rule, own[at], code)
             span[t] = max(span[t], local[j])
             parent[v + offsets[code]] = (code + 4) & 7
-            if not waits[u]:
-                waits[u] = 1
-                queue[tail] = u
-                tail = tail + 1 if tail + 1 < queue.size else 0
-                count += 1
+            count = heap_lower(keys, queue, place, count, np.float32(offer), u)
 
 
 @helper
@@ -234,7 +229,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     piece = labels[1]
     total = pieces[0]
     exits, many, span, _, _, _, across = tiles
-    names, cost, own, less, queue, waits, _, _, _ = bench
+    names, cost, own, less, queue, keys, place, _, _, _ = bench
     _lay(t, grid, labels, total, tiles, bench)
     _, rows, cols = corner_of(grid, across, t)
     farthest = 0.0
@@ -256,9 +251,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
                 if less[at] and _take_less(
                     *(at, t, (row << BITS) + col, grid, labels, pieces, tiles, bench, least)
                 ):
-                    queue[count] = at
-                    waits[at] = 1
-                    count += 1
+                    count = heap_lower(keys, queue, place, count, np.float32(cost[at]), at)
     if count == 0:
         return False
     _spread(t, grid, labels, tiles, bench, count, least)
