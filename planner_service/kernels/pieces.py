@@ -117,7 +117,13 @@ def make_bench() -> Bench:
     size = WIDE * WIDE
     return (
         *(names, np.full(size, np.inf), np.full(size, np.inf), np.zeros(size, np.int32), np.empty(size, np.int32)),
-        *(np.zeros(size, np.float32), np.full(size, -1, np.int32), np.full(size, NONE), np.full(size, NO_PIECE), step_offsets(WIDE)),
+        *(
+            np.zeros(size, np.float32),
+            np.full(size, -1, np.int32),
+            np.full(size, NONE),
+            np.full(size, NO_PIECE),
+            step_offsets(WIDE),
+        ),
     )
 
 

@@ -181,8 +181,8 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
 
 @helper
 def _spread(t, grid, labels, tiles, bench, count, least):
-    """Spread what the `count` cells of the heap cost, inside the tile, the least first: where a way around is found,
-    most cells behind it are written once. Cells around that are offered less have their tile looked at."""
+    """Spread what the `count` cells of the heap cost, inside the tile, the least first: most cells are then written
+    once. Cells around that are offered less have their tile looked at."""
     _, offsets, stride, rule, corners = grid
     parent, piece, local, _ = labels
     span, wanted, across = tiles[2], tiles[3], tiles[6]

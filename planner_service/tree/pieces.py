@@ -207,15 +207,15 @@ class PieceTree:
 
     def _mend_near(self, near: Cells) -> None:
         """Find ways around what has changed in the changed tiles, before others look at them. What lies behind then
-        costs a little more, and keeps its parents. Were all looked at at once, whole branches would go over to others
-        while they have no way, and come back."""
+        costs a little more, and keeps its parents. Were all looked at at once, whole branches would go over to
+        others while they have no way, and come back."""
         for _ in range(NEAR_ROUNDS):
             self._evaluate()
             todo = near[(self._wanted[near] & LOOK) != 0]
             if not todo.size:
                 break
             self._mend_tiles(todo)
-        # What lay behind had no total when they were looked at, and `find_risen` has not seen that it has one again.
+        # What lay behind had no total when they were looked at, and nobody has noted that it has one again.
         self._wanted[near] |= LOOK
 
     def _mend(self, most: float) -> int:
