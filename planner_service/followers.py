@@ -146,6 +146,11 @@ class Followers:
             for id in late:
                 del heard[id]
 
+    def any_due_in(self, changed: Sequence[Window], now_ns: int) -> bool:
+        """Whether the route of a follower that may be pushed another now passes one of these windows."""
+        due = [each for each in self._by_id.values() if now_ns >= each.push_ns]
+        return any(self._crosses(due[n], changed[m]) for n, m in _near(due, changed))
+
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
         """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
         fresh = [follower for follower in self._by_id.values() if not follower.stale]
@@ -154,13 +159,7 @@ class Followers:
         inside = (rows >= window.row0) & (rows < window.row1) & (cols >= window.col0) & (cols < window.col1)
         for n in np.flatnonzero(inside).tolist():
             fresh[n].stale = True
-        if not changed:
-            return
-        corners = chain.from_iterable(follower.bounds for follower in fresh)
-        row0, col0, row1, col1 = np.fromiter(corners, np.int64, 4 * len(fresh)).reshape(-1, 4, 1).swapaxes(0, 1)
-        each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in changed], np.int64).T
-        near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
-        for n, m in np.argwhere(near).tolist():
+        for n, m in _near(fresh, changed):
             fresh[n].stale = fresh[n].stale or self._crosses(fresh[n], changed[m])
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
@@ -191,3 +190,14 @@ class Followers:
         rows, cols = np.divmod(np.array(follower.cells, np.int64), self._grid.cols)
         inside = (rows >= window.row0 - 1) & (rows <= window.row1)
         return bool((inside & (cols >= window.col0 - 1) & (cols <= window.col1)).any())
+
+
+def _near(followers: Sequence[Follower], windows: Sequence[Window]) -> list[tuple[int, int]]:
+    """Of which followers the bounds of the route meet which windows."""
+    if not windows:
+        return []
+    corners = chain.from_iterable(follower.bounds for follower in followers)
+    row0, col0, row1, col1 = np.fromiter(corners, np.int64, 4 * len(followers)).reshape(-1, 4, 1).swapaxes(0, 1)
+    each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in windows], np.int64).T
+    near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
+    return [(n, m) for n, m in np.argwhere(near).tolist()]

@@ -79,6 +79,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     pieces_mend.mend_tiles,
     pieces_labels.relabel_tiles,
     pieces_totals.evaluate,
+    pieces_totals.find_risen,
     pieces_mend.cut_ways,
     pieces_mend.merge_parents,
     pieces_mend.drop_lost,

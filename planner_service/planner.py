@@ -12,6 +12,7 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
+from planner_service.map_intake import MapIntake
 from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
@@ -104,6 +105,7 @@ class Planner:
         self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
+        self._intake = MapIntake(cost_map, self.followers)
         # Where the target is; the tick takes it in.
         self._watch = TargetWatch(target, self._grid, counters, time_scale)
         self._watch.counts = leads
@@ -201,7 +203,7 @@ class Planner:
             return []
         snapshot_ns = self._growing_since_ns
         news = (pose.cell, self._cost_map.version)
-        dirty = self._take_dirty()
+        dirty = self._take_dirty(now_ns)
         self._growing_since_ns = None
         update = self.tree.adopt(
             grown,
@@ -242,11 +244,12 @@ class Planner:
         pose = self._watch.pose
         if pose is None:
             if self._under_way is not None and self.tree.map_version != self._cost_map.version:
-                self._learn_map()
+                self._learn_map(now_ns)
             return []  # the first growth takes the map as it is then, whatever changed before
         now_known = (pose.cell, self._cost_map.version)
-        self.tree.times.note_tick(self._told is not None and pose.cell != self._told[0])
-        if now_known != self._told:
+        moved = self._told is None or pose.cell != self._told[0]
+        self.tree.times.note_tick(moved and self._told is not None)
+        if moved or (now_known != self._told and self._may_not_wait(now_ns)):
             self._take_in(now_known, now_ns)
         if self._wants_full and self._growing_since_ns is None:
             return [self._grow(now_ns)]
@@ -263,7 +266,7 @@ class Planner:
         if search is None:
             return
         if self.tree.map_version < 0 and not search.tracked:
-            self._learn_map()
+            self._learn_map(now_ns)
         if self.vehicle_class != GROUND:
             return  # that class has told the search all of this
         place_m = (math.inf, math.inf) if pose is None else (pose.x_m - grid.west_m, grid.north_m - pose.y_m)
@@ -273,20 +276,24 @@ class Planner:
             self.counters.counts["searches"] = search.searches
             self.counters.counts["search_places"] = search.searcher.decisions
 
-    def _learn_map(self) -> None:
+    def _learn_map(self, now_ns: int) -> None:
         """Take in the map without a target to lead to."""
-        self.tree.update(self._cost_map.pace_s_per_m, -1, self._take_dirty(), self._cost_map.version)
+        self.tree.update(self._cost_map.pace_s_per_m, -1, self._take_dirty(now_ns), self._cost_map.version)
+
+    def _may_not_wait(self, now_ns: int) -> bool:
+        """Whether changes of the map are to be taken in although the target stands."""
+        return not self.tree.ready or self._intake.is_due(now_ns, self._push_ns)
 
     def _take_in(self, news: tuple[int, int], now_ns: int) -> None:
-        dirty = self._take_dirty()
+        dirty = self._take_dirty(now_ns)
         began_ns = self._now()
         update = self.tree.update(self._cost_map.pace_s_per_m, news[0], dirty, news[1])
         self._told = news
         self._timed(update, self._now() - began_ns, now_ns)
         self._changed(update, dirty, now_ns)
 
-    def _take_dirty(self) -> list[Window]:
-        dirty = self._cost_map.take_dirty()
+    def _take_dirty(self, now_ns: int) -> list[Window]:
+        dirty = self._intake.take(now_ns)
         if self._growing_since_ns is not None:
             self._dirty_since_snapshot = merged(dirty, self._dirty_since_snapshot)
         stamp_ns = self._newest_mark_ns()
@@ -346,7 +353,7 @@ class Planner:
         if (search := self._under_way) is not None:
             routes = search.routes(self._ways, cells, request.vehicles, max_cells, self.tree.map_version)
         else:
-            routes = self.tree.routes(cells, max_cells)
+            routes = self._read(cells, max_cells, now_ns)
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
                 routes = self.tree.routes(cells, max_cells)
             self._certify(routes, now_ns)
@@ -367,6 +374,14 @@ class Planner:
             tracker_lost=self._watch.lost(now_ns),
             vehicle_class=self.vehicle_class,
         )
+
+    def _read(self, cells: list[int], max_cells: int, now_ns: int) -> RouteBatch:
+        """Routes off the tree. None passes what has changed on the map, as far as it is known here."""
+        routes = self.tree.routes(cells, max_cells)
+        if self._told is None or not self.tree.ready or not self._intake.concerns(routes):
+            return routes
+        self._take_in((self._told[0], self._cost_map.version), now_ns)
+        return self.tree.routes(cells, max_cells)
 
     def _pulled(self, routes: RouteBatch) -> RouteBatch:
         return routes if self._puller is None else self._puller.pull_batch(routes)
@@ -445,7 +460,7 @@ class Planner:
         pushes: list[Action] = []
         for max_cells, batch in due.items():
             cells = [follower.cell for _, follower in batch]
-            routes = self._pulled(self.tree.routes(cells, max_cells))
+            routes = self._pulled(self._read(cells, max_cells, now_ns))
             for (id, follower), route in zip(batch, routes, strict=True):
                 follower.stale = False
                 if route.status not in _WORTH_PUSHING or not self.followers.is_news(follower, route):

@@ -178,6 +178,11 @@ class CostMap:
         self._dirty = [self.grid.window]
         return True
 
+    @property
+    def dirty(self) -> Sequence[Window]:
+        """What `take_dirty` would return now."""
+        return self._dirty
+
     def take_dirty(self) -> list[Window]:
         """Windows which cover every cell whose pace changed since the last call, 32 at most; none touches
         another."""

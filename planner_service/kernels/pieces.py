@@ -42,8 +42,9 @@ A tile is worked on with one cell around, WIDE ** 2 cells that are called its be
     place    int32    (n,)          where in `kept` a tile is; -1 if it is not
     holder   int32    (m + 1,)      which tile is in each place, -1 if none; behind, the place that goes next
     less     int32    (WIDE ** 2,)  whether a cell is offered less
-    queue    int32    (WIDE ** 2,)  cells
-    waits    uint8    (WIDE ** 2,)  whether a cell is in the queue; 0 between calls
+    queue    int32    (WIDE ** 2,)  cells; while costs spread, the items of a `kernels.heap`
+    keys     float32  (WIDE ** 2,)  s; of the heap
+    spot     int32    (WIDE ** 2,)  where in the heap a cell is; -1 between calls
     code     uint8    (WIDE ** 2,)  parents; NONE around the tile
     name     uint8    (WIDE ** 2,)  pieces
     around   int64    (8,)          what each direction adds to a cell of these arrays
@@ -99,21 +100,22 @@ Bench = tuple[
     NDArray[np.float64],
     NDArray[np.int32],
     NDArray[np.int32],
-    NDArray[np.uint8],
+    NDArray[np.float32],
     NDArray[np.uint8],
     NDArray[np.uint8],
     NDArray[np.int64],
     NDArray[np.float64],
     NDArray[np.int32],
     NDArray[np.int32],
+    NDArray[np.int32],
 ]
-"""(names, cost, own, inner, less, queue, waits, code, name, around, kept, place, holder)."""
+"""(names, cost, own, inner, less, queue, keys, code, name, around, kept, place, holder, spot)."""
 
 LABELLED = "Tuple((u1[::1], u1[::1], f8[::1], i8))"
 PIECES = "Tuple((f8[:, ::1], i4[:, ::1]))"
 TILES = "Tuple((u1[::1], i4[::1], f8[::1], u1[::1], f8[:, ::1], f8[:, ::1], i8))"
-_SCRATCH = "i2[::1], f8[::1], f8[::1], f8[::1], i4[::1], i4[::1], u1[::1], u1[::1], u1[::1], i8[::1]"
-BENCH = f"Tuple(({_SCRATCH}, f8[::1], i4[::1], i4[::1]))"
+_SCRATCH = "i2[::1], f8[::1], f8[::1], f8[::1], i4[::1], i4[::1], f4[::1], u1[::1], u1[::1], i8[::1]"
+BENCH = f"Tuple(({_SCRATCH}, f8[::1], i4[::1], i4[::1], i4[::1]))"
 
 
 def make_bench(tiles: int, most: int) -> Bench:
@@ -125,11 +127,12 @@ def make_bench(tiles: int, most: int) -> Bench:
     return (
         *(names, np.full(size, np.inf), np.full(size, np.inf), np.zeros(size)),
         *(np.zeros(size, np.int32), np.empty(size, np.int32)),
-        *(np.zeros(size, np.uint8), np.full(size, NONE), np.full(size, NO_PIECE), step_offsets(WIDE)),
+        *(np.zeros(size, np.float32), np.full(size, NONE), np.full(size, NO_PIECE), step_offsets(WIDE)),
         *(
             np.empty(places * CELLS),
             np.full(tiles, -1, np.int32),
             np.append(np.full(places, -1), 0).astype(np.int32),
+            np.full(size, -1, np.int32),
         ),
     )
 

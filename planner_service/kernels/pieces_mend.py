@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.heap import heap_lower, heap_pop
 from planner_service.kernels.layout import (
     BOX,
     GRID,
@@ -181,20 +182,19 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
 
 @helper
 def _spread(t, grid, labels, tiles, bench, count, least):
-    """Spread what the first `count` cells of the queue cost, inside the tile. Cells around that are offered less
-    have their tile looked at."""
+    """Spread what the `count` cells of the heap cost, inside the tile, the least first: most cells are then written
+    once. Cells around that are offered less have their tile looked at."""
     _, offsets, stride, rule, corners = grid
     parent, piece, _, _ = labels
     span, wanted, across = tiles[2], tiles[3], tiles[6]
-    cost, own, inner, queue, waits, around = bench[1], bench[2], bench[3], bench[5], bench[6], bench[9]
+    cost, own, inner, around = bench[1], bench[2], bench[3], bench[9]
+    queue, keys, spot = bench[5], bench[6], bench[13]
     first = t * CELLS
     origin, rows, cols = corner_of(grid, across, t)
-    head, tail = 0, count
     while count > 0:
-        at = np.int64(queue[head])
-        head = head + 1 if head + 1 < queue.size else 0
+        at = np.int64(queue[0])
+        heap_pop(keys, queue, spot, count)
         count -= 1
-        waits[at] = 0
         row, col = at // WIDE - 1, at % WIDE - 1
         v = origin + row * stride + col
         rim = row == 0 or col == 0 or row == rows - 1 or col == cols - 1
@@ -220,11 +220,7 @@ def _spread(t, grid, labels, tiles, bench, count, least):
             inner[u] = inner[at] + step_cost(rule, own[at], code)
             span[t] = max(span[t], inner[u])
             parent[v + offsets[code]] = (code + 4) & 7
-            if not waits[u]:
-                waits[u] = 1
-                queue[tail] = u
-                tail = tail + 1 if tail + 1 < queue.size else 0
-                count += 1
+            count = heap_lower(keys, queue, spot, count, np.float32(offer), u)
 
 
 @helper
@@ -234,7 +230,8 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     piece = labels[1]
     total = pieces[0]
     exits, many, span, _, _, _, across = tiles
-    names, cost, own, less, queue, waits = bench[0], bench[1], bench[2], bench[4], bench[5], bench[6]
+    names, cost, own, less = bench[0], bench[1], bench[2], bench[4]
+    queue, keys, spot = bench[5], bench[6], bench[13]
     _lay(t, grid, labels, total, tiles, bench)
     _, rows, cols = corner_of(grid, across, t)
     farthest = 0.0
@@ -256,9 +253,7 @@ def _mend(t, grid, labels, pieces, tiles, bench):
                 if less[at] and _take_less(
                     *(at, t, (row << BITS) + col, grid, labels, pieces, tiles, bench, least)
                 ):
-                    queue[count] = at
-                    waits[at] = 1
-                    count += 1
+                    count = heap_lower(keys, queue, spot, count, np.float32(cost[at]), at)
     if count == 0:
         return False
     _spread(t, grid, labels, tiles, bench, count, least)

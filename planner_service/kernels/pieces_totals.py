@@ -124,10 +124,9 @@ def _note_changes(t, pieces, tiles):
     ends[1, t] = far
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i8[::1], i4, i4[::1], i8[::1])")
-def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
-    """Totals := what is driven from each exit to the root. Returns how many tiles are to be looked at, and writes
-    them to `todo`: those where it is wanted, and where totals have risen by more than others about them.
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i8[::1], i4, i4[::1])")
+def evaluate(grid, labels, pieces, tiles, names, order, now, stack):
+    """Totals := what is driven from each exit to the root.
 
     order  all tiles, those nearest the root first
     now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
@@ -135,10 +134,8 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
     where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way it ends, as
     no piece leads to itself.
     """
-    _, many, _, wanted, falls, ends, across = tiles
-    down = many.size // across
+    many, wanted = tiles[1], tiles[3]
     for t in range(many.size):
-        falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
         if wanted[t] & REHOOK:
             _hook_tile(t, grid, labels, pieces, tiles, names)
             wanted[t] = (wanted[t] & ~REHOOK) | _WAITS | _CHANGED
@@ -157,7 +154,16 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
                 want(tiles, t, _WAITS)
                 wanted[t] &= ~_WAITS
                 again = True
+
+
+@kernel(f"({PIECES}, {TILES}, i8[::1])")
+def find_risen(pieces, tiles, todo):
+    """Returns how many tiles are to be looked at, and writes them to `todo`: those where it is wanted, and where
+    totals have risen by more than others about them since this was last called."""
+    _, many, _, wanted, falls, ends, across = tiles
+    down = many.size // across
     for t in range(many.size):
+        falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
         if wanted[t] & _CHANGED:
             wanted[t] &= ~_CHANGED
             _note_changes(t, pieces, tiles)

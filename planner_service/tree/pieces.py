@@ -23,6 +23,8 @@ from swarm.grid import Window
 MOST_LOOKS = 3.0
 """A move or a repair gives way to a growth once it has looked at so many times as many tiles as the map has; to
 mend one counts double."""
+NEAR_ROUNDS = 4
+"""Of a repair in changed tiles alone, at most; more than half of them need one."""
 
 MOST_KEPT = 1 << 10
 """Of so many tiles, all of a map of 2048 x 2048 cells, is kept what cells cost inside: 34 MB."""
@@ -145,6 +147,7 @@ class PieceTree:
             self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
         )
         self._relabel(np.flatnonzero(changed))
+        self._mend_near(np.flatnonzero(changed))
         looked = self.mend()
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
         pieces_mend.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
@@ -184,15 +187,40 @@ class PieceTree:
     def _relabel(self, which: Cells) -> None:
         pieces_labels.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
 
-    def _add_up(self) -> int:
-        """Evaluate the totals; returns how many tiles are to be looked at now, which stand in `_todo`."""
+    def _evaluate(self) -> None:
         self._now += self._moved
-        count = pieces_totals.evaluate(
+        pieces_totals.evaluate(
             *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench[0]),
-            *(np.argsort(self._ends[0]), self._now if self._moved else 0, self._stack, self._todo),
+            *(np.argsort(self._ends[0]), self._now if self._moved else 0, self._stack),
         )
         self._moved = False
-        return int(count)
+
+    def _add_up(self) -> int:
+        """Evaluate the totals; returns how many tiles are to be looked at now, which stand in `_todo`."""
+        self._evaluate()
+        return int(pieces_totals.find_risen(self._pieces, self._tiles, self._todo))
+
+    def _mend_tiles(self, which: Cells) -> int:
+        """Look at these tiles, those nearest the root first; returns how many had to be mended."""
+        which = which[np.argsort(self._ends[0][which])]
+        return int(
+            pieces_mend.mend_tiles(
+                *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench, which),
+            )
+        )
+
+    def _mend_near(self, near: Cells) -> None:
+        """Find ways around what has changed in the changed tiles, before others look at them. What lies behind then
+        costs a little more, and keeps its parents. Were all looked at at once, whole branches would go over to
+        others while they have no way, and come back."""
+        for _ in range(NEAR_ROUNDS):
+            self._evaluate()
+            todo = near[(self._wanted[near] & LOOK) != 0]
+            if not todo.size:
+                break
+            self._mend_tiles(todo)
+        # What lay behind had no total when they were looked at, and nobody has noted that it has one again.
+        self._wanted[near] |= LOOK
 
     def _mend(self, most: float) -> int:
         """Look at tiles until the tree is exact, or as many as `most` have been."""
@@ -202,12 +230,8 @@ class PieceTree:
             count = self._add_up()
             if not count or looked + 2 * mended > most:
                 break
-            todo = self._todo[:count]
-            todo = todo[np.argsort(self._ends[0][todo])]
             looked += count
-            mended += pieces_mend.mend_tiles(
-                *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench, todo),
-            )
+            mended += self._mend_tiles(self._todo[:count])
         self.exact = not count
         self.work = looked, mended, rounds
         return looked * CELLS

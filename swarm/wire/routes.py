@@ -31,6 +31,8 @@ from swarm.wire.fields import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from swarm.grid import GridSpec
+
 
 class RouteStatus(enum.StrEnum):
     """Whether a planner has a route from a cell, and why not."""
@@ -56,7 +58,7 @@ class Route(Bounded, frozen=True, kw_only=True):
     status is OK.
 
     cost_s         travel time of the whole route, as driven from middle to middle of neighbouring cells
-    lower_bound_s  proven: no route from cell to neighbouring cell is quicker on the planner's present map
+    lower_bound_s  proven: no route from cell to neighbouring cell is quicker on the map as the tree knows it
     length_m       length of the way given
     remaining_s    cost-to-go after it, 0 at the target
     legs           uint32: of each straight segment of a pulled route, over how many of the steps it goes, from
@@ -163,6 +165,18 @@ class RouteBatch:
 
     def __iter__(self) -> Iterator[Route]:
         return (self[index] for index in range(len(self)))
+
+    def places(self, grid: GridSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of all cells of the routes, one route after the other: int64. Starts are of the grid."""
+        begins = np.diff(self.ends, prepend=0)
+        begins, steps = self.ends - begins, begins
+        rows, cols = np.divmod(self.starts, grid.cols)
+        places = []
+        for starts, moves in ((rows, STEP_ROW), (cols, STEP_COL)):
+            gone = np.concatenate(([0], np.cumsum(np.array(moves, np.int64)[self.directions])))
+            along = gone[1:] + np.repeat(starts - gone[begins], steps)
+            places.append(np.concatenate((starts, along)))
+        return places[0], places[1]
 
     @property
     def gaps(self) -> NDArray[np.float64]:

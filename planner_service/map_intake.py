@@ -1,0 +1,57 @@
+"""When a tree takes in what has changed on its map: at once where that concerns somebody, else now and then. Pure.
+
+To repair a tree costs about the same however many cells have changed. With hundreds of vehicles that see something
+new in every tick, somewhere, a planner that repaired in every tick did little else. A change that no follower's
+route passes is nothing to push; so it waits, but not long.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planner_service.followers import Followers
+from shared_map.cost_map import CostMap
+from swarm.clock import NS_PER_S
+from swarm.grid import Window
+from swarm.wire.routes import LETHAL_START, UNREACHABLE, RouteBatch
+
+LONGEST_WAIT_NS = NS_PER_S
+"""A change waits no longer, however seldom routes are pushed."""
+
+
+class MapIntake:
+    """Which changes of one map the tree of one target does not know, and whether they may wait."""
+
+    def __init__(self, cost_map: CostMap, followers: Followers) -> None:
+        self._cost_map = cost_map
+        self._followers = followers
+        self._taken_ns: int | None = None
+        """When there were any the last time; None before."""
+
+    def take(self, now_ns: int) -> list[Window]:
+        """What has changed since the last call, for the tree to take in now."""
+        if self._cost_map.dirty:
+            self._taken_ns = now_ns
+        return self._cost_map.take_dirty()
+
+    def is_due(self, now_ns: int, wait_ns: int) -> bool:
+        """Whether changes that wait are to be taken in now: because the tree was told of others so long ago, or
+        because they lie on the route of a follower that may be pushed another."""
+        wait_ns = min(wait_ns, LONGEST_WAIT_NS)
+        if self._taken_ns is None or not 0 <= now_ns - self._taken_ns < wait_ns:
+            return True
+        return self._followers.any_due_in(self._cost_map.dirty, now_ns)
+
+    def concerns(self, routes: RouteBatch) -> bool:
+        """Whether changes that wait lie on one of these routes or next to it, or may make a way where there is
+        none."""
+        windows = self._cost_map.dirty
+        if not windows:
+            return False
+        if np.isin(routes.statuses, (UNREACHABLE, LETHAL_START)).any():
+            return True
+        rows, cols = routes.places(self._cost_map.grid)
+        return any(
+            bool(np.any((rows >= w.row0 - 1) & (rows <= w.row1) & (cols >= w.col0 - 1) & (cols <= w.col1)))
+            for w in windows
+        )

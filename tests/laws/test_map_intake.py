@@ -1,0 +1,124 @@
+"""Changes of a map may wait for a tree, but no route leads through one that waits, and none waits for long."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support import slow_twins as naive
+from support.effort import few
+from support.planner_strategies import random_pace
+from support.scripted_planner import TICK, chasers
+
+from planner_service.map_intake import LONGEST_WAIT_NS
+from planner_service.planner import Planner
+from planner_service.target_tree import TargetTree
+from shared_map.cost_map import CostMap
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import walk
+from swarm.runtime.stats import Counters
+from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.statements import MarkKind
+
+SIDE = 24
+
+
+class Watched:
+    """A planner whose map changes in every tick, and what of its tree was behind the map for how long."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = rng = np.random.default_rng(seed)
+        self.map = CostMap(terrain_of_pace(random_pace(rng, SIDE, SIDE, 5.0, (0.0, 0.15, 0.3)[seed % 3])))
+        self.grid = self.map.grid
+        config = PlannerConfig(strategy=("exact", "auto", "full")[seed // 3 % 3])  # type: ignore[arg-type]
+        tree = TargetTree(self.grid, config)
+        self.planner = Planner("t0", 7, config, tree, self.map, Counters())
+        self.now_ns = self.seq = 0
+        self.routes = self.waited = 0
+        self.told_at: dict[int, int] = {}
+        """Version of the map -> when there was one first."""
+        self.pose()
+
+    def pose(self) -> None:
+        cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
+        self.seq += 1
+        told = TargetPose(
+            target="t0", tracker="radar", incarnation=1, seq=self.seq, stamp_ns=0, cell=cell, x_m=0, y_m=0
+        )
+        self.planner.hear_pose(told, self.now_ns)
+
+    def mark(self) -> None:
+        cells = self.rng.integers(0, self.grid.cells, int(self.rng.integers(1, 3)))
+        kinds = self.rng.choice([MarkKind.LETHAL, MarkKind.PACE, MarkKind.PACE, MarkKind.CLEAR], cells.size)
+        paces = self.rng.uniform(0.05, 0.6, cells.size)
+        self.map.apply(cells.astype(np.uint32), kinds.astype(np.uint8), paces.astype(np.float32))
+        self.told_at.setdefault(self.map.version, self.now_ns)
+
+    def ask(self) -> None:
+        cells = self.rng.integers(0, self.grid.cells, 3).tolist()
+        force = bool(self.rng.integers(2))
+        request = RouteRequest(cells=cells, vehicles=["a", "b", "c"], force=force)
+        reply = self.planner.answer(request, self.now_ns)
+        assert isinstance(reply, RouteReply)
+        for route in reply.routes:
+            self.check(route)
+
+    def tick(self) -> None:
+        self.now_ns += TICK
+        cells: list[Any] = [("a", int(self.rng.integers(self.grid.cells)))]
+        if self.rng.integers(3) == 0:
+            self.planner.hear_chasers(chasers(*cells, stamp_ns=self.now_ns), self.now_ns)
+        for action in self.planner.tick(self.now_ns):
+            if isinstance(action, PushedRoute):
+                self.check(action.route)
+        self.told_at = {at: ns for at, ns in self.told_at.items() if at > self.planner.tree.map_version}
+        if self.planner.tree.ready:
+            assert all(self.now_ns - ns <= LONGEST_WAIT_NS for ns in self.told_at.values())
+        self.waited += bool(self.told_at)
+
+    def check(self, route: Route) -> None:
+        """What a route says that it costs is what it costs on the map as the planner knows it now."""
+        if route.status is not RouteStatus.OK:
+            return
+        self.routes += 1
+        pace = self.map.pace_s_per_m
+        driven = naive.follow(pace, route.start, route.directions)
+        assert driven is not None, "through a cell that is known to be lethal"
+        assert driven[0] == self.planner.tree.target_cell == walk(self.grid, route.start, route.directions)[-1]
+        assert driven[1] * self.grid.resolution_m == pytest.approx(route.cost_s, rel=1e-5)
+        assert route.lower_bound_s <= route.cost_s
+
+
+def test_no_route_leads_through_a_change_that_waits_and_none_waits_for_long() -> None:
+    routes = waited = 0
+    for seed in range(few(36)):
+        watched = Watched(seed)
+        watched.tick()
+        for _ in range(40):
+            happens = watched.rng.integers(6)
+            if happens == 0:
+                watched.pose()
+            elif happens < 4:
+                watched.mark()
+            else:
+                watched.ask()
+            if watched.rng.integers(3) == 0:
+                watched.tick()
+        routes, waited = routes + watched.routes, waited + watched.waited
+    assert routes > 100
+    assert waited > 10, "every change was taken in at once"
+
+
+def test_routes_are_read_as_places_as_they_are_walked() -> None:
+    rng = np.random.default_rng(3)
+    watched = Watched(1)
+    watched.tick()
+    starts = rng.integers(0, watched.grid.cells, 40)
+    routes = watched.planner.tree.routes(starts)
+    rows, cols = routes.places(watched.grid)
+    walked = [cell for route in routes for cell in walk(watched.grid, route.start, route.directions)]
+    assert sorted((rows * SIDE + cols).tolist()) == sorted(walked)
