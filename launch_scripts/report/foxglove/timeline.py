@@ -23,6 +23,7 @@ from launch_scripts.ros2.frames import headings_along
 from launch_scripts.ros2.grids import UNKNOWN, occupancy_grid, occupancy_of
 from launch_scripts.ros2.markers import Colour, Drawing, Form, MarkerBook
 from launch_scripts.ros2.messages import RosMessages
+from launch_scripts.ros2.names import ros_name
 from shared_map.terrain.places import middles_of
 from swarm.clock import NS_PER_S
 from swarm.wire.statements import MarkKind
@@ -79,7 +80,8 @@ def told(
 
 def _still(messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, first_ns: int) -> Iterator[Told]:
     frames = [messages.map_transform(first_ns)]
-    frames += [messages.vehicle_transforms(first_ns, each.id, 0.0, 0.0, None)[0] for each in tracks.vehicles]
+    names = frame_names(each.id for each in tracks.vehicles)
+    frames += [messages.vehicle_transforms(first_ns, name, 0.0, 0.0, None)[0] for name in names.values()]
     yield Told(first_ns, "/tf_static", messages.transforms(frames))
     if ground is not None:
         occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
@@ -115,10 +117,23 @@ def _instants(tracks: Sequence[Track]) -> Iterator[_Instant]:
         yield _Instant(int(times[some[0]]), ids, xy_m[some], headings[some].tolist())
 
 
+def frame_names(ids: Iterable[str]) -> dict[str, str]:
+    """Vehicle -> its name in frames, as of the gateway: a0-07 -> a0_07, or its id where another has that name."""
+    ids = sorted(set(ids))
+    names = {id: id for id in ids if ros_name(id) == id}
+    taken = set(names)
+    for id in ids:
+        if id not in names:
+            names[id] = id if ros_name(id) in taken else ros_name(id)
+            taken.add(names[id])
+    return names
+
+
 def _vehicles(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
+    names = frame_names(each.id for each in tracks)
     for now in _instants(tracks):
         bases = [
-            messages.vehicle_transforms(now.time_ns, id, x_m, y_m, heading_rad)[1]
+            messages.vehicle_transforms(now.time_ns, names[id], x_m, y_m, heading_rad)[1]
             for id, (x_m, y_m), heading_rad in zip(now.ids, now.xy_m.tolist(), now.headings_rad, strict=True)
         ]
         yield Told(now.time_ns, "/tf", messages.transforms(bases))

@@ -22,13 +22,14 @@ from rosbags.highlevel import AnyReader
 from support.fake_run import fake_run
 
 from launch_scripts.cli import main
-from launch_scripts.report.foxglove.timeline import instants_of
+from launch_scripts.report.foxglove.timeline import frame_names, instants_of
 from launch_scripts.report.geo.track_file import TRACKS_FILE, RunTracks, read_tracks
 from launch_scripts.report.ground_pace import GROUND_PACE_FILE
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from launch_scripts.ros2.frames import RosMap
 from launch_scripts.ros2.grids import rows_from_north
+from launch_scripts.ros2.names import ros_name
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -116,7 +117,7 @@ def test_every_vehicle_is_at_every_time_where_its_track_says(
     heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
 ) -> None:
     expected = {
-        (f"{each.id}/base_link", int(time_ns)): place
+        (f"{ros_name(each.id)}/base_link", int(time_ns)): place
         for each in tracks.vehicles
         for time_ns, place in zip(each.time_ns, in_map(each.xy_m), strict=True)
     }
@@ -150,7 +151,7 @@ def test_every_frame_hangs_on_the_terrain(heard: dict[str, list[tuple[int, Any]]
     origin = still.transforms[0].transform.translation
     assert (parents["map"], origin.x, origin.y) == ("terrain", 500_000, 5_200_000 - 48 * 25)
     for each in tracks.vehicles:
-        assert parents[parents[f"{each.id}/base_link"]] == "map"
+        assert parents[parents[f"{ros_name(each.id)}/base_link"]] == "map"
 
 
 def test_every_target_is_where_its_track_says(heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks) -> None:
@@ -327,3 +328,11 @@ def test_changes_are_told_soon_seldom_and_all(changes: list[int], first_ns: int,
         within = min(max(change, first_ns), last_ns)
         assert any(within <= each <= within + period_ns for each in instants)
     assert all(first_ns <= each <= last_ns for each in instants)
+
+
+@given(st.sets(st.text("aA1_-.", min_size=1, max_size=4)))
+def test_no_two_vehicles_share_a_frame(ids: set[str]) -> None:
+    names = frame_names(ids)
+    assert set(names) == ids
+    assert len(set(names.values())) == len(ids)
+    assert all(name in (ros_name(id), id) for id, name in names.items())
