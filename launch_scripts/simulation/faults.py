@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from swarm.clock import NS_PER_S
 
@@ -15,6 +15,9 @@ RELINK_S = 0.3
 """Seconds until a client has found its router again: the retry period, and a session's start."""
 OBSERVER = "recorder-0"
 """The node that writes the report. No fault touches it, or the report would be wrong."""
+MOST_WRONG_S = 11.5 * 3600
+"""No clock is further off, whatever steps come together: marks of a process whose clock is a day ahead of the reader's
+are refused, so of two that are half a day off to either side one would never hold what the other says."""
 _NS_PER_MS = 1_000_000
 
 
@@ -194,7 +197,7 @@ def random_plan(seed: int, nodes: Sequence[str], seconds: float) -> FaultPlan:
         if chance.random() < 0.3:
             by_s = chance.choice((-3600.0, 3600.0, -43_200.0, 43_200.0, 5.0, -5.0))
             clock_steps.append(ClockStep(crash.at_s, crash.node, by_s))
-    return FaultPlan(
+    plan = FaultPlan(
         drop=chance.choice((0.0, 0.01, 0.1)),
         duplicate=chance.choice((0.0, 0.01, 0.1)),
         reorder=chance.choice((0.0, 0.01, 0.1)),
@@ -207,6 +210,18 @@ def random_plan(seed: int, nodes: Sequence[str], seconds: float) -> FaultPlan:
             node: chance.choice((200, 3.6e6)) * chance.uniform(-1, 1) for node in names if chance.random() < 0.3
         },
         hangs=tuple(hangs),
-        clock_steps=tuple(clock_steps),
         twins=tuple(twins),
     )
+    return replace(plan, clock_steps=_within_half_a_day(clock_steps, plan.skews_ms))
+
+
+def _within_half_a_day(steps: Sequence[ClockStep], skews_ms: Mapping[str, float]) -> tuple[ClockStep, ...]:
+    """Those steps which leave every clock within `MOST_WRONG_S`; others are shortened to that."""
+    wrong_s = {node: skew_ms / 1e3 for node, skew_ms in skews_ms.items()}
+    kept = []
+    for step in sorted(steps, key=lambda each: each.at_s):
+        before_s = wrong_s.get(step.node, 0.0)
+        after_s = max(-MOST_WRONG_S, min(MOST_WRONG_S, before_s + step.by_s))
+        wrong_s[step.node] = after_s
+        kept.append(replace(step, by_s=after_s - before_s))
+    return tuple(kept)
