@@ -17,7 +17,10 @@ from launch_scripts.simulation.worlds import world
 from planner_service.search.target_search import LISTEN_NS
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.clock import NS_PER_S
+from swarm.config.agents import plan_agents
+from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
+from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY
 from swarm.runtime.garbage import collected_rarely
 
 SECONDS = 30.0
@@ -68,13 +71,21 @@ def nodes_of(scenario: Scenario) -> list[str]:
     return [spec.name for spec in processes_of(scenario, SIMULATED_ROLES)]
 
 
+def few_of_layer(scenario: Scenario) -> list[str]:
+    """The nodes of agents that are less than three on the ground, or in the air: right of way of each is its own."""
+    layers: dict[bool, list[str]] = {}
+    for plan in plan_agents(scenario):
+        layers.setdefault(flies(scenario, plan.group.vehicle_class), []).append(f"agent-{plan.id}")
+    return [name for layer in layers.values() if len(layer) < FEWEST_FOR_MAJORITY for name in layer]
+
+
 def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | None = None) -> Verdict:
     """Run a world with all faults of a seed. A service that raises is a broken law, too.
 
     given  the scenario of that name, where it is none of `WORLDS`
     """
     scenario, terrain = world(name, seed) if given is None else _seeded(given, seed)
-    plan = random_plan(seed, nodes_of(scenario), seconds)
+    plan = random_plan(seed, nodes_of(scenario), seconds, few_of_layer(scenario))
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
     began_s = time.perf_counter()
     trial = Trial(simulation)

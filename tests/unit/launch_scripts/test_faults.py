@@ -5,8 +5,10 @@ from __future__ import annotations
 import random
 
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
+from launch_scripts.simulation.trial import few_of_layer, nodes_of
 from shared_map.replication.marks import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
 
 BEGAN_NS = 1_000 * NS_PER_S
 
@@ -114,3 +116,16 @@ def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
     kinds = [[plan.crashes, plan.partitions, plan.hangs, plan.clock_steps, plan.twins] for plan in plans]
     assert any(all(some) for some in kinds)  # everything at once
     assert any(cut.one_way for plan in plans for cut in plan.partitions)
+
+
+def test_agents_that_nobody_can_tell_apart_have_no_second_life():
+    """Of a drone's agent, alone in the air, and of two on the ground no file is noted as the first by a majority."""
+    air = "\n[[classes]]\nname = 'drone'\nair = { speed_m_per_s = 10 }\n[[groups]]\nname = 'drones'\nclass = 'drone'"
+    text = "name = 'x'\n[[groups]]\nname = 'rovers'\nvehicles = 75\n[vehicles]\nper_agent = {}"
+    for per_agent, few in ((25, {"agent-a3"}), (50, {"agent-a0", "agent-a1", "agent-a2"})):
+        scenario = parse_scenario(text.replace("{}", str(per_agent)) + air + "\nvehicles = 1")
+        assert set(few_of_layer(scenario)) == few
+        names = nodes_of(scenario)
+        plans = [random_plan(seed, names, 30, few_of_layer(scenario)) for seed in range(300)]
+        assert not any(twin.node in few for plan in plans for twin in plan.twins)
+        assert any(plan.twins for plan in plans) is (len(few) == 1)
