@@ -16,8 +16,8 @@ RELINK_S = 0.3
 OBSERVER = "recorder-0"
 """The node that writes the report. No fault touches it, or the report would be wrong."""
 MOST_WRONG_S = 11.5 * 3600
-"""No clock is further off, whatever steps come together: marks of a process whose clock is a day ahead of the reader's
-are refused, so of two that are half a day off to either side one would never hold what the other says."""
+"""No clock is further off, whatever steps come together: marks of a process whose clock is a day ahead of the
+reader's are refused, so of two that are half a day off to either side one would never hold what the other says."""
 _NS_PER_MS = 1_000_000
 
 

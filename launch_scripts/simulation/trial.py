@@ -72,7 +72,7 @@ def nodes_of(scenario: Scenario) -> list[str]:
 
 
 def few_of_layer(scenario: Scenario) -> list[str]:
-    """The nodes of agents that are less than three on the ground, or in the air: right of way of each is its own."""
+    """The nodes of agents that are less than three on the ground, or in the air: each has its own right of way."""
     layers: dict[bool, list[str]] = {}
     for plan in plan_agents(scenario):
         layers.setdefault(flies(scenario, plan.group.vehicle_class), []).append(f"agent-{plan.id}")

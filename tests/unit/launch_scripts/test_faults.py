@@ -119,8 +119,10 @@ def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
 
 
 def test_agents_that_nobody_can_tell_apart_have_no_second_life():
-    """Of a drone's agent, alone in the air, and of two on the ground no file is noted as the first by a majority."""
-    air = "\n[[classes]]\nname = 'drone'\nair = { speed_m_per_s = 10 }\n[[groups]]\nname = 'drones'\nclass = 'drone'"
+    """Of a drone's agent, alone in the air, and of two on the ground nobody notes which file is the first."""
+    air = (
+        "\n[[classes]]\nname = 'drone'\nair = { speed_m_per_s = 10 }\n[[groups]]\nname = 'drones'\nclass = 'drone'"
+    )
     text = "name = 'x'\n[[groups]]\nname = 'rovers'\nvehicles = 75\n[vehicles]\nper_agent = {}"
     for per_agent, few in ((25, {"agent-a3"}), (50, {"agent-a0", "agent-a1", "agent-a2"})):
         scenario = parse_scenario(text.replace("{}", str(per_agent)) + air + "\nvehicles = 1")
