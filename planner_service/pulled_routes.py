@@ -56,8 +56,8 @@ class Puller:
         The integral is inf of a route that meets what is shut by now: each of its steps is a segment then.
         """
         many, steps = starts.size, directions.size
-        # What came over the wire, or was put together of single routes, is read-only, and the kernel takes no such.
-        given = tuple(np.require(each, requirements="CW") for each in (starts, directions, ends))
+        # What came over the wire, or was put together of single routes, is read-only, which the kernel refuses.
+        given = tuple(np.require(each, requirements=("C", "W")) for each in (starts, directions, ends))
         longest = int(np.diff(ends, prepend=0).max(initial=0)) + 1
         scratch = (np.empty(longest, np.int64), np.empty((2, longest)), *np.empty((2, longest), np.int64))
         out = np.empty(2 * steps, np.uint8), np.empty(many, np.int64)
