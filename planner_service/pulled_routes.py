@@ -61,12 +61,14 @@ class Puller:
     def pull(
         self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
     ) -> tuple[Pulled, NDArray[np.float64]]:
-        """Routes as in `RouteBatch` -> those pulled, and (3, n) float64: the integral of the pace along each one,
-        and along the route that it was, s; its length, m.
+        """Routes as in `RouteBatch`, read-only or not -> those pulled, and (3, n) float64: the integral of the pace
+        along each one, and along the route that it was, s; its length, m.
 
         The integral is inf of a route that meets what is shut by now: each of its steps is a segment then.
         """
         many, steps = starts.size, directions.size
+        # What came over the wire, or was put together of single routes, is read-only, which the kernel refuses.
+        given = tuple(np.require(each, requirements=("C", "W")) for each in (starts, directions, ends))
         longest = int(np.diff(ends, prepend=0).max(initial=0)) + 1
         scratch = (np.empty(longest, np.int64), np.empty((2, longest)), *np.empty((2, longest), np.int64))
         out = np.empty(2 * steps, np.uint8), np.empty(many, np.int64)
@@ -77,7 +79,7 @@ class Puller:
             self._flight,
             self._offsets,
             self._corners,
-            (starts, directions, ends),
+            given,
             scratch,
             (*out, legs, turned),
             prices,
@@ -89,7 +91,7 @@ class Puller:
         """The same routes along their segments. Costs and bounds stay those of the routes over neighbours."""
         if not routes.directions.size:
             return routes
-        pulled, prices = self.pull(routes.starts, np.ascontiguousarray(routes.directions), routes.ends)
+        pulled, prices = self.pull(routes.starts, routes.directions, routes.ends)
         length_m = np.where(np.isfinite(prices[0]), prices[2], routes.length_m)
         return replace(
             routes,

@@ -44,6 +44,12 @@ def replica_of(node: Node) -> MapReplica | None:
     return replica
 
 
+_ROUTED = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
+"""States of vehicles that have what they need; those that search have a place to look at."""
+_HAS_TO_GO = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.WAITING)
+"""States of vehicles that have somewhere to go, or ask for it."""
+
+
 class Laws:
     """Looks at everything in a simulation that no process could see.
 
@@ -167,7 +173,7 @@ class Waits:
         across_s = self._across_s[node.service.agent.plan.group.vehicle_class]
         for vehicle in node.service.agent.vehicles.values():
             cell, waited_s = self._waited_s.get(vehicle.id, (-1, 0.0))
-            waits = vehicle.state in (VehicleState.FOLLOWING, VehicleState.WAITING)
+            waits = vehicle.state in _HAS_TO_GO
             waits = waits and not node.service.agent.stopped(vehicle.id)
             waited_s = waited_s + counts_s if waits and cell == vehicle.cell else 0.0
             self._waited_s[vehicle.id] = (vehicle.cell, waited_s)
@@ -177,7 +183,8 @@ class Waits:
 
 
 class Routed:
-    """When vehicles have a route, or their target within reach, once nothing goes wrong any more.
+    """When vehicles have a route, to their target or to where they search for it, or their target within reach,
+    once nothing goes wrong any more.
 
     whole_s  when all processes worked for the first time since the quiet began; None until then
     """
@@ -195,7 +202,7 @@ class Routed:
         if self.whole_s is None or not isinstance(node.service, AgentService):
             return
         for vehicle in node.service.agent.vehicles.values():
-            if vehicle.state in (VehicleState.FOLLOWING, VehicleState.ARRIVED):
+            if vehicle.state in _ROUTED:
                 self._at_s.setdefault(vehicle.id, now_s)
 
     def missing(self) -> list[str]:

@@ -9,7 +9,8 @@ from swarm.grid import REGION_CELLS, GridSpec
 
 PLOT_CELLS = REGION_CELLS
 """Side of a plot: that of a region. Messages go by plot, so that smaller ones cost more of them."""
-_MEMBERS = 3
+FEWEST_FOR_MAJORITY = 3
+"""Members of a plot; a layer of fewer agents has one for each plot."""
 
 
 class Plots:
@@ -47,7 +48,7 @@ class Plots:
         self.others = frozenset(others)
         self._first = layer * self.count
         self.all = range(self._first, self._first + self.count)
-        self.majority = 2 if len(self.agents) >= _MEMBERS else 1
+        self.majority = 2 if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
 
     def of(self, cell: int) -> int:
         """The plot of a cell; -1 of a cell outside the grid."""
@@ -60,7 +61,7 @@ class Plots:
         members = self._members.get(plot)
         if members is None:
             by_hash = sorted(self.agents, key=lambda agent: blake2s(f"{plot}/{agent}".encode()).digest())
-            members = self._members[plot] = tuple(by_hash[: _MEMBERS if self.majority > 1 else 1])
+            members = self._members[plot] = tuple(by_hash[: FEWEST_FOR_MAJORITY if self.majority > 1 else 1])
         return members
 
     def warden(self, plot: int, epoch: int) -> str:

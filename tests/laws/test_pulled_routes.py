@@ -122,6 +122,8 @@ def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
     finder = RouteFinder(pace, (0, 0), corner_cutting=corner_cutting, neighbours=neighbours)
     batch = found_batch(finder, pace, random)
     pulled = Puller(pace, 1.0, config).pull_batch(batch)
+    for same in (RouteBatch.of(list(batch)), batch.columns().batch):  # read-only, as those of a search are
+        assert list(Puller(pace, 1.0, config).pull_batch(same)) == list(pulled)
     for before, route in zip(batch, pulled, strict=True):
         assert (route.status, route.start, route.cost_s) == (before.status, before.start, before.cost_s)
         if not before.directions:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import random
 
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
+from launch_scripts.simulation.trial import few_of_layer, nodes_of
+from shared_map.replication.marks import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
 
 BEGAN_NS = 1_000 * NS_PER_S
 
@@ -88,6 +91,15 @@ def test_of_a_one_way_cut_one_side_hears_until_the_lease_ends_the_session():
     assert all(short.delays_ns("b", "a", "x", at(5 + n / 10)) for n in range(20))
 
 
+def far_off(plan: FaultPlan) -> float:
+    """How many seconds two clocks are apart at most."""
+    off = {node: [skew_ms / 1e3] for node, skew_ms in plan.skews_ms.items()}
+    for step in sorted(plan.clock_steps, key=lambda each: each.at_s):
+        off.setdefault(step.node, [0.0]).append(off.get(step.node, [0.0])[-1] + step.by_s)
+    ever = [0.0, *(each for of in off.values() for each in of)]
+    return max(ever) - min(ever)
+
+
 def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
     nodes = ["keeper-0", "planner-t0", "agent-a0", "agent-a1", "agent-a2"]
     assert random_plan(3, nodes, 30) == random_plan(3, nodes[::-1], 30)
@@ -99,7 +111,23 @@ def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
         assert all(hang.until_s <= 18 for hang in plan.hangs)
         assert all(step.at_s < 18 for step in plan.clock_steps)
         assert all(twin.at_s < 18 and twin.node.startswith("agent-") for twin in plan.twins)
+        assert far_off(plan) * NS_PER_S < MAX_AHEAD_NS  # or one refuses what the other says, for good
     assert len({str(plan) for plan in plans[:20]}) == 20
     kinds = [[plan.crashes, plan.partitions, plan.hangs, plan.clock_steps, plan.twins] for plan in plans]
     assert any(all(some) for some in kinds)  # everything at once
     assert any(cut.one_way for plan in plans for cut in plan.partitions)
+
+
+def test_agents_that_nobody_can_tell_apart_have_no_second_life():
+    """Of a drone's agent, alone in the air, and of two on the ground nobody notes which file is the first."""
+    air = (
+        "\n[[classes]]\nname = 'drone'\nair = { speed_m_per_s = 10 }\n[[groups]]\nname = 'drones'\nclass = 'drone'"
+    )
+    text = "name = 'x'\n[[groups]]\nname = 'rovers'\nvehicles = 75\n[vehicles]\nper_agent = {}"
+    for per_agent, few in ((25, {"agent-a3"}), (50, {"agent-a0", "agent-a1", "agent-a2"})):
+        scenario = parse_scenario(text.replace("{}", str(per_agent)) + air + "\nvehicles = 1")
+        assert set(few_of_layer(scenario)) == few
+        names = nodes_of(scenario)
+        plans = [random_plan(seed, names, 30, few_of_layer(scenario)) for seed in range(300)]
+        assert not any(twin.node in few for plan in plans for twin in plan.twins)
+        assert any(plan.twins for plan in plans) is (len(few) == 1)
