@@ -14,8 +14,10 @@ MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
-MODEL_PIECES_NS_PER_CELL = 2
-"""The same of a tree in pieces."""
+MODEL_PIECES_NS_PER_ROW = 5_000
+"""The same of a tree in pieces, for each row of a square map: 4 ms at 512 x 512, 10 at 2048, 16 at 4096."""
+MODEL_CUT = 2
+"""A growth whose tree is cut into pieces takes so many times as long."""
 PIECES_CELLS = 1 << 18
 """Maps of so many cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as by the
 parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
@@ -54,7 +56,9 @@ class GrowthTimes:
         self._grid = grid
         self.full_ns = self.model_ns
         self.in_pieces = grid.cells >= PIECES_CELLS and not climbs
-        self.exact_ns = grid.cells * (MODEL_PIECES_NS_PER_CELL if self.in_pieces else MODEL_EXACT_NS_PER_CELL)
+        self.exact_ns = grid.cells * MODEL_EXACT_NS_PER_CELL
+        if self.in_pieces:
+            self.exact_ns = math.isqrt(grid.cells) * MODEL_PIECES_NS_PER_ROW
         self.row = StrategyRow(OnMove.WHOLE_TREE)
         self.narrowest = 4 << config.k_min
         """How far the narrowest scheduled window reaches, in cells."""
@@ -89,7 +93,9 @@ class GrowthTimes:
         """What a full growth really took; not one that found networks too. A simulation does not call it."""
         median_ns = _median_with(self._full_took_ns, took_ns)
         if not self._exact_took_ns:
-            self.exact_ns = self.exact_ns * median_ns // self.full_ns
+            # The first growth on a large map is of a tree that is cut up: a move is not dearer for that.
+            first = self.in_pieces and len(self._full_took_ns) == 1
+            self.exact_ns = self.exact_ns * median_ns // (self.full_ns * (MODEL_CUT if first else 1))
         self.full_ns = max(1, median_ns)
         self._choose()
 

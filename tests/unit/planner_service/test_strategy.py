@@ -169,6 +169,18 @@ def test_a_strategy_that_fails_is_named_and_trees_stay_exact(answer: object, sai
     assert fault.endswith("this planner keeps exact trees now")
 
 
+@pytest.mark.parametrize("took_ms", [500, 1000, 1500])
+def test_a_first_growth_that_took_long_as_it_was_cut_up_does_not_leave_a_large_tree_to_windows(
+    took_ms: int,
+) -> None:
+    times = GrowthTimes(GridSpec(4096, 4096, 10.0), PlannerConfig(cpu_budget=0.05, tick_hz=5.0), True, False, None)
+    times.observe_full_ns(took_ms * 1_000_000)
+    assert 16e6 < times.exact_ns < 70e6  # measured: 16 to 27 ms where such a growth takes 1,000
+    for tick in range(200):
+        times.note_tick(tick % 16 == 0)
+    assert times.row.on_move is OnMove.EXACT_MOVE
+
+
 def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
     grid = GridSpec(2048, 2048, 10.0)
     for every, stage in ((20, OnMove.EXACT_MOVE), (1, OnMove.SCHEDULED_WINDOW)):
