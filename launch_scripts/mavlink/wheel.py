@@ -50,13 +50,16 @@ class Wheel:
         self._holding = False
         return self._send(self._wanted(beat, height_m), now_ns)
 
-    def hold(self, beat: Beat, now_ns: int) -> Command | None:
-        """The command that lets it stand, where it drives for us."""
+    def hold(self, beat: Beat, now_ns: int, *, last: bool = False) -> Command | None:
+        """The command that lets it stand, where it drives for us.
+
+        last  it is said now, if it was said before or not
+        """
         self._look(beat, now_ns)
         modes = self._kind.modes
         if self.why or not self._taken or modes is None or beat.mode != self.mode or self.mode == modes.hold:
             return None
-        if self._holding and now_ns < self._due_ns:
+        if self._holding and now_ns < self._due_ns and not last:
             return None
         self._holding = self._held = True
         return self._send(self._kind.set_mode(modes.hold), now_ns)

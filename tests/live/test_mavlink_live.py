@@ -20,7 +20,7 @@ from swarm.client import Swarm, connect
 
 pytest.importorskip("mavsdk", reason="mavsdk, an autopilot to speak to, is not installed")
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
-pytestmark = pytest.mark.network
+pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 VEHICLE = Path(__file__).parents[1] / "support" / "mavlink_vehicle.py"
 ROWS, COLS, CELL_M = 60, 80, 30.0
@@ -183,6 +183,21 @@ def test_with_arm_it_drives_to_the_target_and_goes_on_after_either_side_was_kill
         pair.adapter("--target", "t", "--arm", "--id", "rover")
         second.waits_for("^armed 1")
         eventually(lambda: watching.vehicles["rover"].x_m > x_m + 100, 20, "its driving again")
+
+
+def test_when_the_router_dies_that_is_said_and_the_vehicle_is_back_with_the_router(
+    pair: Pair, live: LiveSwarm, swarm: Swarm
+) -> None:
+    pair.vehicle()
+    adapter = pair.adapter("--target", "t", "--id", "rover")
+    adapter.waits_for("the vehicle is in the swarm")
+    os.kill(live.pid_of("router-0"), signal.SIGKILL)
+    adapter.waits_for("the swarm is not heard: its routes are followed no more")
+    adapter.waits_for("the swarm is back")
+    with swarm.observer() as watching:
+        eventually(lambda: "rover" in watching.vehicles, 20, "the rover after the router's death")
+    adapter.process.send_signal(signal.SIGTERM)
+    assert adapter.process.wait(20) == 0, "a signal ends it in order"
 
 
 def test_ground_without_coordinates_is_one_sentence(tmp_path: Path) -> None:
