@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from support.client_rig import run_info
-from support.mavlink_world import FRAME, GRID, START
+from support.mavlink_world import FRAME, GRID, START, TO_THE_EAST
 from support.swarm_model import SwarmModel
 
 from launch_scripts.mavlink.adapter import Wishes
@@ -96,6 +96,23 @@ def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None
     assert rig.bodies[0].id == "mav4"
     assert FRAME.cell(rig.bodies[0].x_m, rig.bodies[0].y_m) == START
     assert rig.link.answered == 2, "who floods is not answered"
+
+
+def test_a_cut_from_the_swarm_ends_setpoints_until_it_is_over() -> None:
+    rig = Rig(Wishes("t0", "guided"))
+    rig.vehicle_says(12, 10)
+    rig.turns(0.1)
+    rig.shell._adapter.hear_way(TO_THE_EAST)
+    rig.turns(0.3)
+    before = len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT"))
+    assert before
+    rig.world.network.link_changed("adapter", False)
+    rig.turns(0.3)
+    assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) == before
+    rig.world.network.link_changed("adapter", True)
+    rig.turns(0.3)
+    assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) > before
+    assert rig.told[-2:] == ["the swarm is not heard: its routes are followed no more", "the swarm is back"]
 
 
 def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error_ends_it() -> None:
