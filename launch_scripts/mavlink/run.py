@@ -90,9 +90,17 @@ class Shell:
     """One turn after the other: what the link and the swarm have brought, then what is due."""
 
     def __init__(
-        self, swarm: Swarm, link: Link, wire: Wire, body: Body, wishes: Wishes, tell: Callable[[str], None]
+        self,
+        swarm: Swarm,
+        link: Link,
+        wire: Wire,
+        body: Body,
+        wishes: Wishes,
+        tell: Callable[[str], None],
+        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._swarm = swarm
+        self._now_ns = now_ns
         self._link = link
         self._wire = wire
         self._body = body
@@ -114,14 +122,14 @@ class Shell:
             if heard:
                 self._link.answer_last()
             for message in heard:
-                self._adapter.hear(message, time.monotonic_ns())
+                self._adapter.hear(message, self._now_ns())
         else:
             time.sleep(_TURN_S / 4)
         self._adapter.hear_swarm(self._swarm.connected)
         if (way := self._newest_way()) is not None:
             self._adapter.hear_way(way)
         failure: SwarmError | None = None
-        for action in self._adapter.tick(time.monotonic_ns()):
+        for action in self._adapter.tick(self._now_ns()):
             try:
                 self._do(action)
             except SwarmError as error:  # what is said to the vehicle is said all the same
@@ -131,7 +139,7 @@ class Shell:
 
     def stop(self) -> None:
         """Let the vehicle stop, as far as that is ours, and take it away."""
-        last = self._adapter.stop(time.monotonic_ns())
+        last = self._adapter.stop(self._now_ns())
         for _ in range(_LAST_WORDS):
             for action in last:
                 self._do(action)

@@ -62,9 +62,16 @@ class Rig:
         bus = self.world.bus("adapter")
         self.session = Session(bus, run_info(GRID), self.world.scheduler.clock)
         self.link = PlayedLink()
+        self.now_ns = 10**12
         self.told: list[str] = []
         self.shell = Shell(
-            Swarm(self.session), self.link, Wire(None, None, time.time()), Body(), wishes, self.told.append
+            Swarm(self.session),
+            self.link,
+            Wire(None, None, time.time()),
+            Body(),
+            wishes,
+            self.told.append,
+            lambda: self.now_ns,
         )
         self._mav = common.MAVLink(None, srcSystem=4, srcComponent=AUTOPILOT)
 
@@ -80,8 +87,8 @@ class Rig:
         self.link.pieces += [bytes(each.pack(self._mav)) for each in (beat, place)]
 
     def turns(self, seconds: float) -> None:
-        until_s = time.monotonic() + seconds
-        while time.monotonic() < until_s:
+        for _ in range(round(seconds / 0.02)):
+            self.now_ns += 20_000_000
             self.shell.turn()
             self.world.run(0.02)
 
@@ -99,7 +106,7 @@ def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None
 
 
 def test_a_cut_from_the_swarm_ends_setpoints_until_it_is_over() -> None:
-    rig = Rig(Wishes("t0", "guided"))
+    rig = Rig(Wishes("t0", "guided", lost_s=60.0))
     rig.vehicle_says(12, 10)
     rig.turns(0.1)
     rig.shell._adapter.hear_way(TO_THE_EAST)
@@ -107,23 +114,25 @@ def test_a_cut_from_the_swarm_ends_setpoints_until_it_is_over() -> None:
     before = len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT"))
     assert before
     rig.world.network.link_changed("adapter", False)
+    rig.world.run(0.1)  # until the client has heard of it
     rig.turns(0.3)
     assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) == before
     rig.world.network.link_changed("adapter", True)
+    rig.world.run(0.1)
     rig.turns(0.3)
     assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) > before
     assert rig.told[-2:] == ["the swarm is not heard: its routes are followed no more", "the swarm is back"]
 
 
 def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error_ends_it() -> None:
-    rig = Rig(Wishes("t0", arm=True))
+    rig = Rig(Wishes("t0", arm=True, lost_s=60.0))
     mission = 4 << 16 | 4 << 24
     rig.vehicle_says(12, 10, mission, base=1 | 128)
     rig.turns(0.1)
     driver = rig.shell._adapter._driver
     assert driver is not None
     assert driver._wheel is not None
-    driver._wheel.drive(rig.shell._adapter._beat, 0.0, time.monotonic_ns())  # type: ignore[arg-type]
+    driver._wheel.drive(rig.shell._adapter._beat, 0.0, rig.now_ns)  # type: ignore[arg-type]
     rig.session.ended = RunMismatchError("run a is over, and run b is in its namespace: connect again")
     rig.vehicle_says(12, 10, mission, base=1 | 128)
     with pytest.raises(RunMismatchError):
