@@ -181,9 +181,11 @@ class Adapter:
         return self._told(actions, now_ns)
 
     def stop(self, now_ns: int) -> list[Action]:
-        """The last words: the vehicle is to stop, and nobody avoids it any more."""
+        """The last words to the vehicle: it is to stop, as nobody avoids it any more."""
         self._swarm_up = False
-        return [each for each in self.tick(now_ns) if not isinstance(each, Report)]
+        if not self._there or self._driver is None or self._beat is None or self._position is None:
+            return []
+        return self._driver.hold(self._beat, self._position, now_ns, last=True)
 
     def _ask_positions(self, now_ns: int) -> list[Action]:
         silent = self._position is None or now_ns - self._position_ns > NS_PER_S

@@ -82,7 +82,7 @@ class Driver:
         place  of the position, in the terrain's frame
         """
         if way is None or not way.points_m:
-            actions = self._hold(beat, position, now_ns)
+            actions = self.hold(beat, position, now_ns)
         else:
             actions = self._drive(way, beat, position, place, now_ns)
         if self._wheel is not None and self._wheel.why and not self._gave_up:
@@ -102,11 +102,15 @@ class Driver:
         command = self._wheel.drive(beat, position.height_m, now_ns) if self._wheel is not None and ready else None
         return actions if command is None else [*actions, command]
 
-    def _hold(self, beat: Beat, position: Position, now_ns: int) -> list[Action]:
+    def hold(self, beat: Beat, position: Position, now_ns: int, *, last: bool = False) -> list[Action]:
+        """What is to be said now so that it stays where it is, as far as that is ours.
+
+        last  nothing is said after it
+        """
         actions: list[Action] = []
         if self._missions is not None:
             actions += self._missions.cancel()
         if self._setpoints is not None:
             actions += self._setpoints.hold(position, now_ns)
-        command = self._wheel.hold(beat, now_ns) if self._wheel is not None else None
+        command = self._wheel.hold(beat, now_ns, last=last) if self._wheel is not None else None
         return actions if command is None else [*actions, command]

@@ -13,7 +13,7 @@ from launch_scripts.mavlink.adapter import Adapter, Wishes
 from launch_scripts.mavlink.link import Address, Link, open_link
 from launch_scripts.mavlink.messages import Action, Follow, Report, Tell, Unfollow, Way, Withdraw
 from launch_scripts.mavlink.wire import Wire, pymavlink
-from swarm.client import ConfigError, Frame, Route, Stream, Swarm, Vehicle
+from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
 
 _TURN_S = 0.02
 _MOST_READ = 200
@@ -72,7 +72,7 @@ def run(
         check_ground(swarm.frame)
         link = open_link(address)
         try:
-            shell = _Shell(swarm, link, Wire(sysid, key, time.time()), body, wishes, tell)
+            shell = Shell(swarm, link, Wire(sysid, key, time.time()), body, wishes, tell)
             tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
             with _interrupts():
                 try:
@@ -86,11 +86,21 @@ def run(
             link.close()
 
 
-class _Shell:
+class Shell:
+    """One turn after the other: what the link and the swarm have brought, then what is due."""
+
     def __init__(
-        self, swarm: Swarm, link: Link, wire: Wire, body: Body, wishes: Wishes, tell: Callable[[str], None]
+        self,
+        swarm: Swarm,
+        link: Link,
+        wire: Wire,
+        body: Body,
+        wishes: Wishes,
+        tell: Callable[[str], None],
+        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._swarm = swarm
+        self._now_ns = now_ns
         self._link = link
         self._wire = wire
         self._body = body
@@ -112,22 +122,27 @@ class _Shell:
             if heard:
                 self._link.answer_last()
             for message in heard:
-                self._adapter.hear(message, time.monotonic_ns())
+                self._adapter.hear(message, self._now_ns())
         else:
             time.sleep(_TURN_S / 4)
         self._adapter.hear_swarm(self._swarm.connected)
         if (way := self._newest_way()) is not None:
             self._adapter.hear_way(way)
-        for action in self._adapter.tick(time.monotonic_ns()):
-            self._do(action)
+        failure: SwarmError | None = None
+        for action in self._adapter.tick(self._now_ns()):
+            try:
+                self._do(action)
+            except SwarmError as error:  # what is said to the vehicle is said all the same
+                failure = error
+        if failure is not None:
+            raise failure
 
     def stop(self) -> None:
         """Let the vehicle stop, as far as that is ours, and take it away."""
-        last = self._adapter.stop(time.monotonic_ns())
+        last = self._adapter.stop(self._now_ns())
         for _ in range(_LAST_WORDS):
             for action in last:
-                if not isinstance(action, Report | Follow | Unfollow | Withdraw | Tell):
-                    self._link.write(self._wire.write(action))
+                self._do(action)
             time.sleep(_TURN_S)
 
     def _newest_way(self) -> Way | None:

@@ -11,6 +11,9 @@ AGAIN_NS = 2 * NS_PER_S
 MOST_COMMANDS = 10
 """In a row without effect. A vehicle that refuses has a reason, which it tells in its own words."""
 
+_MOST_STARTS = 3
+"""Some autopilots begin their mission without, and never answer."""
+
 
 class Wheel:
     """Brings a vehicle into the mode in which it drives for us, armed, and into hold while there is no way.
@@ -28,7 +31,8 @@ class Wheel:
         self.takeoff_m = takeoff_m
         self.why = ""
         self._kind = kind
-        self._starts = starts
+        self._starts_left = _MOST_STARTS if starts else 0
+        """Times that MISSION_START is still said."""
         self._taken = False
         self._holding = False
         """What was commanded last is hold, not driving."""
@@ -46,20 +50,23 @@ class Wheel:
         self._holding = False
         return self._send(self._wanted(beat, height_m), now_ns)
 
-    def hold(self, beat: Beat, now_ns: int) -> Command | None:
-        """The command that lets it stand, where it drives for us."""
+    def hold(self, beat: Beat, now_ns: int, *, last: bool = False) -> Command | None:
+        """The command that lets it stand, where it drives for us.
+
+        last  it is said now, if it was said before or not
+        """
         self._look(beat, now_ns)
         modes = self._kind.modes
         if self.why or not self._taken or modes is None or beat.mode != self.mode or self.mode == modes.hold:
             return None
-        if self._holding and now_ns < self._due_ns:
+        if self._holding and now_ns < self._due_ns and not last:
             return None
         self._holding = self._held = True
         return self._send(self._kind.set_mode(modes.hold), now_ns)
 
     def hear_answered(self, command: int, accepted: bool) -> None:
         if accepted and command == MISSION_START:
-            self._starts = False
+            self._starts_left = 0
         if accepted and command == NAV_TAKEOFF:
             self.takeoff_m = None
 
@@ -92,7 +99,11 @@ class Wheel:
             return Command(NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, self.takeoff_m))
         if self.mode is not None and not drives:
             return self._kind.set_mode(self.mode)
-        return Command(MISSION_START) if self._starts else None
+        if self._starts_left:
+            self._starts_left -= 1
+            self._commands = 0
+            return Command(MISSION_START)
+        return None
 
     def _send(self, command: Command | None, now_ns: int) -> Command | None:
         if command is None:

@@ -352,6 +352,15 @@ def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
     assert world.told()[-1].endswith("it has not obeyed 10 commands")
 
 
+def test_a_vehicle_that_knows_no_start_of_missions_is_told_three_times_and_left_in_peace() -> None:
+    vehicle = Autopilot(0, 0)
+    obey = vehicle._obey
+    vehicle._obey = lambda command, params: 3 if command == MISSION_START else obey(command, params)  # type: ignore[method-assign]
+    world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
+    assert [each.command for each in vehicle.commands].count(MISSION_START) == 3
+    assert not any("left alone" in each for each in world.told())
+
+
 def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() -> None:
     vehicle = Autopilot(PX4)
     world = driving(Wishes("t0", arm=True), vehicle, seconds=10.0)

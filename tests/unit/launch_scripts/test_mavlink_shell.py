@@ -1,0 +1,161 @@
+"""The shell of `swarm mavlink`, turn by turn, between a link that a test plays and a swarm on a memory network."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from support.client_rig import run_info
+from support.mavlink_world import FRAME, GRID, START, TO_THE_EAST
+from support.swarm_model import SwarmModel
+
+from launch_scripts.mavlink.adapter import Wishes
+from launch_scripts.mavlink.run import Body, Shell, check_ground
+from launch_scripts.mavlink.wire import AUTOPILOT, Wire
+from swarm.bus.bus import Heard
+from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
+from swarm.client.session import Session
+from swarm.grid import GridSpec
+from swarm.wire.messages.bodies import Body as BodyMessage
+from swarm.wire.topics import BODY
+
+common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")
+LAT_DEG, LON_DEG = FRAME.to_wgs84(*GRID.centre_m(START))
+
+
+class PlayedLink:
+    """Brings the pieces of a list, or one piece without end, and keeps what is written."""
+
+    whole = True
+
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.flood = b""
+        self.written: list[Any] = []
+        self.answered = 0
+        self._reader = common.MAVLink(None)
+
+    def read(self, within_s: float) -> bytes | None:
+        if self.pieces:
+            return self.pieces.pop(0)
+        return self.flood or None
+
+    def answer_last(self) -> None:
+        self.answered += 1
+
+    def write(self, data: bytes) -> None:
+        self.written += self._reader.parse_buffer(data) or []
+
+    def close(self) -> None:
+        pass
+
+    def heard(self, kind: str) -> list[Any]:
+        return [each for each in self.written if each.get_type() == kind]
+
+
+class Rig:
+    def __init__(self, wishes: Wishes) -> None:
+        self.world = SwarmModel()
+        self.bodies: list[BodyMessage] = []
+        self.world.bus("ear").subscribe(BODY, self._hear)
+        bus = self.world.bus("adapter")
+        self.session = Session(bus, run_info(GRID), self.world.scheduler.clock)
+        self.link = PlayedLink()
+        self.now_ns = 10**12
+        self.told: list[str] = []
+        self.shell = Shell(
+            Swarm(self.session),
+            self.link,
+            Wire(None, None, time.time()),
+            Body(),
+            wishes,
+            self.told.append,
+            lambda: self.now_ns,
+        )
+        self._mav = common.MAVLink(None, srcSystem=4, srcComponent=AUTOPILOT)
+
+    def _hear(self, event: Any) -> None:
+        assert isinstance(event, Heard)
+        assert isinstance(event.message, BodyMessage)
+        self.bodies.append(event.message)
+
+    def vehicle_says(self, autopilot: int, type: int, mode: int = 0, base: int = 1) -> None:
+        beat = common.MAVLink_heartbeat_message(type, autopilot, base, mode, 4, 3)
+        lat, lon = round(LAT_DEG * 1e7), round(LON_DEG * 1e7)
+        place = common.MAVLink_global_position_int_message(0, lat, lon, 0, 0, 0, 0, 0, 0)
+        self.link.pieces += [bytes(each.pack(self._mav)) for each in (beat, place)]
+
+    def turns(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.02)):
+            self.now_ns += 20_000_000
+            self.shell.turn()
+            self.world.run(0.02)
+
+
+def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None:
+    rig = Rig(Wishes())
+    rig.vehicle_says(3, 10)
+    stranger = common.MAVLink(None, srcSystem=9, srcComponent=AUTOPILOT)
+    rig.link.flood = bytes(common.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0).pack(stranger))
+    rig.turns(2.2)
+    assert len(rig.link.heard("HEARTBEAT")) == 3
+    assert rig.bodies[0].id == "mav4"
+    assert FRAME.cell(rig.bodies[0].x_m, rig.bodies[0].y_m) == START
+    assert rig.link.answered == 2, "who floods is not answered"
+
+
+def test_a_cut_from_the_swarm_ends_setpoints_until_it_is_over() -> None:
+    rig = Rig(Wishes("t0", "guided", lost_s=60.0))
+    rig.vehicle_says(12, 10)
+    rig.turns(0.1)
+    rig.shell._adapter.hear_way(TO_THE_EAST)
+    rig.turns(0.3)
+    before = len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT"))
+    assert before
+    rig.world.network.link_changed("adapter", False)
+    rig.world.run(0.1)  # until the client has heard of it
+    rig.turns(0.3)
+    assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) == before
+    rig.world.network.link_changed("adapter", True)
+    rig.world.run(0.1)
+    rig.turns(0.3)
+    assert len(rig.link.heard("SET_POSITION_TARGET_GLOBAL_INT")) > before
+    assert rig.told[-2:] == ["the swarm is not heard: its routes are followed no more", "the swarm is back"]
+
+
+def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error_ends_it() -> None:
+    rig = Rig(Wishes("t0", arm=True, lost_s=60.0))
+    mission = 4 << 16 | 4 << 24
+    rig.vehicle_says(12, 10, mission, base=1 | 128)
+    rig.turns(0.1)
+    driver = rig.shell._adapter._driver
+    assert driver is not None
+    assert driver._wheel is not None
+    driver._wheel.drive(rig.shell._adapter._beat, 0.0, rig.now_ns)  # type: ignore[arg-type]
+    rig.session.ended = RunMismatchError("run a is over, and run b is in its namespace: connect again")
+    rig.vehicle_says(12, 10, mission, base=1 | 128)
+    with pytest.raises(RunMismatchError):
+        rig.turns(1.0)
+    rig.shell.stop()
+    holds = [(each.command, each.param2, each.param3) for each in rig.link.heard("COMMAND_LONG")]
+    assert holds[-3:] == [(176, 4.0, 3.0)] * 3, "nobody answers last words, so they are said three times"
+
+
+def test_what_flies_is_gone_when_its_link_is_lost_and_another_life_when_it_is_back() -> None:
+    rig = Rig(Wishes(lost_s=0.3))
+    rig.vehicle_says(12, 2)
+    rig.turns(0.5)
+    assert rig.bodies[-1].lease_s == 0
+    assert rig.told[-1] == "no heartbeat for 0.3 s: the vehicle is left to its own fail-safe"
+    rig.vehicle_says(12, 2)
+    rig.turns(0.1)
+    assert rig.bodies[-1].lease_s > 0
+    assert rig.bodies[-1].incarnation > rig.bodies[0].incarnation
+
+
+def test_ground_without_coordinates_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match="swarm mavlink needs latitudes and longitudes: this terrain has no coordin"
+    ):
+        check_ground(Frame(GridSpec(9, 9, 10.0)))
