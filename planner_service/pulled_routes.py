@@ -64,28 +64,49 @@ class Puller:
         """Routes as in `RouteBatch`, read-only or not -> those pulled, and (3, n) float64: the integral of the pace
         along each one, and along the route that it was, s; its length, m.
 
-        The integral is inf of a route that meets what is shut by now: each of its steps is a segment then.
+        The integral is inf of a route that meets what is shut by now: each of its steps is a segment then. A route
+        that, pulled, would come to a cell twice is not pulled either: whoever is pushed the same route in that cell
+        would drive the loop again.
         """
         many, steps = starts.size, directions.size
         # What came over the wire, or was put together of single routes, is read-only, which the kernel refuses.
         given = tuple(np.require(each, requirements=("C", "W")) for each in (starts, directions, ends))
+        stays = np.zeros(many, np.bool_)
         longest = int(np.diff(ends, prepend=0).max(initial=0)) + 1
         scratch = (np.empty(longest, np.int64), np.empty((2, longest)), *np.empty((2, longest), np.int64))
         out = np.empty(2 * steps, np.uint8), np.empty(many, np.int64)
         legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
         prices = np.empty((3, many))
-        self._kernel(
-            self._pace,
-            self._flight,
-            self._offsets,
-            self._corners,
-            given,
-            scratch,
-            (*out, legs, turned),
-            prices,
-        )
-        done = int(out[1][-1]) if many else 0
-        return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
+        while True:
+            self._kernel(
+                self._pace,
+                self._flight,
+                self._offsets,
+                self._corners,
+                (*given, stays),
+                scratch,
+                (*out, legs, turned),
+                prices,
+            )
+            done = int(out[1][-1]) if many else 0
+            returns = self._returns(starts, out[0][:done], out[1]) & ~stays
+            if not returns.any():
+                return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
+            stays |= returns
+
+    def _returns(
+        self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """bool (n,): which routes come to a cell twice."""
+        route = np.repeat(np.arange(starts.size), np.diff(ends, prepend=0))
+        moved = np.cumsum(self._offsets[directions])
+        before = np.concatenate((np.zeros(1, np.int64), moved))[np.concatenate((np.zeros(1, np.int64), ends[:-1]))]
+        cells = np.concatenate((starts, starts[route] + moved - before[route]))
+        order = np.lexsort((cells, route := np.concatenate((np.arange(starts.size), route))))
+        cells, route = cells[order], route[order]
+        found = np.zeros(starts.size, np.bool_)
+        found[route[1:][(cells[1:] == cells[:-1]) & (route[1:] == route[:-1])]] = True
+        return found
 
     def pull_batch(self, routes: RouteBatch) -> RouteBatch:
         """The same routes along their segments. Costs and bounds stay those of the routes over neighbours."""

@@ -12,7 +12,8 @@ cells:
         per_metre  float32  (2,)   entries of it per metre of rise, of straight steps and of diagonal ones
         wind       (south, east)   what it blows towards, in air speeds
     offsets    int64    (8,)     of `layout.step_offsets(cols)`
-    routes     (starts int64 (n,), directions uint8 (sum of steps,), ends int64 (n,)), as `RouteBatch`
+    routes     (starts int64 (n,), directions uint8 (sum of steps,), ends int64 (n,)), as `RouteBatch`, and
+               stays bool (n,): those that are not to be pulled
     cells      int64    (m,)     those of one route, neighbours of each other
     costs      float64  (2, m)   in paces times cells, from its first cell to each: along the route, and pulled
     before     int64    (m,)     index of the cell in which the cheapest pulled way to each one turned last
@@ -184,15 +185,15 @@ def _lay_out(cols, start, end, directions, at):
 
 
 @step_kernel(
-    "void(f4[::1], CLIMBS, i8[::1], i8, Tuple((i8[::1], u1[::1], i8[::1])), "
+    "void(f4[::1], CLIMBS, i8[::1], i8, Tuple((i8[::1], u1[::1], i8[::1], b1[::1])), "
     "Tuple((i8[::1], f8[:, ::1], i8[::1], i8[::1])), Tuple((u1[::1], i8[::1], u4[::1], i8[::1])), f8[:, ::1])",
     _FLIGHT,
 )
 def pull_routes(pace, flight, offsets, corners, routes, scratch, pulled, prices):
-    """Write `pulled` and `prices`. A route that meets a lethal cell costs inf and stays as it is, each step a
-    segment."""
+    """Write `pulled` and `prices`. A route that is not to be pulled stays as it is, each step a segment; so does
+    one that meets a lethal cell, which costs inf."""
     cols = offsets[4]
-    starts, directions, ends = routes
+    starts, directions, ends, stays = routes
     cells, costs, _, turns = scratch
     out, out_ends, legs, many_legs = pulled
     at = many = 0
@@ -206,9 +207,11 @@ def pull_routes(pace, flight, offsets, corners, routes, scratch, pulled, prices)
         if size > 1:
             count = _pull(pace, flight, cols, corners, scratch, size)
             prices[0, n], prices[1, n] = costs[1, size - 1], costs[0, size - 1]
-            if prices[0, n] == np.inf:
+            if prices[0, n] == np.inf or stays[n]:
+                prices[0, n] = prices[1, n]
                 for i in range(size - 1):
                     out[at + i], legs[many + i] = directions[begin + i], 1
+                    prices[2, n] += math.sqrt(2.0) if directions[begin + i] & 1 else 1.0
                 at, many = at + size - 1, many + size - 1
                 count = 0
             first = 0  # of the segment that is under way, as an index into `turns`

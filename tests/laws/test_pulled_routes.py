@@ -132,12 +132,35 @@ def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
         cells = [divmod(cell, pace.shape[1]) for cell in walk(finder.grid, route.start, route.directions)]
         legs = [(cells[a], cells[b], cells[a : b + 1]) for a, b in itertools.pairwise(route.turns)]
         assert cells[-1] == (0, 0)
+        assert len(set(cells)) == len(cells)
         assert neighbours == 8 or all(abs(a - c) + abs(b - d) == 1 for (a, b), (c, d) in itertools.pairwise(cells))
         for start, end, along in legs:
             assert along == [cell for cell, _ in crossed(start, end)[0]]
             assert math.isfinite(twin_cost_s(pace, start, end, corner_cutting))
         assert route.length_m == pytest.approx(sum(math.dist(a, b) for a, b, _ in legs), rel=1e-12)
     assert encode_again(pulled) == list(pulled)
+
+
+def test_a_route_that_would_come_back_to_a_cell_is_not_pulled() -> None:
+    """From the cell below the start a segment leads back over the start; whoever is pushed a route there begins
+    the same loop again."""
+    pace = np.array(
+        [[1, 92.7, 3.2], [58.4, 12.9, 1.4], [10.3, 0.01, 17], [2.7, 6.4, 0.01], [0.1, 8.6, 0.01], [0.2, 0.9, 2.4]],
+        np.float32,
+    )
+    finder = RouteFinder(pace, (0, 0), resolution_m=2.0, neighbours=4)
+    batch = finder._tree.routes([11, 5])  # (3, 2), and one above it
+    one, other = Puller(pace, 2.0, PlannerConfig(neighbours=4)).pull_batch(batch)
+    assert one.directions == batch[0].directions
+    assert one.turns == tuple(range(len(one.directions) + 1))
+    assert one.length_m == batch[0].length_m
+    cells = walk(finder.grid, other.start, other.directions)
+    assert len(set(cells)) == len(cells)
+    route = finder.route(3, 2)
+    pulled = finder.pull(route)
+    assert pulled.turns.tolist() == route.cells.tolist()
+    assert pulled.cost_s == pulled.grid_cost_s
+    assert pulled.length_m == route.length_m
 
 
 def encode_again(batch: RouteBatch) -> list[Route]:
