@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,10 +17,15 @@ from support.live_swarm import SWARM, LiveSwarm
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
+from launch_scripts.bench.wire.remote import Far
+from launch_scripts.bench.wire.ros2_gateway import swarm_peer
+from launch_scripts.ports import free_ports
 from launch_scripts.ros2.graph import Attachment, Qos
 from launch_scripts.ros2.node import Node, close_ros, open_ros
 from launch_scripts.ros2.topics import ROWS
 from launch_scripts.ros2.types import Distribution, types_of
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.scenario import NetworkConfig
 
 pytestmark = pytest.mark.network
 
@@ -30,11 +36,15 @@ NEW_MARKS = "map_updates"
 
 @dataclass
 class Gateway:
-    """A gateway at a router of the ROS side, and the swarm behind it."""
+    """A gateway at a router of the ROS side, and the swarm behind it.
 
-    swarm: LiveSwarm
+    swarm  endpoint of its router
+    """
+
+    swarm: str
     port: int
     folder: Path
+    runs: Path
 
     @property
     def endpoint(self) -> str:
@@ -43,8 +53,8 @@ class Gateway:
     def start(self, *options: str) -> subprocess.Popen[str]:
         with (self.folder / "ros2.log").open("w") as log:
             return subprocess.Popen(
-                [*SWARM, "ros2", "--connect", self.swarm.endpoint, "--ros", self.endpoint,
-                 "--runs", str(self.swarm.runs), *options],
+                [*SWARM, "ros2", "--connect", self.swarm, "--ros", self.endpoint,
+                 "--runs", str(self.runs), *options],
                 stdout=log, stderr=log, text=True,
             )  # fmt: skip
 
@@ -66,7 +76,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
 @pytest.fixture(scope="module")
 def gateway(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     with ros_router() as port:
-        yield Gateway(live, port, tmp_path_factory.mktemp("ros"))
+        yield Gateway(live.endpoint, port, tmp_path_factory.mktemp("ros"), live.runs)
 
 
 @pytest.fixture
@@ -202,10 +212,51 @@ def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> 
     assert process.wait(20) == 0, gateway.said
     assert "Traceback" not in gateway.said
     alone = subprocess.run(
-        [*SWARM, "ros2", "--connect", gateway.swarm.endpoint, "--ros", "tcp/127.0.0.1:9"],
+        [*SWARM, "ros2", "--connect", gateway.swarm, "--ros", "tcp/127.0.0.1:9"],
         capture_output=True, text=True, timeout=30, check=False,
     )  # fmt: skip
     assert alone.returncode == 4
     assert alone.stderr == (
         "swarm: no router of the ROS side listens at tcp/127.0.0.1:9: start rmw_zenohd, or name it by --ros\n"
     )
+
+
+def poses_heard(port: int, within_s: float) -> None:
+    """Waits until a node at this router hears where vehicles are."""
+    session = open_ros(f"tcp/127.0.0.1:{port}")
+    try:
+        heard: list[object] = []
+        Node(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, heard.append)
+        eventually(lambda: heard, within_s, "poses of vehicles")
+    finally:
+        close_ros(session)
+
+
+@contextmanager
+def made_up_swarm(network: NetworkConfig, run_id: str) -> Iterator[None]:
+    """A router, and agents with 25 vehicles."""
+    with open_bus(network, mode="router"), Far(network) as far:
+        far.start(swarm_peer, 25, 90.0, run_id)
+        yield
+
+
+def test_either_side_may_go_and_come_back_and_the_next_run_is_told_as_well(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    with ExitStack() as ends:
+        with made_up_swarm(network, "first"):
+            with ros_router() as port:
+                gateway = Gateway(endpoint, port, tmp_path, tmp_path)
+                process = gateway.start("--namespace", "bench")
+                ends.callback(process.wait, 10)
+                ends.callback(process.kill)
+                poses_heard(port, 40)
+            eventually(lambda: "the ROS router" in gateway.said, 15, "the word about the router that is gone")
+            with ros_router(port):
+                poses_heard(port, 20)
+        ends.enter_context(ros_router(port))
+        ends.enter_context(made_up_swarm(network, "second"))
+        eventually(lambda: "run second" in gateway.said, 40, "the next run")
+        poses_heard(port, 20)
+        assert process.poll() is None, gateway.said
+        assert "Traceback" not in gateway.said

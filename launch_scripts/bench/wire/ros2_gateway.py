@@ -39,12 +39,14 @@ _WARM_S = 3.0
 _START_S = 60.0
 
 
-def swarm_peer(network: NetworkConfig, pipe: Connection, vehicles: int, seconds: float) -> None:
+def swarm_peer(
+    network: NetworkConfig, pipe: Connection, vehicles: int, seconds: float, run_id: str = "bench"
+) -> None:
     """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, for so long.
     Answers which run it is."""
     inbox, now_ns = Inbox(), time.time_ns()
     info = RunInfo(
-        run_id="bench", role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
+        run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
         cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=GRID.west_m, north_m=GRID.north_m,
     )  # fmt: skip
     with open_bus(network) as bus:
