@@ -127,6 +127,29 @@ def ros2_gateway(
 
 
 @app.command()
+def ros2(
+    questions: Annotated[int, typer.Option(min=10, help="Questions and goals of each kind.")] = 200,
+    seconds: Annotated[float, typer.Option(min=1, help="How long ROS floods, and is quiet, in each round.")] = 4.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of flood and quiet.")] = 5,
+    hz: Annotated[int, typer.Option(min=100, help="Messages a second of the flood.")] = 5000,
+    as_json: AsJson = False,
+) -> None:
+    """Plans for clients of ROS beside the swarm's own queries, and those while ROS floods the gateway. A minute.
+
+    \b
+    swarm bench ros2
+
+    Two routers, three planners of 512 x 512 cells, the gateway's part and the flood are processes of their own on
+    this machine. ROS and the swarm's own take turns: look at the ratios.
+    """
+    from launch_scripts.bench.wire.ros2 import run, tables
+
+    with progress_of("ros2") as progress:
+        report = run(questions, seconds, rounds, hz, progress)
+    show(report, as_json, tables)
+
+
+@app.command()
 def compaction(
     lives: Annotated[int, typer.Option(min=1, help="Lives of one agent, each with 100 writes.")] = 200,
     seed: Seed = 1,

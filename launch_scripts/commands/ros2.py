@@ -54,7 +54,10 @@ def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
 
 def list_topics(settings: Settings, *, as_json: bool) -> None:
     """Print what is forwarded."""
-    rows = settings.rows()
+    from launch_scripts.ros2.incoming.table import incoming_rows
+
+    rows = list(settings.rows())
+    rows += incoming_rows(settings.incoming, has_map=any(row.name == "map" for row in rows))
     if as_json:
         told = [
             {"name": row.name, "topic": row.topic, "type": row.type_name, "qos": row.qos.name.lower(),

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from launch_scripts.reference.scenario_page import sections
+from launch_scripts.ros2.incoming.table import EXAMPLE, incoming_rows
 from launch_scripts.ros2.settings import Settings
-from launch_scripts.ros2.topics import TABLE
+from launch_scripts.ros2.topics import TABLE, TopicRow
 
 PATH = Path(__file__).parents[2] / "docs" / "reference" / "ros2.md"
 
@@ -21,6 +22,15 @@ Nothing else crosses. `{vehicle}` and `{target}` stand for each one's id, in whi
 `_` becomes `_`: `a0-07` is `/a0_07/odom`.
 
 | name in settings | topic | type | quality of service | rate | what it tells |
+|---|---|---|---|---|---|
+"""
+_INCOMING = """
+## What may come in
+
+Nothing does unless `[incoming]` below names it. Names are those that topics have unless settings say otherwise;
+`{robot}` stands for a robot's name, `ID` for a target's.
+
+| what | topic or service | type | way | at most | what it does |
 |---|---|---|---|---|---|
 """
 _SETTINGS = """
@@ -41,4 +51,13 @@ def document() -> str:
         f"{'on change' if row.hz is None else f'{row.hz:g} Hz'} | {row.says} |"
         for row in TABLE
     ]
-    return _HEAD + "\n".join(rows) + "\n" + _SETTINGS + "\n" + "\n".join(sections(Settings))
+    incoming = [
+        f"| {row.name} | `{row.topic}` | `{row.type_name}` | {row.direction} | {_rate(row)} | {row.says} |"
+        for row in incoming_rows(EXAMPLE, has_map=True)
+    ]
+    tables = "\n".join([*rows, _INCOMING.rstrip("\n"), *incoming])
+    return _HEAD + tables + "\n" + _SETTINGS + "\n" + "\n".join(sections(Settings))
+
+
+def _rate(row: TopicRow) -> str:
+    return "" if row.hz is None else f"{row.hz:g} Hz"

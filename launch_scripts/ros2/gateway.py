@@ -6,11 +6,12 @@ Each topic of the table has its rate; what comes late is left out, never made up
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 from launch_scripts.ros2.actions import Action, Channel, Declare, Put
 from launch_scripts.ros2.diagnostics import Health, diagnostics_of
 from launch_scripts.ros2.frames import RosMap
+from launch_scripts.ros2.grids import occupancy_grid
 from launch_scripts.ros2.map_feed import MapFeed
 from launch_scripts.ros2.map_topics import MapTopics
 from launch_scripts.ros2.messages import RosMessages
@@ -70,6 +71,10 @@ class Gateway:
     def due_ns(self) -> int:
         """When `tick` has something to do again."""
         return min(self._due_ns.values(), default=0)
+
+    def whole_map(self, now_ns: int) -> Any:
+        """nav_msgs/OccupancyGrid of the map as it is known now."""
+        return occupancy_grid(self._messages, now_ns, self._feed.occupancy(self._feed.grid.window))
 
     def take_problems(self) -> list[str]:
         """Sentences for people since the last call."""

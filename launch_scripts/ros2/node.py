@@ -9,8 +9,9 @@ import itertools
 import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import zenoh
@@ -18,7 +19,7 @@ from zenoh import ext
 from zenoh.handlers import Callback
 
 from launch_scripts.ros2.graph import Attachment, Endpoint, Kind, NodeName, Qos, SeenEndpoint, read_token
-from launch_scripts.ros2.types import REQUEST, RESPONSE, RosTypes
+from launch_scripts.ros2.types import LARGEST_MESSAGE_BYTES, REQUEST, RESPONSE, RosTypes
 from swarm.errors import BusError, ProtocolError
 
 log = logging.getLogger(__name__)
@@ -46,6 +47,46 @@ class Publisher:
             self._put(content, attachment=attachment.packed())
         except zenoh.ZError as error:
             raise BusError(f"{self.endpoint.topic} is not put: {error}") from error
+
+
+class Newest:
+    """What came last on a topic and was not taken yet. Made by `Node.newest`.
+
+    heard  how many messages have come, taken or not
+    wake   called on Zenoh's thread with each; None at first
+    """
+
+    def __init__(self, node: Node, endpoint: Endpoint, most_bytes: int) -> None:
+        self.endpoint = endpoint
+        self.heard = 0
+        self.wake: Callable[[], None] | None = None
+        self._node, self._most_bytes = node, most_bytes
+        self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
+
+    def keep(self, sample: zenoh.Sample) -> None:
+        """On Zenoh's threads: keeps the bytes as they are."""
+        self.heard += 1
+        self._waiting.append(sample)
+        if self.wake is not None:
+            self.wake()
+
+    def take(self) -> Any | None:
+        """The newest message, once; None if none has come, or it is none of its type."""
+        try:
+            payload = self._waiting.pop().payload
+        except IndexError:
+            return None
+        try:
+            if len(payload) > self._most_bytes:
+                raise ProtocolError(f"message of {len(payload)} bytes, expected at most {self._most_bytes}")
+            return self._node.types.unpack(payload.to_bytes(), self.endpoint.type_name)
+        except ProtocolError as error:
+            self._node.dropped(self.endpoint.topic, error)
+            return None
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._node.remove(self.endpoint)
 
 
 class Node:
@@ -102,27 +143,48 @@ class Node:
             try:
                 hear(self.types.unpack(sample.payload.to_bytes(), type_name))
             except ProtocolError as error:
-                self._dropped(topic, error)
+                self.dropped(topic, error)
 
+        self._listen(endpoint, qos, take)
+        return endpoint
+
+    def newest(
+        self,
+        topic: str,
+        type_name: str,
+        qos: Qos = Qos.DEFAULT,
+        most_bytes: int = LARGEST_MESSAGE_BYTES,
+    ) -> Newest:
+        """Subscribe, and keep only what came last until it is taken: a flood costs no more than one message."""
+        endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
+        newest = Newest(self, endpoint, most_bytes)
+        self._listen(endpoint, qos, newest.keep)
+        return newest
+
+    def _listen(self, endpoint: Endpoint, qos: Qos, take: Callable[[zenoh.Sample], None]) -> None:
         made: Any
+        # What this node puts itself is not for it: a topic may go both ways.
         if qos.latched:
             made = ext.declare_advanced_subscriber(
                 self._session,
                 endpoint.key,
                 take,
+                allowed_origin=zenoh.Locality.REMOTE,
                 history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
                 recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 subscriber_detection=True,
             )
         else:
-            made = self._session.declare_subscriber(endpoint.key, take)
+            made = self._session.declare_subscriber(endpoint.key, take, allowed_origin=zenoh.Locality.REMOTE)
         self._declare(endpoint, made)
-        return endpoint
 
     def serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> Endpoint:
-        """Answer a service. `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is
-        called once, then or later, on any thread. A client of ROS waits for ever for what is never answered, so
-        errors go into the response."""
+        """Answer a service.
+
+        `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is called once, then or
+        later, on any thread, with a response or its CDR. A client of ROS waits for ever for what is never answered,
+        so errors go into the response.
+        """
         endpoint = self._endpoint(Kind.SERVICE, name, type_name, Qos.DEFAULT)
 
         def take(query: zenoh.Query) -> None:
@@ -131,15 +193,15 @@ class Node:
                 content = query.payload.to_bytes() if query.payload else b""
                 request = self.types.unpack(content, type_name + REQUEST)
             except ProtocolError as error:
-                self._dropped(name, error)
+                self.dropped(name, error)
                 return
 
             def reply(response: Any) -> None:
                 attachment = Attachment(asked.sequence, time.time_ns(), asked.gid).packed()
-                with query:
-                    query.reply(
-                        endpoint.key, self.types.pack(response, type_name + RESPONSE), attachment=attachment
-                    )
+                packed = isinstance(response, bytes)
+                content = response if packed else self.types.pack(response, type_name + RESPONSE)
+                with query, suppress(zenoh.ZError):  # the session may be closed, or the link cut
+                    query.reply(endpoint.key, content, attachment=attachment)
 
             answer(request, reply)
 
@@ -176,7 +238,7 @@ class Node:
             try:
                 endpoint = read_token(str(sample.key_expr))
             except ProtocolError as error:
-                self._dropped("tokens", error)
+                self.dropped("tokens", error)
                 return
             if endpoint is not None and endpoint.zid != self.name.zid:
                 seen(endpoint, sample.kind == zenoh.SampleKind.PUT)
@@ -210,7 +272,8 @@ class Node:
         with self._lock:
             self._declared[endpoint] = [each for each in (token, made) if each is not None]
 
-    def _dropped(self, topic: str, error: ProtocolError) -> None:
+    def dropped(self, topic: str, error: ProtocolError) -> None:
+        """Count what is none of its type."""
         self.counts["dropped"] += 1
         log.debug("%s: %s", topic, error)
 

@@ -9,14 +9,16 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from launch_scripts.ros2.actions import Action, Channel, Declare, Put, Remove
 from launch_scripts.ros2.diagnostics import Health
 from launch_scripts.ros2.frames import RosMap
-from launch_scripts.ros2.gateway import Gateway
+from launch_scripts.ros2.gateway import Gateway, View
 from launch_scripts.ros2.graph import SeenEndpoint
+from launch_scripts.ros2.incoming.incoming import TICK_S, Incoming
+from launch_scripts.ros2.incoming.settings import IncomingSettings
 from launch_scripts.ros2.map_feed import MapFeed
 from launch_scripts.ros2.node import Node, Publisher, RosSession, close_ros, open_ros
 from launch_scripts.ros2.peers import PeerWatch
@@ -27,8 +29,10 @@ from launch_scripts.ros2.types import Distribution, types_of
 from launch_scripts.ros2.vehicle_topics import ToWgs84
 from swarm.client import Observer, Swarm, SwarmError, connect
 from swarm.client.frame import Frame
+from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ConfigError
+from swarm.wire.messages.marks import MarkSet
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +60,28 @@ class Sides:
 
     def up(self, side: str) -> bool:
         return self._up[side]
+
+
+class WithoutRobots:
+    """What an observer sees, without the robots of ROS: these tell ROS themselves where they are."""
+
+    def __init__(self, view: View, incoming: Incoming) -> None:
+        self._view, self._incoming = view, incoming
+
+    @property
+    def vehicles(self) -> Mapping[str, SeenVehicle]:
+        robots = self._incoming.robots
+        return {id: each for id, each in self._view.vehicles.items() if id not in robots}
+
+    @property
+    def targets(self) -> Mapping[str, SeenTarget]:
+        return self._view.targets
+
+    def take_routes(self) -> Mapping[str, list[tuple[float, float]]]:
+        return self._view.take_routes()
+
+    def take_mark_sets(self) -> list[MarkSet]:
+        return self._view.take_mark_sets()
 
 
 class RosOut:
@@ -151,9 +177,23 @@ class Ros2Service:
                     f"node /{settings.ros.node} in domain {settings.ros.domain} at {settings.ros.endpoint}, "
                     f"{settings.ros.distribution}; run {swarm.run_id}, scenario {swarm.scenario}"
                 )
-                _Loop(self, node, swarm, observer, gateway, self._say).run(until_s)
+                incoming = self._incoming(node, swarm, gateway)
+                try:
+                    _Loop(self, node, swarm, observer, gateway, incoming, self._say).run(until_s)
+                finally:
+                    if incoming is not None:
+                        incoming.close()
         finally:
             node.close()
+
+    def _incoming(self, node: Node, swarm: Swarm, gateway: Gateway) -> Incoming | None:
+        settings = self._settings
+        if settings.incoming == IncomingSettings():
+            return None
+        map = RosMap(swarm.frame.grid, settings.frames.map)
+        has_map = any(row.name == "map" for row in settings.rows())
+        map_now = (lambda: gateway.whole_map(time.time_ns())) if has_map else None
+        return Incoming(node, swarm, settings.incoming, map, map_now)
 
     def _gateway(self, swarm: Swarm) -> Gateway:
         settings, grid = self._settings, swarm.frame.grid
@@ -191,10 +231,18 @@ class _Loop:
     """One run's turns, on one thread."""
 
     def __init__(
-        self, service: Ros2Service, node: Node, swarm: Swarm, observer: Observer, gateway: Gateway, say: Say
+        self,
+        service: Ros2Service,
+        node: Node,
+        swarm: Swarm,
+        observer: Observer,
+        gateway: Gateway,
+        incoming: Incoming | None,
+        say: Say,
     ) -> None:
         self._where = service.where
-        self._node, self._swarm, self._observer, self._gateway = node, swarm, observer, gateway
+        self._node, self._swarm, self._gateway, self._incoming = node, swarm, gateway, incoming
+        self._view: View = observer if incoming is None else WithoutRobots(observer, incoming)
         self._say = say
         self._sides = Sides(say)
         self._out = RosOut(node)
@@ -209,11 +257,14 @@ class _Loop:
                 self._look_due_s = time.monotonic() + _LOOK_S
                 self._look()
             now_ns = time.time_ns()
-            for action in self._gateway.tick(now_ns, self._swarm.now_ns, self._observer, self._health()):
+            for action in self._gateway.tick(now_ns, self._swarm.now_ns, self._view, self._health()):
                 self._out.perform(action)
             self._tell()
             due_s = (self._gateway.due_ns - time.time_ns()) / 1e9
-            time.sleep(min(max(due_s, 0.001), _LONGEST_SLEEP_S))
+            if self._incoming is not None:
+                self._incoming.tick(time.monotonic_ns())
+            longest_s = _LONGEST_SLEEP_S if self._incoming is None else TICK_S
+            time.sleep(min(max(due_s, 0.001), longest_s))
 
     def _look(self) -> None:
         swarm_at, ros_at = self._where
@@ -227,6 +278,7 @@ class _Loop:
             **self._out.counts,
             **self._node.counts,
             **{f"swarm_{k}": v for k, v in self._swarm.counts.items()},
+            **({} if self._incoming is None else {f"from_ros_{k}": v for k, v in self._incoming.counts.items()}),
         }
         return Health(self._swarm.run_id, self._sides.up("swarm"), self._sides.up("ROS"), counts)
 

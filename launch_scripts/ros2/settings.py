@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from launch_scripts.ros2.incoming.settings import IncomingSettings, check_incoming
 from launch_scripts.ros2.topics import ROWS, TARGET, VEHICLE, TopicRow
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, read_text
@@ -93,6 +94,7 @@ class Settings(Section, frozen=True, kw_only=True):
     vehicles  ids of vehicles that ROS hears of, with * and ?
     forward   names of topics of the table that are forwarded; empty: all
     topics    what is changed of topics of the table, by name
+    incoming  what may come in from ROS; nothing unless it is named
     """
 
     vehicles: tuple[str, ...] = ("*",)
@@ -101,6 +103,7 @@ class Settings(Section, frozen=True, kw_only=True):
     frames: Frames = Frames()
     swarm: SwarmSide = SwarmSide()
     topics: dict[str, TopicSettings] = msgspec.field(default_factory=dict)
+    incoming: IncomingSettings = IncomingSettings()
 
     def rows(self) -> tuple[TopicRow, ...]:
         """The topics that are forwarded, as these settings have them."""
@@ -147,6 +150,7 @@ def check(settings: Settings, source: str = "settings") -> None:
     topics = [row.topic for row in settings.rows()]
     if doubled := next((topic for topic in topics if topics.count(topic) > 1), None):
         raise ConfigError(f"{source}: topics: two topics are called {doubled}; rename one")
+    check_incoming(settings.incoming, f"{source}: incoming")
     check_ros_endpoint(settings.ros, f"{source}: ros.endpoint")
 
 

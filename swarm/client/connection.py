@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,8 @@ from swarm.client.frame import Frame
 from swarm.client.observer import EVERY_S, Observer
 from swarm.client.orders import Orders
 from swarm.client.right_of_way import RightOfWay
+from swarm.client.route import Route
+from swarm.client.route_question import ask_route
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
@@ -155,6 +158,15 @@ class Swarm:
         lease_s  the target counts as lost, or as the next tracker's, so long after the last word
         """
         return Target(self._session, id, tracker, lease_s)
+
+    def route_soon(
+        self, target: str, x_m: float, y_m: float, *, vehicle_class: str = GROUND, timeout_s: float = 5.0
+    ) -> Future[Route]:
+        """The best route to a target from any place, without waiting and without a vehicle.
+
+        Its failure is a BusError. Raises ConfigError on a place outside the terrain.
+        """
+        return ask_route(self._session, target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
     def orders(self) -> Orders:
         """Orders to the swarm: pause, close areas, add targets ... With certificates for `operator.NAME` only."""

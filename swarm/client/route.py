@@ -31,6 +31,7 @@ class Route:
     remaining_s    cost-to-go from the last cell; 0 if that is the target's
     pose_age_s     how long ago the target was heard of, when the planner answered; None if it does not say
     tracker_lost   nobody tracks the target now: it was there, and may be anywhere
+    target_cell    cell of the target that the planner went by: a target that has just moved may be elsewhere by now
     """
 
     frame: Frame
@@ -43,6 +44,7 @@ class Route:
     pose_age_s: float | None = None
     tracker_lost: bool = False
     turns: tuple[int, ...] = ()
+    target_cell: int | None = None
 
     @classmethod
     def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
@@ -57,7 +59,7 @@ class Route:
         age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
         return cls(
             frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
-            age_s, lost, turns,
+            age_s, lost, turns, reply.target_cell,
         )  # fmt: skip
 
     @property

@@ -13,11 +13,12 @@ from swarm.client.frame import checked_cells, number
 from swarm.client.own_marks import OwnMarks
 from swarm.client.right_of_way import RightOfWay
 from swarm.client.route import Route
+from swarm.client.route_question import ask_route, check_target
 from swarm.client.session import Session
 from swarm.client.stream import Stream
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.errors import BusError, ConfigError
+from swarm.errors import ConfigError
 from swarm.wire.fields import check_id
 from swarm.wire.messages.bodies import LONGEST_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
 from swarm.wire.messages.marks import MarkSet, MarksRequest
@@ -188,25 +189,7 @@ class Vehicle:
 
     def route_soon(self, target: str, timeout_s: float = _TIMEOUT_S) -> Future[Route]:
         """As `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
-        session = self._session
-        _check_target(session, target)
-        request = RouteRequest(cells=[self.cell], vehicle_class=self.vehicle_class)
-        asked = session.ask(ROUTE, request, timeout_s, target=target)
-        found: Future[Route] = Future()
-
-        def finish(done: Future[list[Any]]) -> None:
-            error = done.exception()
-            if error is not None:
-                found.set_exception(BusError(f"no route to {target!r}: {error}"))
-                return
-            reply: RouteReply = done.result()[0]
-            try:
-                found.set_result(Route.of(session.frame, reply.routes[0], reply))
-            except (ValueError, IndexError) as error:
-                found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
-
-        asked.add_done_callback(finish)
-        return found
+        return ask_route(self._session, target, self.cell, self.vehicle_class, timeout_s)
 
     def follow(self, target: str) -> Stream[Route]:
         """Routes to a target from now on: the first one, and a newer one whenever the target moves, the map changes
@@ -214,7 +197,7 @@ class Vehicle:
         session = self._session
         with session.lock:
             session.check_open()
-            _check_target(session, target)
+            check_target(session, target)
             _ = self.cell
             self.unfollow()
             self._target, self._ask_due_ns = target, 0
@@ -400,10 +383,3 @@ class Vehicle:
                 session.bus.unserve(MARKS, author=self._marks.author)
                 session.bus.unsubscribe(MARKS, author=self._marks.author)
             session.remove(self)
-
-
-def _check_target(session: Session, target: str) -> None:
-    try:
-        check_id("target", target)
-    except ValueError as error:
-        raise session.refused(str(error)) from error

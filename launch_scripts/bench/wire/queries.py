@@ -42,7 +42,7 @@ _SESSIONS = 10
 # --- path queries -------------------------------------------------------------------------------------------
 
 
-def planner_peer(network: NetworkConfig, pipe: Connection) -> None:
+def planner_peer(network: NetworkConfig, pipe: Connection, target: str = _TARGET) -> None:
     """A planner on level terrain of 512 x 512 cells, and a raw queryable which answers with given bytes."""
     from planner_service.kernel_build import load_all
     from planner_service.service import PlannerService
@@ -50,8 +50,8 @@ def planner_peer(network: NetworkConfig, pipe: Connection) -> None:
     load_all()
     clock, inbox = MonotonicClock(), Inbox()
     terrain = terrain_of_pace(np.random.default_rng(1).uniform(0.1, 1.0, (_SIDE, _SIDE)).astype(np.float32))
-    scenario = Scenario(network=network, targets=(TargetConfig(name=_TARGET),))
-    setup = RoleSetup(scenario, "bench", "planner", _TARGET, time.time_ns(), time.time_ns())
+    scenario = Scenario(network=network, targets=(TargetConfig(name=target),))
+    setup = RoleSetup(scenario, "bench", "planner", target, time.time_ns(), time.time_ns())
     with open_bus(network) as bus, closing(ThreadWorker("grow-tree", inbox)) as worker:
         service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
         payloads: list[bytes] = []

@@ -166,6 +166,16 @@ def test_a_route_is_the_planners_and_costs_what_it_says(world: Swarm) -> None:
     wire = WireRoute(status=RouteStatus.OK, start=route.cells[0], directions=directions, cost_s=1.0)
     assert driven_s(world.pace, wire) == pytest.approx(route.cost_s, rel=1e-4)
     assert 0 < route.lower_bound_s <= route.cost_s * 1.0001
+    assert route.target_cell == GRID.cell(5, 40)
+
+
+def test_a_route_from_anywhere_needs_no_vehicle(world: Swarm) -> None:
+    swarm = Program(world).swarm
+    asked = swarm.route_soon("t", *GRID.centre_m(GRID.cell(30, 3)))
+    world.run(0.1)
+    assert (asked.result(0).cells[0], asked.result(0).target_cell) == (GRID.cell(30, 3), GRID.cell(5, 40))
+    with pytest.raises(ConfigError, match="outside the terrain"):
+        swarm.route_soon("t", -1e6, 0.0)
 
 
 def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm) -> None:

@@ -1,0 +1,1 @@
+"""What comes in from ROS: robots, goals, targets, areas and services. Pure parts beside one shell, `Incoming`."""

@@ -1,0 +1,301 @@
+"""What comes in from ROS is hostile until it is read: no message raises, and what goes on is always valid."""
+
+from __future__ import annotations
+
+import math
+import random
+from contextlib import suppress
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from support.effort import few
+
+from launch_scripts.ros2.frames import RosMap, quaternion_of
+from launch_scripts.ros2.incoming.areas import MOST_CELLS, closed_cells, corners_of
+from launch_scripts.ros2.incoming.goals import GoalTargets
+from launch_scripts.ros2.incoming.places import FrameReader, Place, robot_place
+from launch_scripts.ros2.incoming.settings import IncomingSettings, Robots, ZoneSettings, check_incoming
+from launch_scripts.ros2.incoming.tracks import Track
+from launch_scripts.ros2.messages import RosMessages
+from launch_scripts.ros2.packed_path import packed_path
+from launch_scripts.ros2.types import Distribution, types_of
+from swarm.clock import NS_PER_S
+from swarm.errors import ConfigError, ProtocolError
+from swarm.grid import GridSpec
+from swarm.wire.messages.bodies import MOST_M_PER_S
+
+TYPES = types_of(Distribution.JAZZY)
+GRID = GridSpec(12, 16, 10.0, 5000.0, 70_000.0)
+MAP = RosMap(GRID)
+NUMBERS = st.floats() | st.floats(-50, 250)
+FRAMES = st.sampled_from(["map", "/map", "terrain", "uav/odom", "odom", "", "x" * 300]) | st.text(max_size=20)
+KINDS = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
+
+
+def n(**fields: Any) -> SimpleNamespace:
+    return SimpleNamespace(**fields)
+
+
+def pose(x: float, y: float, turned: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)) -> SimpleNamespace:
+    qx, qy, qz, qw = turned
+    return n(position=n(x=x, y=y, z=0.0), orientation=n(x=qx, y=qy, z=qz, w=qw))
+
+
+def header(frame: str = "map") -> SimpleNamespace:
+    return n(frame_id=frame, stamp=n(sec=0, nanosec=0))
+
+
+def odometry(x: float, y: float, forward: float = 0.0, left: float = 0.0, frame: str = "map") -> SimpleNamespace:
+    twist = n(twist=n(linear=n(x=forward, y=left, z=0.0)))
+    return n(header=header(frame), pose=n(pose=pose(x, y), covariance=()), twist=twist)
+
+
+messages = st.builds(
+    lambda x, y, turned, forward, left, frame, kind: {
+        0: lambda: n(
+            header=header(frame), pose=n(pose=pose(x, y, turned), covariance=()),
+            twist=n(twist=n(linear=n(x=forward, y=left, z=0.0))),
+        ),
+        1: lambda: n(header=header(frame), pose=pose(x, y, turned)),
+        2: lambda: n(header=header(frame), pose=n(pose=pose(x, y, turned), covariance=())),
+    }[kind](),
+    NUMBERS, NUMBERS, st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS), NUMBERS, NUMBERS, FRAMES, st.integers(0, 2),
+)  # fmt: skip
+
+
+def assert_valid(place: Place) -> None:
+    assert GRID.cell_at(place.x_m, place.y_m) >= 0
+    assert 0 <= place.speed_m_per_s <= MOST_M_PER_S
+    assert place.heading_rad is None or 0 <= place.heading_rad < math.tau
+
+
+@given(messages, NUMBERS.filter(lambda x: abs(x) < 1e12), NUMBERS.filter(lambda x: abs(x) < 10))
+def test_any_message_of_a_robot_is_a_valid_place_or_a_sentence(message: Any, offset: float, turn: float) -> None:
+    found = robot_place(FrameReader(MAP, "uav/odom", (offset, -offset), turn), message)
+    if isinstance(found, str):
+        assert "expected" in found
+        assert len(found) < 400
+    else:
+        assert_valid(found)
+
+
+@given(st.lists(st.tuples(messages, st.integers(0, 3 * NS_PER_S)), max_size=30), st.floats(0.1, 50))
+def test_the_swarm_is_told_valid_places_at_a_bounded_rate_whatever_comes(words: Any, hz: float) -> None:
+    said: list[str] = []
+    track = Track(FrameReader(MAP, "uav/odom"), 2.0, hz, said.append)
+    now_ns, told_ns, heard_ns = 0, [], None
+    for message, step_ns in words:
+        now_ns += step_ns
+        if track.due(now_ns):
+            place = track.hear(message, now_ns)
+            if place is not None:
+                assert_valid(place)
+                told_ns.append(now_ns)
+                heard_ns = now_ns
+        gone = track.gone(now_ns)
+        assert gone == (heard_ns is not None and now_ns - heard_ns > 2 * NS_PER_S)
+        heard_ns = None if gone else heard_ns
+        assert (track.place is None) == (heard_ns is None)
+    assert all(later - sooner >= NS_PER_S / hz for sooner, later in pairwise(told_ns))
+    assert len(said) <= track.refused
+
+
+@given(st.integers(0, 11), st.integers(0, 15), st.floats(0, math.tau, exclude_max=True), st.floats(-3, 3))
+def test_a_place_in_a_frame_of_its_own_is_turned_and_moved(row: int, col: int, heading: float, turn: float) -> None:
+    x_m, y_m = GRID.centre_m(GRID.cell(row, col))
+    x, y = MAP.to_ros(x_m, y_m)
+    # The same place as a frame says it whose origin is at (30, 40) and which is turned by `turn`.
+    dx, dy = x - 30, y - 40
+    own = math.cos(turn) * dx + math.sin(turn) * dy, math.cos(turn) * dy - math.sin(turn) * dx
+    reader = FrameReader(MAP, "uav/odom", (30, 40), turn)
+    found = reader.pose(header("uav/odom"), pose(*own, quaternion_of(heading + turn)))
+    assert isinstance(found, Place)
+    assert (found.x_m, found.y_m) == pytest.approx((x_m, y_m))
+    assert found.heading_rad is not None
+    assert math.cos(found.heading_rad - heading) == pytest.approx(1.0)
+
+
+def test_a_robot_that_drives_backwards_is_told_to_go_where_it_goes() -> None:
+    found = robot_place(FrameReader(MAP), odometry(50, 50, forward=-2.0))
+    assert isinstance(found, Place)
+    assert (found.heading_rad, found.speed_m_per_s) == (pytest.approx(1.5 * math.pi), 2.0)  # it looks east
+
+
+def test_poses_tell_a_speed_that_the_messages_do_not() -> None:
+    track = Track(FrameReader(MAP), 2.0, 10.0, pytest.fail)
+    track.hear(n(header=header(), pose=pose(50, 50)), 0)
+    found = track.hear(n(header=header(), pose=pose(50, 53)), NS_PER_S)
+    assert found is not None
+    assert (found.heading_rad, found.speed_m_per_s) == (pytest.approx(0.0), pytest.approx(3.0))
+
+
+def test_a_reason_is_said_once_until_a_good_message_comes() -> None:
+    said: list[str] = []
+    track = Track(FrameReader(MAP), 2.0, 10.0, said.append)
+    for number in range(20):
+        track.hear(odometry(50, 50, frame="odom"), number * NS_PER_S)
+    assert said == ["frame is 'odom', expected 'map' or 'terrain'"]
+    track.hear(odometry(50, 50), 30 * NS_PER_S)
+    track.hear(odometry(50, 50, frame="odom"), 31 * NS_PER_S)
+    assert len(said) == 2
+
+
+# --- goals -----------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 4)), max_size=60), st.integers(0, 3))
+def test_a_goal_target_stands_where_all_who_use_it_go(steps: list[tuple[bool, int]], many: int) -> None:
+    pool = GoalTargets([f"g{each}" for each in range(many)])
+    lent: list[tuple[str, int]] = []
+    for take, number in steps:
+        if take:
+            found = pool.lend(number)
+            cells = {cell for _, cell in lent}
+            assert (found is None) == (number not in cells and len({id for id, _ in lent}) == many)
+            if found is not None:
+                lent.append((found[0], number))
+        elif lent:
+            pool.give_back(lent.pop(number % len(lent))[0])
+        assert all(pool.cell_of(id) == cell for id, cell in lent)
+
+
+# --- areas -----------------------------------------------------------------------------------------------------
+
+
+def grid_message(
+    data: Any, width: int, height: int, resolution: float, x: float, y: float, frame: str = "map", **turned: float
+) -> SimpleNamespace:
+    orientation = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0} | turned
+    origin = n(position=n(x=x, y=y, z=0.0), orientation=n(**orientation))
+    info = n(width=width, height=height, resolution=resolution, origin=origin)
+    return n(header=header(frame), info=info, data=np.asarray(data, np.int8))
+
+
+@given(
+    st.integers(0, 40), st.integers(0, 40), NUMBERS, NUMBERS, NUMBERS, FRAMES, st.integers(-128, 127),
+    st.integers(1, 100), st.integers(0, 3), NUMBERS,
+)  # fmt: skip
+def test_any_grid_closes_cells_of_the_terrain_or_is_a_sentence(
+    width: int, height: int, resolution: float, x: float, y: float, frame: str, value: int, occupied: int,
+    more: int, turn: float,
+) -> None:  # fmt: skip
+    message = grid_message([value] * (width * height + more), width, height, resolution, x, y, frame, z=turn)
+    found = closed_cells(MAP, message, occupied)
+    if not isinstance(found, str):
+        assert found == sorted(set(found))
+        assert all(0 <= cell < GRID.cells for cell in found)
+
+
+@given(
+    st.integers(1, 9), st.integers(1, 9), st.sampled_from([2.5, 4.0, 5.0, 10.0, 13.0, 20.0, 40.0]),
+    st.integers(-60, 170), st.integers(-60, 130), st.randoms(use_true_random=False),
+)  # fmt: skip
+def test_cells_are_closed_by_the_area_under_them(
+    width: int, height: int, resolution: float, x: float, y: float, chance: Any
+) -> None:
+    data = [chance.choice([-1, 0, 50, 100]) for _ in range(width * height)]
+    found = closed_cells(MAP, grid_message(data, width, height, resolution, float(x), float(y)), 50)
+
+    def overlap(a: float, b: float, c: float, d: float) -> float:
+        return max(0.0, min(b, d) - max(a, c))
+
+    expected = []
+    for cell in range(GRID.cells):
+        row, col = GRID.row_col(cell)
+        south, west = (GRID.rows - 1 - row) * 10.0, col * 10.0
+        area = sum(
+            overlap(west, west + 10, x + c * resolution, x + (c + 1) * resolution)
+            * overlap(south, south + 10, y + r * resolution, y + (r + 1) * resolution)
+            for r in range(height)
+            for c in range(width)
+            if data[r * width + c] >= 50
+        )
+        assume(abs(area - 50.0) > 1e-6 or area == 50.0)
+        if area >= 50.0:
+            expected.append(cell)
+    assert (found if isinstance(found, list) else []) == expected
+
+
+def test_a_grid_that_would_close_too_much_is_refused() -> None:
+    large = RosMap(GridSpec(400, 400, 10.0))
+    message = grid_message([100], 1, 1, 4000.0, 0.0, 0.0)
+    found = closed_cells(large, message, 100)
+    assert found == f"grid closes 160000 cells of the terrain, expected at most {MOST_CELLS}"
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), max_size=300), FRAMES)
+def test_any_polygon_is_corners_on_the_terrain_or_a_sentence(points: Any, frame: str) -> None:
+    message = n(header=header(frame), polygon=n(points=[n(x=x, y=y, z=0.0) for x, y in points]))
+    found = corners_of(FrameReader(MAP), message)
+    if isinstance(found, str):
+        assert "expected" in found
+    else:
+        assert len(found) == 0 or 3 <= len(found) <= 256
+        assert all(GRID.cell_at(*corner) >= 0 for corner in found)
+
+
+def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
+    """Of real types, as they come from the wire: messages of which any bytes are others."""
+    chance, read = random.Random(1), 0
+    messages = RosMessages(TYPES, MAP)
+    good = messages.odometry(0, "uav", *GRID.centre_m(40), 1.0, 2.0)
+    pose = messages.pose_stamped(0, *GRID.centre_m(40), 1.0)
+    for number in range(few(3000)):
+        kind, made = (KINDS[0], good) if number % 2 else (KINDS[1], pose)
+        content = bytearray(TYPES.pack(made, kind))
+        for _ in range(chance.randrange(12)):
+            content[chance.randrange(4, len(content))] = chance.choice([0, 127, 128, 255, chance.randrange(256)])
+        with suppress(ProtocolError):
+            found = robot_place(FrameReader(MAP, "uav/odom"), TYPES.unpack(bytes(content), kind))
+            assert isinstance(found, (str, Place))
+            read += 1
+    assert read > few(3000) / 3
+
+
+# --- settings --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (IncomingSettings(robots=(Robots(topic="/odom"),)), "expected {robot} in it, or an id"),
+        (IncomingSettings(robots=(Robots(id="a"),)), "expected {robot} in it, or an id and none in it"),
+        (IncomingSettings(robots=(Robots(plan="/plan"),)), "plan is '/plan', expected {robot} once"),
+        (IncomingSettings(robots=(Robots(frame="{x}/odom"),)), "frame is '{x}/odom', expected no braces"),
+        (IncomingSettings(targets=("fox",), goal_targets=("fox",)), "'fox' is there twice"),
+        (IncomingSettings(robots=(Robots(), Robots())), "topics: '/{robot}/odom' is there twice"),
+        (
+            IncomingSettings(zones=(ZoneSettings(name="z", topic="/a"), ZoneSettings(name="z", topic="/b"))),
+            "zones: 'z' is there twice",
+        ),
+    ],
+)
+def test_settings_that_contradict_themselves_get_a_sentence(settings: IncomingSettings, says: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        check_incoming(settings, "ros2.toml")
+    assert str(error.value).startswith("ros2.toml: ")
+    assert says in str(error.value)
+
+
+def test_good_settings_pass() -> None:
+    check_incoming(IncomingSettings(robots=(Robots(), Robots(id="spot", topic="/odometry", plan="/plan"))))
+
+
+@pytest.mark.parametrize(
+    ("topic", "robot"),
+    [("/uav1/odom", "uav1"), ("/a/b/odom", None), ("//odom", None), ("/1a/odom", None), ("/uav1/odom/x", None)],
+)
+def test_a_robot_is_found_by_its_topic(topic: str, robot: str | None) -> None:
+    assert Robots().robot_of(topic) == robot
+
+
+def test_a_response_of_getplan_has_the_bytes_of_its_path() -> None:
+    points = [GRID.centre_m(cell) for cell in (3, 4, 21, 22)]
+    path = RosMessages(TYPES, MAP).path(7, points)
+    response = TYPES.make("nav_msgs/srv/GetPlan_Response", plan=path)
+    assert TYPES.pack(response, "nav_msgs/srv/GetPlan_Response") == packed_path(MAP, 7, points)
