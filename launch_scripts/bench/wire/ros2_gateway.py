@@ -28,13 +28,15 @@ from swarm.errors import SwarmError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.processes import RunInfo
+from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
-from swarm.wire.topics import FLEET, FOLLOWED, MARKS, RUN
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, RUN
 
 _PER_AGENT = 25
 _HZ = 10.0
 _ROUTE_CELLS, _NEW_ROUTE_S = 200, 2.0
 _MARK_SETS_A_TICK, _MARKS = 1, 20
+_WEST_M, _NORTH_M, _CRS = 500_000.0, 5_300_000.0, "EPSG:32632"
 _WARM_S = 3.0
 _START_S = 60.0
 
@@ -42,12 +44,13 @@ _START_S = 60.0
 def swarm_peer(
     network: NetworkConfig, pipe: Connection, vehicles: int, seconds: float, run_id: str = "bench"
 ) -> None:
-    """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, for so long.
-    Answers which run it is."""
+    """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, and a target,
+    for so long. Answers which run it is."""
     inbox, now_ns = Inbox(), time.time_ns()
     info = RunInfo(
         run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
-        cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=GRID.west_m, north_m=GRID.north_m,
+        cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=_WEST_M, north_m=_NORTH_M,
+        crs=_CRS,
     )  # fmt: skip
     with open_bus(network) as bus:
         bus.serve(RUN, inbox.post, role="keeper", id="0")
@@ -57,6 +60,11 @@ def swarm_peer(
         while time.monotonic() < began_s + seconds and not pipe.poll():
             tick += 1
             _tell(bus, tick, vehicles)
+            target = TargetPose(
+                target="t0", incarnation=now_ns, seq=tick, stamp_ns=time.time_ns(), cell=0,
+                x_m=_WEST_M + 5.0, y_m=_NORTH_M - 5.0,
+            )  # fmt: skip
+            bus.publish(POSE, target, target="t0")
             while (event := inbox.take(max(0.0, began_s + tick / _HZ - time.monotonic()))) is not None:
                 if isinstance(event, Asked):
                     event.answer(msgspec.structs.replace(info, now_ns=time.time_ns()), role="keeper", id="0")
