@@ -108,6 +108,24 @@ def wire(
     show(report, as_json, tables)
 
 
+@app.command("ros2-gateway")
+def ros2_gateway(
+    vehicles: Annotated[int, typer.Option(min=25, help="A multiple of 25.")] = 100,
+    seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 20.0,
+    as_json: AsJson = False,
+) -> None:
+    """CPU that `swarm ros2` takes for many vehicles, each at 10 Hz, with plans, map and markers.
+
+    \b
+    swarm bench ros2-gateway --vehicles 100
+    """
+    from launch_scripts.bench.wire.ros2_gateway import run
+
+    with progress_of("ros2-gateway") as progress:
+        report = run(vehicles, seconds, progress)
+    show(report, as_json)
+
+
 @app.command()
 def ros2(
     questions: Annotated[int, typer.Option(min=10, help="Questions and goals of each kind.")] = 200,

@@ -52,6 +52,11 @@ class Moving:
         self.route_told_ns = 0
         self._moved_ns = now_ns
 
+    @property
+    def place(self) -> tuple[float, float, float | None]:
+        """x, y, heading."""
+        return self.x_m, self.y_m, self.heading_rad
+
     def take(self, seen: SeenVehicle, now_ns: int) -> None:
         """Where it is now."""
         heading_rad = self.heading_rad if seen.heading_rad is None else seen.heading_rad

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from launch_scripts.ros2.actions import Action, Channel, Declare, Put, Remove
+from launch_scripts.ros2.frames import base_frame, odom_frame
 from launch_scripts.ros2.messages import RosMessages
 from launch_scripts.ros2.moving import Moving
 from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.packed_path import packed_path
+from launch_scripts.ros2.packed_places import PackedOdometry, PackedPose, PackedTransforms
 from launch_scripts.ros2.topics import VEHICLE, TopicRow
 from swarm.client.observer import SeenVehicle
 from swarm.clock import NS_PER_S
@@ -53,6 +55,12 @@ class VehicleTopics:
         self._problem = problem
         self._told: dict[str, Moving] = {}
         """By name in ROS."""
+        self._odometry: dict[str, PackedOdometry] = {}
+        self._own_transform: dict[str, PackedTransforms] = {}
+        """Of each where frames are bare."""
+        self._transforms: PackedTransforms | None = None
+        """Of all in their order; None when others have come since it was made."""
+        self._pose = PackedPose(messages)
         self._wanted: dict[str, bool] = {}
         """Ids that were matched with the patterns. Cleared when vehicles leave, so that it does not grow."""
         self._refused: set[str] = set()
@@ -66,8 +74,10 @@ class VehicleTopics:
         gone = [name for name, moving in self._told.items() if moving.id not in seen]
         actions: list[Action] = [Remove(self._channels(name)) for name in gone]
         for name in gone:
-            del self._told[name]
+            del self._told[name], self._odometry[name]
+            self._own_transform.pop(name, None)
         if gone:
+            self._transforms = None
             self._wanted.clear()
             self._refused.clear()  # their names are free
         came = [new for id, each in seen.items() if (new := self._take(id, each, now_ns)) is not None]
@@ -96,6 +106,11 @@ class VehicleTopics:
             self._problem(f"vehicle {id} is not told to ROS: {why}")
             return None
         self._told[name] = Moving(id, name, seen, now_ns)
+        odom, base = self._frames(name)
+        self._odometry[name] = PackedOdometry(self._messages, odom, base)
+        self._transforms = None
+        if self._bare:
+            self._own_transform[name] = PackedTransforms(self._messages, [(odom, base)])
         return name
 
     def route(self, id: str, points_m: Iterable[tuple[float, float]]) -> None:
@@ -109,39 +124,35 @@ class VehicleTopics:
         for moving in self._told.values():
             yield from self._of_one(due, moving, now_ns)
         if "tf" in due and not self._bare and self._told:
-            moved = [self._transform(moving, now_ns) for moving in self._told.values()]
-            yield self._put("tf", self._messages.transforms(moved))
+            if self._transforms is None:
+                self._transforms = PackedTransforms(self._messages, [self._frames(name) for name in self._told])
+            places = [moving.place for moving in self._told.values()]
+            yield self._put("tf", self._transforms.at(now_ns, places))
         if "poses" in due:
             told = sorted(self._told.values(), key=lambda moving: moving.id)
-            places = np.array([(each.x_m, each.y_m) for each in told], np.float64).reshape(-1, 2)
+            points_m = np.array([(each.x_m, each.y_m) for each in told], np.float64).reshape(-1, 2)
             headings = [each.heading_rad for each in told]
-            yield self._put("poses", self._messages.pose_array(now_ns, places, headings))
+            yield self._put("poses", self._messages.pose_array(now_ns, points_m, headings))
 
     def _of_one(self, due: Collection[str], moving: Moving, now_ns: int) -> Iterator[Action]:
         messages, name = self._messages, moving.name
-        here = moving.x_m, moving.y_m, moving.heading_rad
         if "odom" in due:
-            odometry = messages.odometry(now_ns, name, *here, moving.speed_m_per_s, moving.turn_rad_per_s)
-            if self._bare:
-                odometry.header.frame_id, odometry.child_frame_id = "odom", "base_link"
-            yield self._put("odom", odometry, name)
+            speeds = moving.speed_m_per_s, moving.turn_rad_per_s
+            yield self._put("odom", self._odometry[name].at(now_ns, moving.place, *speeds), name)
         if "pose" in due:
-            yield self._put("pose", messages.pose_stamped(now_ns, *here), name)
+            yield self._put("pose", self._pose.at(now_ns, moving.place), name)
         if "fix" in due and self._to_wgs84 is not None:
-            frame = "base_link" if self._bare else f"{name}/base_link"
+            frame = self._frames(name)[1]
             yield self._put("fix", messages.fix(now_ns, frame, *self._to_wgs84(moving.x_m, moving.y_m)), name)
         if "plan" in due and moving.route_is_new and now_ns - moving.route_told_ns >= _PLAN_NS:
             moving.route_is_new, moving.route_told_ns = False, now_ns
             yield self._put("plan", packed_path(messages.map, now_ns, moving.route), name)
         if "tf" in due and self._bare:
-            yield self._put("tf", messages.transforms([self._transform(moving, now_ns)]), name)
+            yield self._put("tf", self._own_transform[name].at(now_ns, [moving.place]), name)
 
-    def _transform(self, moving: Moving, now_ns: int) -> Any:
-        place = moving.x_m, moving.y_m, moving.heading_rad
-        transform = self._messages.vehicle_transforms(now_ns, moving.name, *place)[1]
-        if self._bare:
-            transform.header.frame_id, transform.child_frame_id = "odom", "base_link"
-        return transform
+    def _frames(self, name: str) -> tuple[str, str]:
+        """Of a vehicle: the one that does not move, and its own."""
+        return ("odom", "base_link") if self._bare else (odom_frame(name), base_frame(name))
 
     def _static(self, told: Iterable[Moving], now_ns: int) -> Any:
         transforms = []
@@ -149,8 +160,7 @@ class VehicleTopics:
             transform = self._messages.vehicle_transforms(now_ns, moving.name, *self._messages.map.origin_m, None)[
                 0
             ]
-            if self._bare:
-                transform.child_frame_id = "odom"
+            transform.child_frame_id = self._frames(moving.name)[0]
             transforms.append(transform)
         return self._messages.transforms(transforms)
 

@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.05
 _RUN_TIMEOUT_S = 2.0
+_COMPARE_AGAIN_NS = 2 * NS_PER_S
 _SAY_AGAIN_NS = 60 * NS_PER_S
 _SAME_CLOCK_NS = NS_PER_S
 """Clocks that differ by less are not corrected: an answer is as old as a tick."""
@@ -67,6 +68,8 @@ class Session:
         self._asked: dict[str, tuple[Future[list[Any]], list[Any]]] = {}
         """Tag -> who waits for the answers, and those that came."""
         self._tags = itertools.count(1)
+        self._compare_due_ns: int | None = None
+        """When to ask again which run is in the namespace, as nobody has answered since the link is back."""
         self._later: list[Callable[[], None]] = []
         """Callbacks to call once the lock is free."""
         self._said_ns: dict[str, int] = {}
@@ -204,6 +207,9 @@ class Session:
         with self.lock:
             self._owner = threading.get_ident()
             if self.ended is None:
+                if self._compare_due_ns is not None and now_ns >= self._compare_due_ns:
+                    self._compare_due_ns = None
+                    self._compare_run()
                 for part in self._parts:
                     part.tick(now_ns)
         self._call_later()
@@ -220,12 +226,16 @@ class Session:
         self.bus.close()
 
     def _compare_run(self) -> None:
-        """After a cut the namespace may hold another run, in which our cells mean other places."""
+        """After a cut the namespace may hold another run, in which our cells mean other places. Routers may be back
+        long before a process of a run is."""
         asked = self.ask(RUN, Nothing(), _RUN_TIMEOUT_S)
 
         def compare(done: Future[list[Any]]) -> None:
             runs = [] if done.exception() else [each for each in done.result() if each.run_id]
-            if not runs or any(each.run_id == self.run.run_id for each in runs):
+            if not runs:
+                self._compare_due_ns = self.now_ns() + _COMPARE_AGAIN_NS
+                return
+            if any(each.run_id == self.run.run_id for each in runs):
                 return
             with self.lock:
                 self.ended = RunMismatchError(

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,25 +17,33 @@ from support.live_swarm import SWARM, LiveSwarm
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
+from launch_scripts.bench.wire.remote import Far
+from launch_scripts.bench.wire.ros2_gateway import swarm_peer
+from launch_scripts.ports import free_ports
 from launch_scripts.ros2.graph import Attachment, Qos
 from launch_scripts.ros2.node import Node, close_ros, open_ros
-from launch_scripts.ros2.topics import ROWS
+from launch_scripts.ros2.topics import ROWS, TABLE, Direction
 from launch_scripts.ros2.types import Distribution, types_of
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.scenario import NetworkConfig
 
 pytestmark = pytest.mark.network
 
 TYPES = types_of(Distribution.JAZZY)
-NEW_MARKS = "map_updates"
-"""Put when a mark comes: not in any given second."""
+OUT = [row.name for row in TABLE if row.direction is Direction.OUT]
 
 
 @dataclass
 class Gateway:
-    """A gateway at a router of the ROS side, and the swarm behind it."""
+    """A gateway at a router of the ROS side, and the swarm behind it.
 
-    swarm: LiveSwarm
+    swarm  endpoint of its router
+    """
+
+    swarm: str
     port: int
     folder: Path
+    runs: Path
 
     @property
     def endpoint(self) -> str:
@@ -43,8 +52,8 @@ class Gateway:
     def start(self, *options: str) -> subprocess.Popen[str]:
         with (self.folder / "ros2.log").open("w") as log:
             return subprocess.Popen(
-                [*SWARM, "ros2", "--connect", self.swarm.endpoint, "--ros", self.endpoint,
-                 "--runs", str(self.swarm.runs), *options],
+                [*SWARM, "ros2", "--connect", self.swarm, "--ros", self.endpoint,
+                 "--runs", str(self.runs), *options],
                 stdout=log, stderr=log, text=True,
             )  # fmt: skip
 
@@ -66,7 +75,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
 @pytest.fixture(scope="module")
 def gateway(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     with ros_router() as port:
-        yield Gateway(live, port, tmp_path_factory.mktemp("ros"))
+        yield Gateway(live.endpoint, port, tmp_path_factory.mktemp("ros"), live.runs)
 
 
 @pytest.fixture
@@ -90,26 +99,14 @@ def topic_of(row: str) -> str:
     return ROWS[row].topic.format(vehicle="a0_01", target="t0")
 
 
-def test_a_foreign_stack_hears_every_type_and_lists_every_topic(running: Gateway, definitions: Path) -> None:
-    # The SDK subscribes plainly: of what is latched it hears what comes later.
-    heard = [row for row in ROWS if row not in ("map", "tf_static", "fix", NEW_MARKS)]
-    with RosPeer(running.port, definitions) as peer:
-        for row in heard:
-            peer.hear(topic_of(row), ROWS[row].type_name)
-        eventually(lambda: all(peer.heard[topic_of(row)] for row in heard), 30, "a message of each topic")
-        pose = peer.heard[topic_of("pose")][-1]
-        assert pose["header"]["frame_id"] == "map"
-        assert pose["header"]["stamp"]["sec"] == pytest.approx(time.time(), abs=60)
-        assert 0 <= pose["pose"]["position"]["x"] <= 128 * 30
-        assert len(peer.heard["/swarm/poses"][-1]["poses"]) == 12
-        assert len(peer.heard[topic_of("plan")][-1]["poses"]) >= 1
+def test_a_foreign_stack_lists_every_topic(running: Gateway) -> None:
     program = "from zenoh_ros2_sdk.cli import main; main()"
     listed = subprocess.run(
         [sys.executable, "-c", program, "--no-daemon", "--router", f"127.0.0.1:{running.port}",
          "topic", "list", "-t"],
         capture_output=True, text=True, timeout=30, check=False,
     )  # fmt: skip
-    for row in ROWS:
+    for row in OUT:
         if row != "fix":  # this terrain has no coordinates
             assert f"{topic_of(row)} [{ROWS[row].type_name}]" in listed.stdout, listed
 
@@ -185,7 +182,7 @@ def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway) -> 
         node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
         process = gateway.start()
         try:
-            eventually(lambda: {topic_of(row) for row in ROWS if row != "fix"} <= there, 40, "all topics")
+            eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
         finally:
             process.kill()
             process.wait(10)
@@ -202,10 +199,76 @@ def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> 
     assert process.wait(20) == 0, gateway.said
     assert "Traceback" not in gateway.said
     alone = subprocess.run(
-        [*SWARM, "ros2", "--connect", gateway.swarm.endpoint, "--ros", "tcp/127.0.0.1:9"],
+        [*SWARM, "ros2", "--connect", gateway.swarm, "--ros", "tcp/127.0.0.1:9"],
         capture_output=True, text=True, timeout=30, check=False,
     )  # fmt: skip
     assert alone.returncode == 4
     assert alone.stderr == (
         "swarm: no router of the ROS side listens at tcp/127.0.0.1:9: start rmw_zenohd, or name it by --ros\n"
     )
+
+
+def poses_heard(port: int, within_s: float) -> None:
+    """Waits until a node at this router hears where vehicles are."""
+    session = open_ros(f"tcp/127.0.0.1:{port}")
+    try:
+        heard: list[object] = []
+        Node(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, heard.append)
+        eventually(lambda: heard, within_s, "poses of vehicles")
+    finally:
+        close_ros(session)
+
+
+@contextmanager
+def made_up_swarm(network: NetworkConfig, run_id: str) -> Iterator[None]:
+    """A router, and agents with 25 vehicles."""
+    with open_bus(network, mode="router"), Far(network) as far:
+        far.start(swarm_peer, 25, 90.0, run_id)
+        yield
+
+
+def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    with ExitStack() as ends:
+        ends.enter_context(made_up_swarm(network, "bench"))
+        port = ends.enter_context(ros_router())
+        peer = ends.enter_context(RosPeer(port, definitions))
+        # Before the gateway is there: the SDK asks nobody for what was latched before.
+        for row in OUT:
+            peer.hear(topic_of(row), ROWS[row].type_name)
+        process = Gateway(endpoint, port, tmp_path, tmp_path).start("--namespace", "bench")
+        ends.callback(process.wait, 10)
+        ends.callback(process.kill)
+        eventually(lambda: all(peer.heard[topic_of(row)] for row in OUT), 40, "a message of each topic")
+        pose = peer.heard[topic_of("pose")][-1]
+        assert pose["header"]["frame_id"] == "map"
+        assert pose["header"]["stamp"]["sec"] == pytest.approx(time.time(), abs=60)
+        assert 500 < pose["pose"]["position"]["x"] < 4000
+        assert pose["pose"]["position"]["y"] == pytest.approx(20_480 - 500)
+        assert len(peer.heard["/swarm/poses"][-1]["poses"]) == 25
+        assert len(peer.heard[topic_of("plan")][-1]["poses"]) == 201
+        assert peer.heard[topic_of("fix")][-1]["latitude"] == pytest.approx(47.85, abs=0.2)
+        assert peer.heard["/map"][0]["info"]["width"] == 2048
+
+
+def test_either_side_may_go_and_come_back_and_the_next_run_is_told_as_well(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    with ExitStack() as ends:
+        with made_up_swarm(network, "first"):
+            with ros_router() as port:
+                gateway = Gateway(endpoint, port, tmp_path, tmp_path)
+                process = gateway.start("--namespace", "bench")
+                ends.callback(process.wait, 10)
+                ends.callback(process.kill)
+                poses_heard(port, 40)
+            eventually(lambda: "the ROS router" in gateway.said, 15, "the word about the router that is gone")
+            with ros_router(port):
+                poses_heard(port, 20)
+        ends.enter_context(ros_router(port))
+        ends.enter_context(made_up_swarm(network, "second"))
+        eventually(lambda: "run second" in gateway.said, 40, "the next run")
+        poses_heard(port, 20)
+        assert process.poll() is None, gateway.said
+        assert "Traceback" not in gateway.said

@@ -26,9 +26,9 @@ _EMPTY = "uint8 structure_needs_at_least_one_member"
 
 
 @contextmanager
-def ros_router() -> Iterator[int]:
+def ros_router(port: int | None = None) -> Iterator[int]:
     """The port of a router in this process, of the kind that rmw_zenohd is: it does not forward between peers."""
-    port = free_ports(1)[0]
+    port = port or free_ports(1)[0]
     config = zenoh.Config()
     for key, value in {
         "mode": '"router"',

@@ -24,6 +24,14 @@ from launch_scripts.ros2.map_topics import corners, outline
 from launch_scripts.ros2.messages import RosMessages
 from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.packed_path import PATH, packed_path
+from launch_scripts.ros2.packed_places import (
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    PackedOdometry,
+    PackedPose,
+    PackedTransforms,
+)
 from launch_scripts.ros2.peers import PeerWatch
 from launch_scripts.ros2.settings import Settings, parse_settings
 from launch_scripts.ros2.topics import ROWS
@@ -76,7 +84,9 @@ def told(gateway: Gateway, world: World, at_s: float) -> list[Any]:
 
 
 def puts(actions: list[Any], row: str) -> list[Any]:
-    return [each.message for each in actions if isinstance(each, Put) and each.channel.row == row]
+    """What was put of a row, as a hearer reads it."""
+    found = [each.message for each in actions if isinstance(each, Put) and each.channel.row == row]
+    return [TYPES.unpack(each, ROWS[row].type_name) if isinstance(each, bytes) else each for each in found]
 
 
 # --- the core -----------------------------------------------------------------------------------------------------
@@ -334,6 +344,36 @@ def _length(points: Any) -> float:
 def test_a_path_from_columns_has_the_bytes_of_one_from_objects(frame: str, points: Any, stamp_ns: int) -> None:
     map = RosMap(GRID, frame)
     assert packed_path(map, stamp_ns, points) == TYPES.pack(RosMessages(TYPES, map).path(stamp_ns, points), PATH)
+
+
+FRAMES = st.text("abc_/7", min_size=1, max_size=13)
+SPOTS = st.tuples(st.floats(-1e7, 1e7), st.floats(-1e7, 1e7), st.none() | st.floats(-6, 6))
+STAMPS = st.integers(0, 2**31 * NS_PER_S - 1)
+
+
+@given(
+    FRAMES, FRAMES, st.lists(st.tuples(STAMPS, SPOTS, st.floats(-50, 50), st.floats(-9, 9)), min_size=1, max_size=3)
+)
+def test_odometry_and_poses_in_place_have_the_bytes_of_new_ones(frame: str, child: str, moments: Any) -> None:
+    messages = RosMessages(TYPES, RosMap(GRID))
+    odometry, pose = PackedOdometry(messages, frame, child), PackedPose(messages)
+    for stamp_ns, spot, speed, turn in moments:
+        made = messages.odometry(stamp_ns, "", *spot, speed, turn)
+        made.header.frame_id, made.child_frame_id = frame, child
+        assert odometry.at(stamp_ns, spot, speed, turn) == TYPES.pack(made, ODOMETRY)
+        assert pose.at(stamp_ns, spot) == TYPES.pack(messages.pose_stamped(stamp_ns, *spot), POSE)
+
+
+@given(st.lists(st.tuples(FRAMES, FRAMES, SPOTS), max_size=4), STAMPS)
+def test_transforms_in_place_have_the_bytes_of_new_ones(vehicles: Any, stamp_ns: int) -> None:
+    messages = RosMessages(TYPES, RosMap(GRID))
+    made = []
+    for parent, child, spot in vehicles:
+        transform = messages.vehicle_transforms(stamp_ns, "", *spot)[1]
+        transform.header.frame_id, transform.child_frame_id = parent, child
+        made.append(transform)
+    packed = PackedTransforms(messages, [(parent, child) for parent, child, _ in vehicles])
+    assert packed.at(stamp_ns, [spot for *_, spot in vehicles]) == TYPES.pack(messages.transforms(made), TRANSFORMS)
 
 
 # --- peers -------------------------------------------------------------------------------------------------------

@@ -543,6 +543,25 @@ def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> N
     assert bodies[-1].x_m == 15.0
 
 
+def test_another_run_that_begins_long_after_the_link_is_back_ends_the_connection_too(world: Swarm) -> None:
+    program = Program(world)
+    world.kill("planner-t-1")
+    world.kill("a0.1")
+    world.cut(program.bus)
+    world.run(0.5)
+    world.heal(program.bus)
+    world.run(20.0)
+    assert program.swarm.ended is None, "nobody has answered yet"
+
+    def answer(event: Any) -> None:
+        event.answer(run_info(GRID, "run2"))
+        event.end()
+
+    world.bus("other").serve(RUN, answer, role="keeper", id="0")
+    world.run(6.0)
+    assert isinstance(program.swarm.ended, RunMismatchError)
+
+
 def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm) -> None:
     program = Program(world)
     rover = program.swarm.vehicle("rover")
