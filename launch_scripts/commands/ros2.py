@@ -9,7 +9,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import typer
 
 from swarm.bus.endpoints import listening
@@ -35,21 +34,9 @@ def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
     changes  key -> value, such as {"ros.domain": 3}; None changes nothing
     """
     check_installed()
-    from launch_scripts.ros2.settings import Settings, check, load_settings
-    from swarm.config.explain import explain
+    from launch_scripts.ros2.settings import load_settings
 
-    settings = Settings() if file is None else load_settings(file)
-    raw = msgspec.to_builtins(settings)
-    for key, value in changes.items():
-        if value is not None:
-            section, _, name = key.rpartition(".")
-            (raw[section] if section else raw)[name] = value
-    try:
-        settings = msgspec.convert(raw, Settings)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"options: {explain(str(error), raw, Settings)}") from error
-    check(settings, "options" if file is None else str(file))
-    return settings
+    return load_settings(file, changes)
 
 
 def list_topics(settings: Settings, *, as_json: bool) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
+from launch_scripts.ros2.frames import TERRAIN_FRAME
 from launch_scripts.ros2.incoming.settings import IncomingSettings, check_incoming
 from launch_scripts.ros2.topics import ROWS, TARGET, VEHICLE, TopicRow
 from swarm.config.explain import choice, explain
@@ -23,7 +25,7 @@ MOST_HZ = 100.0
 
 DistributionName = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
 NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}$")]
-FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,80}$")]
+FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,79}(?<!/)$")]
 Rate = Annotated[float, Meta(ge=0, le=MOST_HZ)]
 
 
@@ -118,14 +120,31 @@ class Settings(Section, frozen=True, kw_only=True):
         )  # fmt: skip
 
 
-def load_settings(path: Path) -> Settings:
-    """Read and check a file of settings. Raises ConfigError that names file and key."""
-    return parse_settings(read_text(path, FileKind.SCENARIO), str(path))
+def load_settings(path: Path | None, options: Mapping[str, object] | None = None) -> Settings:
+    """Read and check a file of settings, or none, and what options say over them. Raises ConfigError that names the
+    file, or options, and the key.
+
+    options  key -> value, such as {"ros.domain": 3}; None changes nothing
+    """
+    text, source = ("", "settings") if path is None else (read_text(path, FileKind.SCENARIO), str(path))
+    return parse_settings(text, source, options)
 
 
-def parse_settings(text: str, source: str = "settings") -> Settings:
+def parse_settings(text: str, source: str = "settings", options: Mapping[str, object] | None = None) -> Settings:
     """As `load_settings`, of a text."""
     raw = parse_toml(text, source, ConfigError)
+    settings = _checked(raw, source)
+    said = {key: value for key, value in (options or {}).items() if value is not None}
+    if not said:
+        return settings
+    # Into what was read, not into what became of it: defaults need not be values that a file may have.
+    for key, value in said.items():
+        section, _, name = key.rpartition(".")
+        (raw.setdefault(section, {}) if section else raw)[name] = value
+    return _checked(raw, "options")
+
+
+def _checked(raw: dict[str, Any], source: str) -> Settings:
     try:
         settings = msgspec.convert(raw, Settings)
     except msgspec.ValidationError as error:
@@ -150,6 +169,10 @@ def check(settings: Settings, source: str = "settings") -> None:
     topics = [row.topic for row in settings.rows()]
     if doubled := next((topic for topic in topics if topics.count(topic) > 1), None):
         raise ConfigError(f"{source}: topics: two topics are called {doubled}; rename one")
+    if settings.frames.map == TERRAIN_FRAME:
+        raise ConfigError(
+            f"{source}: frames.map is {TERRAIN_FRAME!r}, which is the frame of the terrain's coordinates"
+        )
     check_incoming(settings.incoming, f"{source}: incoming")
     check_ros_endpoint(settings.ros, f"{source}: ros.endpoint")
 

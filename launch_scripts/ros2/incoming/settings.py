@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from launch_scripts.ros2.names import ros_name
 from swarm.config.values import Metres, Name, Positive, Section
 from swarm.errors import ConfigError
 from swarm.wire.messages.bodies import LONGEST_LEASE_S, MOST_RADIUS_M
@@ -17,7 +18,8 @@ ROBOT, TARGET = "{robot}", "{target}"
 MOST_HZ = 50.0
 
 RosName = Annotated[str, Meta(pattern=r"^[a-zA-Z][a-zA-Z0-9_]{0,60}$")]
-Topic = Annotated[str, Meta(pattern=r"^/[a-zA-Z0-9_/{}]{1,200}$")]
+Topic = Annotated[str, Meta(min_length=1, max_length=200)]
+_TOPIC = re.compile(r"(?:/[a-zA-Z_][a-zA-Z0-9_]*)+")
 Frame = Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/{}-]{0,200}$")]
 PoseType = Literal["odometry", "pose", "pose_with_covariance"]
 POSE_TYPES: dict[PoseType, str] = {
@@ -41,7 +43,7 @@ class Robots(Section, frozen=True, kw_only=True):
     hz         the swarm hears of it at most so often
     group      whose it is
     vehicle_class  whose routes it gets: one of the scenario's classes
-    target     whom it follows; empty: nobody, until it is given a goal
+    target     whom it follows; not given: nobody, until it is given a goal
     plan       topic of its route
     goal       topic of the place to go: put when it follows a target, heard when somebody gives it a goal
     """
@@ -57,7 +59,7 @@ class Robots(Section, frozen=True, kw_only=True):
     hz: Annotated[float, Meta(gt=0, le=MOST_HZ)] = 10.0
     group: Name = "all"
     vehicle_class: Name = GROUND
-    target: Name | Literal[""] = ""
+    target: Name | None = None
     plan: Topic = "/{robot}/plan"
     goal: Topic = "/{robot}/goal_pose"
 
@@ -129,7 +131,7 @@ class IncomingSettings(Section, frozen=True, kw_only=True):
         """All that are subscribed to, those of robots with their {robot}."""
         return [
             *(each.topic for each in self.robots),
-            *(self.set_pose.replace(TARGET, each) for each in self.targets),
+            *(self.set_pose.replace(TARGET, ros_name(each)) for each in self.targets),
             *(each.topic for each in self.zones),
             *(each.topic for each in self.grids),
         ]
@@ -143,21 +145,37 @@ def check_incoming(settings: IncomingSettings, source: str = "settings") -> None
             raise ConfigError(
                 f"{where}: topic is {robots.topic!r}, expected {ROBOT} in it, or an id and none in it"
             )
-        _check_braces(robots.topic, ROBOT, 0 if robots.id else 1, f"{where}.topic")
+        _check_topic(robots.topic, ROBOT, 0 if robots.id else 1, f"{where}.topic")
+        own = (robots.topic, robots.plan, robots.goal)
+        if len({each.replace(ROBOT, robots.id or ROBOT) for each in own}) < len(own):
+            raise ConfigError(f"{where}: topic, plan and goal are {', '.join(own)}, expected three topics")
         for key in ("plan", "goal"):
             most = 0 if robots.id is not None and ROBOT not in getattr(robots, key) else 1
-            _check_braces(getattr(robots, key), ROBOT, most, f"{where}.{key}")
+            _check_topic(getattr(robots, key), ROBOT, most, f"{where}.{key}")
         _check_braces(robots.frame, ROBOT, robots.frame.count(ROBOT), f"{where}.frame")
-    _check_braces(settings.set_pose, TARGET, 1, f"{source}: set_pose")
+    for n, zone in enumerate(settings.zones):
+        _check_topic(zone.topic, ROBOT, 0, f"{source}: zones[{n}].topic")
+    for n, grid in enumerate(settings.grids):
+        _check_topic(grid.topic, ROBOT, 0, f"{source}: grids[{n}].topic")
+    _check_topic(settings.set_pose, TARGET, 1, f"{source}: set_pose")
     for key, names in (
-        ("robots", [each.id for each in settings.robots if each.id]),
+        (
+            "robots and grids",
+            [*(each.id for each in settings.robots if each.id), *(each.name for each in settings.grids)],
+        ),
         ("targets and goal_targets", [*settings.targets, *settings.goal_targets]),
         ("zones", [each.name for each in settings.zones]),
-        ("grids", [each.name for each in settings.grids]),
         ("topics", settings.topics),
     ):
         if doubled := [name for name, many in Counter(names).items() if many > 1]:
             raise ConfigError(f"{source}: {key}: {doubled[0]!r} is there twice, expected once")
+
+
+def _check_topic(topic: str, part: str, many: int, where: str) -> None:
+    """Zenoh refuses what is none: empty parts between slashes, a slash at the end."""
+    _check_braces(topic, part, many, where)
+    if not _TOPIC.fullmatch(topic.replace(part, "x")):
+        raise ConfigError(f"{where} is {topic!r}, expected a topic such as /a/b, of letters, digits and _")
 
 
 def _check_braces(text: str, part: str, many: int, where: str) -> None:

@@ -6,14 +6,17 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from support.effort import few
 
+from launch_scripts.commands.ros2 import settings_of
 from launch_scripts.ros2.actions import Channel, Declare, Put, Remove
 from launch_scripts.ros2.diagnostics import Health
 from launch_scripts.ros2.frames import RosMap
@@ -33,7 +36,7 @@ from launch_scripts.ros2.packed_places import (
     PackedTransforms,
 )
 from launch_scripts.ros2.peers import PeerWatch
-from launch_scripts.ros2.settings import Settings, parse_settings
+from launch_scripts.ros2.settings import Settings, load_settings, parse_settings
 from launch_scripts.ros2.topics import ROWS
 from launch_scripts.ros2.types import Distribution, types_of
 from swarm.client.observer import SeenTarget, SeenVehicle
@@ -430,6 +433,8 @@ def test_a_peer_that_hears_us_or_asks_for_something_else_is_not_named(changes: d
         ("[ros]\ndomain = 233", "ros.domain: found 233"),
         ('[frames]\nmap = "{vehicle}"', "frames.map: found"),
         ("[rso]\ndomain = 3", "rso"),
+        ('[frames]\nmap = "terrain"', "frames.map is 'terrain', which is the frame of the terrain's coordinates"),
+        ('[frames]\nmap = "map/"', "frames.map: found 'map/'"),
     ],
 )
 def test_a_mistake_in_the_settings_is_one_sentence_that_names_the_key(text: str, says: str) -> None:
@@ -443,3 +448,26 @@ def test_ros_nodes_beyond_this_machine_need_a_word() -> None:
     text = '[ros]\nendpoint = "tcp/10.0.0.1:7447"\nin_the_clear = true'
     assert parse_settings(text).ros.endpoint == "tcp/10.0.0.1:7447"
     assert parse_settings("") == Settings()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[[incoming.robots]]",
+        '[[incoming.robots]]\nid = "spot"\ntopic = "/odometry"',
+        '[incoming]\ntargets = ["t"]',
+    ],
+)
+def test_options_change_what_they_name_and_nothing_else(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text(text)
+    said = {"ros.domain": 3, "vehicles": None, "ros.endpoint": None}
+    before, after = parse_settings(text), load_settings(file, said)
+    assert after == replace(before, ros=replace(before.ros, domain=3))
+    assert settings_of(file, dict.fromkeys(said)) == before
+
+
+def test_a_mistake_in_the_options_is_one_sentence_that_names_them() -> None:
+    with pytest.raises(ConfigError, match=r"options: ros\.domain: found 400"):
+        load_settings(None, {"ros.domain": 400})

@@ -19,7 +19,13 @@ from launch_scripts.ros2.frames import RosMap, quaternion_of
 from launch_scripts.ros2.incoming.areas import MOST_CELLS, closed_cells, corners_of
 from launch_scripts.ros2.incoming.goals import GoalTargets
 from launch_scripts.ros2.incoming.places import FrameReader, Place, robot_place
-from launch_scripts.ros2.incoming.settings import IncomingSettings, Robots, ZoneSettings, check_incoming
+from launch_scripts.ros2.incoming.settings import (
+    GridSettings,
+    IncomingSettings,
+    Robots,
+    ZoneSettings,
+    check_incoming,
+)
 from launch_scripts.ros2.incoming.tracks import Track
 from launch_scripts.ros2.messages import RosMessages
 from launch_scripts.ros2.packed_path import packed_path
@@ -272,6 +278,19 @@ def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
         (
             IncomingSettings(zones=(ZoneSettings(name="z", topic="/a"), ZoneSettings(name="z", topic="/b"))),
             "zones: 'z' is there twice",
+        ),
+        (
+            IncomingSettings(
+                robots=(Robots(id="r", topic="/r/odom"),), grids=(GridSettings(name="r", topic="/seen"),)
+            ),
+            "robots and grids: 'r' is there twice",
+        ),
+        (IncomingSettings(targets=("a-b", "a_b")), "'/targets/a_b/set_pose' is there twice"),
+        (IncomingSettings(robots=(Robots(plan="/{robot}/odom"),)), "expected three topics"),
+        (IncomingSettings(robots=(Robots(topic="/{robot}//odom"),)), "topic is '/{robot}//odom', expected a topic"),
+        *(
+            (IncomingSettings(zones=(ZoneSettings(name="z", topic=topic),)), f"zones[0].topic is {topic!r}")
+            for topic in ("/a//b", "/a/", "//", "/1a", "a", "/{x}", "/{robot}", "/a*", "/a b")
         ),
     ],
 )
