@@ -120,7 +120,9 @@ def export(
     kind_of_file = out.suffix.lower()
     try:
         if kind_of_file in _TEXT:
-            out.write_text(stored_marks.to_json(terrain, grid, sets), encoding="utf-8")
+            with KeeperStore(store, read_only=True) as kept:
+                classes = kept.classes
+            out.write_text(stored_marks.to_json(terrain, grid, sets, classes), encoding="utf-8")
         elif kind_of_file in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
         elif kind_of_file in _SHAPES:
@@ -152,9 +154,9 @@ def import_(
 
     swarm map import marks.json my.sqlite
     """
-    terrain, grid, sets = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
+    terrain, grid, sets, classes = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
     with KeeperStore(store) as into:
-        into.bind(terrain, grid)
+        into.bind(terrain, grid, classes)
         into.save(sets)
     print(f"{store}: merged {_counted(grid, sets)}")
 
