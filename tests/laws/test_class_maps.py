@@ -72,7 +72,10 @@ class History:
 
     def learn(self) -> None:
         author = MapReplica(self.grid, author=f"all.l{self.rng.integers(3)}.{self.rng.integers(1, 1 << 20)}")
-        said = {int(key): Said(int(self.rng.integers(50, 500)), int(self.rng.integers(-60_000, 60_000)), 10) for key in range(4)}
+        said = {
+            int(key): Said(int(self.rng.integers(50, 500)), int(self.rng.integers(-60_000, 60_000)), 10)
+            for key in range(4)
+        }
         self.replica.merge([each.mark_set for each in author.write_learned(said, 10)])
 
     def happen(self) -> None:
@@ -101,7 +104,9 @@ class History:
             np.testing.assert_array_equal(mine.pace_s_per_m, theirs.pace_s_per_m)
         for name in NUMBERS:
             shut = ~np.isfinite(self.grounds[name].ground_s_per_m)
-            assert not np.isfinite(self.maps.of[name].ground_s_per_m[shut]).any(), "a mark opened what it cannot drive"
+            assert not np.isfinite(self.maps.of[name].ground_s_per_m[shut]).any(), (
+                "a mark opened what it cannot drive"
+            )
 
 
 def test_maps_of_classes_follow_from_what_is_held() -> None:

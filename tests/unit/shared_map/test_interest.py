@@ -103,12 +103,18 @@ reassign_s = 2
 """)
 
 
-def test_one_that_enters_a_whole_large_map_asks_for_every_tile_of_every_class_in_messages_that_can_be_read() -> None:
+def test_one_that_enters_a_whole_large_map_asks_for_every_tile_of_every_class_in_messages_that_can_be_read() -> (
+    None
+):
     grid, bus = GridSpec(8192, 8192, 1.0), mock.Mock()
     sync = MapSync(MapReplica(grid), bus, lambda event: None, MapConfig(), "agent", near=True)
     sync.enter(frozenset(range(grid.regions)))
     asked = [decode(encode(call.args[1]), MarksRequest).tiles for call in bus.ask.call_args_list]
-    every = [tile for number in range(MOST_CLASSES + 1) for tile in range(grid.tile_for(0, number), grid.tile_for(grid.tiles, number))]
+    every = [
+        tile
+        for number in range(MOST_CLASSES + 1)
+        for tile in range(grid.tile_for(0, number), grid.tile_for(grid.tiles, number))
+    ]
     assert sorted(tile for tiles in asked for tile in tiles) == sorted([*every, grid.tiles])
 
 
