@@ -131,13 +131,20 @@ def export(
             raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS + _SHAPES)}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    print(f"{out}: {_counted(grid, sets, learned=kind_of_file in _TEXT)}")
+    print(f"{out}: {_counted(grid, sets) if kind_of_file in _TEXT else _counted_for_all(grid, sets)}")
 
 
-def _counted(grid: GridSpec, sets: list[MarkSet], *, learned: bool = True) -> str:
+def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
     marks, words = _parted(grid, sets)
     text = f"{sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets"
-    return f"{text}, and what {len(words)} authors have learned" if words and learned else text
+    return f"{text}, and what {len(words)} authors have learned" if words else text
+
+
+def _counted_for_all(grid: GridSpec, sets: list[MarkSet]) -> str:
+    """Of pixels and polygons, which show the winners among the marks for all vehicles."""
+    text = _counted(grid, [each for each in sets if each.tile < grid.tiles])
+    own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
+    return f"{text}; {own} marks for one class alone are left out, .json has them" if own else text
 
 
 def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:

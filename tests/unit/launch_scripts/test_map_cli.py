@@ -89,14 +89,16 @@ def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path) -> None:
     for_truck = set_of("a1.1", GRID.tile_for(0, 2), 3, {5: (LETHAL, 0, 10)})
     with KeeperStore(store) as kept:
         kept.bind("fedcba9876543210", GRID, ["walker", "truck"])
-        kept.save([for_truck])
+        kept.save([for_truck, SETS[0]])
     assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
     assert CliRunner().invoke(app, ["import", str(out), str(again)]).exit_code == 0
     with KeeperStore(again) as copy:
         assert copy.classes == ["walker", "truck"]
-        assert list(copy.load()) == [for_truck]
+        assert sorted(copy.load(), key=lambda each: each.tile) == [SETS[0], for_truck]
         with pytest.raises(StoreError, match="marks for truck alone"):
             copy.bind("fedcba9876543210", GRID, ["truck", "walker"])
+    pixels = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "map.tif")]).output
+    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in pixels.replace("\n", " ")
 
 
 def test_a_geotiff_says_where_and_what(tmp_path: Path) -> None:
