@@ -98,7 +98,9 @@ def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="marks for truck alone"):
             copy.bind("fedcba9876543210", GRID, ["truck", "walker"])
     pixels = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "map.tif")]).output
-    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in pixels.replace("\n", " ")
+    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in pixels.replace(
+        "\n", " "
+    )
 
 
 def test_a_geotiff_says_where_and_what(tmp_path: Path) -> None:
