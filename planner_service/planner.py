@@ -351,11 +351,14 @@ class Planner:
         most = (MOST_STEPS if self._puller is None else MOST_PULLED_STEPS) // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
         if (search := self._under_way) is not None:
-            routes = search.routes(self._ways, cells, request.vehicles, max_cells, self.tree.map_version)
+            ways, vehicles = self._ways, request.vehicles
+            routes = self._known(
+                lambda: search.routes(ways, cells, vehicles, max_cells, self.tree.map_version), now_ns
+            )
         else:
             routes = self._read(cells, max_cells, now_ns)
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
-                routes = self.tree.routes(cells, max_cells)
+                routes = self._read(cells, max_cells, now_ns)
             self._certify(routes, now_ns)
         routes = self._pulled(routes)
         self.counters.count("routes_served", len(routes))
@@ -376,12 +379,24 @@ class Planner:
         )
 
     def _read(self, cells: list[int], max_cells: int, now_ns: int) -> RouteBatch:
-        """Routes off the tree. None passes what has changed on the map, as far as it is known here."""
-        routes = self.tree.routes(cells, max_cells)
-        if self._told is None or not self.tree.ready or not self._intake.concerns(routes):
+        """Routes off the tree."""
+        return self._known(lambda: self.tree.routes(cells, max_cells), now_ns)
+
+    def _known(self, find: Callable[[], RouteBatch], now_ns: int) -> RouteBatch:
+        """Routes by what the tree knows of the map. None passes what has changed since, as far as it is known here.
+
+        Every route that is given to anybody comes through here.
+        """
+        routes = find()
+        if not self._intake.concerns(routes):
             return routes
-        self._take_in((self._told[0], self._cost_map.version), now_ns)
-        return self.tree.routes(cells, max_cells)
+        if self._told is not None and self.tree.ready:
+            self._take_in((self._told[0], self._cost_map.version), now_ns)
+        elif self._under_way is not None:
+            self._learn_map(now_ns)
+        else:
+            return routes
+        return find()
 
     def _pulled(self, routes: RouteBatch) -> RouteBatch:
         return routes if self._puller is None else self._puller.pull_batch(routes)
@@ -480,14 +495,17 @@ class Planner:
                 break
             if not searcher.wants_place(id) or now_ns < follower.push_ns:
                 continue
-            found = searcher.route(self._ways, id, follower.cell, follower.max_cells, self.tree.map_version)
-            route = self._pulled(found)[0]
+            route = self._pulled(self._place(searcher, id, follower, now_ns))[0]
             follower.push_ns = now_ns + self._push_ns
             if is_place(route):
                 self.followers.sent(follower, route, now_ns + self._push_ns)
                 pushes.append(self._pushed(id, route, searcher.goals[id]))
         self.counters.count("pushes", len(pushes))
         return pushes
+
+    def _place(self, searcher: Searcher, id: str, follower: Follower, now_ns: int) -> RouteBatch:
+        at, most = follower.cell, follower.max_cells
+        return self._known(lambda: searcher.route(self._ways, id, at, most, self.tree.map_version), now_ns)
 
     def _pushed(self, vehicle: str, route: Route, target_cell: int) -> PushedRoute:
         return PushedRoute(

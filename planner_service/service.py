@@ -341,7 +341,9 @@ class PlannerService:
     def _obeys(self, order: Obey) -> bool:
         if order.subject is not None:
             return self._obeyed_version == self._obedience.book.version
-        return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
+        # A zone may be for one class alone; trees of all classes must know of it.
+        knows_map = all(planner.knows_map for _, planner in self._planners)
+        return self._sync.holds(order.author, order.sets, self._now_ns) and knows_map
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()

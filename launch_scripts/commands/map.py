@@ -120,7 +120,9 @@ def export(
     kind_of_file = out.suffix.lower()
     try:
         if kind_of_file in _TEXT:
-            out.write_text(stored_marks.to_json(terrain, grid, sets), encoding="utf-8")
+            with KeeperStore(store, read_only=True) as kept:
+                classes = kept.classes
+            out.write_text(stored_marks.to_json(terrain, grid, sets, classes), encoding="utf-8")
         elif kind_of_file in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
         elif kind_of_file in _SHAPES:
@@ -129,13 +131,20 @@ def export(
             raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS + _SHAPES)}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    print(f"{out}: {_counted(grid, sets, learned=kind_of_file in _TEXT)}")
+    print(f"{out}: {_counted(grid, sets) if kind_of_file in _TEXT else _counted_for_all(grid, sets)}")
 
 
-def _counted(grid: GridSpec, sets: list[MarkSet], *, learned: bool = True) -> str:
+def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
     marks, words = _parted(grid, sets)
     text = f"{sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets"
-    return f"{text}, and what {len(words)} authors have learned" if words and learned else text
+    return f"{text}, and what {len(words)} authors have learned" if words else text
+
+
+def _counted_for_all(grid: GridSpec, sets: list[MarkSet]) -> str:
+    """Of pixels and polygons, which show the winners among the marks for all vehicles."""
+    text = _counted(grid, [each for each in sets if each.tile < grid.tiles])
+    own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
+    return f"{text}; {own} marks for one class alone are left out, .json has them" if own else text
 
 
 def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
@@ -152,9 +161,9 @@ def import_(
 
     swarm map import marks.json my.sqlite
     """
-    terrain, grid, sets = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
+    terrain, grid, sets, classes = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
     with KeeperStore(store) as into:
-        into.bind(terrain, grid)
+        into.bind(terrain, grid, classes)
         into.save(sets)
     print(f"{store}: merged {_counted(grid, sets)}")
 

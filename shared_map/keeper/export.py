@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -60,9 +60,23 @@ class _Export(msgspec.Struct):
     terrain: str
     grid: GridSpec
     sets: list[_Set]
+    classes: list[str] | None = None
 
 
-def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
+class ExportedMap(NamedTuple):
+    """What a store holds.
+
+    terrain  its digest
+    classes  of vehicles beside "ground", in the order of their numbers; None if that is not known
+    """
+
+    terrain: str
+    grid: GridSpec
+    sets: list[MarkSet]
+    classes: list[str] | None
+
+
+def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet], classes: Sequence[str] = ()) -> str:
     """Every set, readable: marks as [row, col, kind, pace or null, stamp_ns] and, where one ends by itself, when;
     what was learned as [number, kind of ground, cells, mean and variance of 65536 ln(driven / prior pace)]."""
     listed = [
@@ -77,7 +91,7 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
         for each in sorted(sets, key=lambda each: (each.tile, each.author))
     ]
     lines = ",\n ".join(json.dumps(each) for each in listed)  # a line a set; a line a mark takes thrice that
-    head = json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid)})
+    head = json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid), "classes": list(classes)})
     return f'{head[:-1]},\n"sets": [\n {lines}\n]}}\n'
 
 
@@ -107,8 +121,8 @@ def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
     return marks
 
 
-def from_json(text: str | bytes) -> tuple[str, GridSpec, list[MarkSet]]:
-    """(terrain, grid, sets). Raises StoreError with the place of what is wrong."""
+def from_json(text: str | bytes) -> ExportedMap:
+    """What was exported. Raises StoreError with the place of what is wrong."""
     try:
         read = msgspec.json.decode(text, type=_Export)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -119,7 +133,7 @@ def from_json(text: str | bytes) -> tuple[str, GridSpec, list[MarkSet]]:
             sets.append(_set(each, read.grid))
         except (ValueError, TypeError, OverflowError) as error:
             raise StoreError(f"not an exported map: sets[{number}]: {error}") from error
-    return read.terrain, read.grid, sets
+    return ExportedMap(read.terrain, read.grid, sets, read.classes)
 
 
 def _set(each: _Set, grid: GridSpec) -> MarkSet:

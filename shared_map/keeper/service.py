@@ -90,7 +90,7 @@ class KeeperService:
         self._sightings_due_ns = 0
         self._noted_ns: int | None = None
         self._named: list[str] = []
-        store.bind(terrain.digest, terrain.grid)
+        store.bind(terrain.digest, terrain.grid, list(self._numbers))
         for each in self.replica.merge(list(store.load()), measured=False).sets:
             self._keeper.restored(each)
 

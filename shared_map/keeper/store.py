@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO
@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 import msgspec
 
+from shared_map.keeper.class_order import agreed
 from shared_map.keeper.compaction import united, without
 from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import base_seq, is_tombstone
@@ -80,6 +81,12 @@ ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.ep
     untils_ns = excluded.untils_ns
 WHERE (excluded.epoch, excluded.seq) >= (sets.epoch, sets.seq)
 """
+_CLASSES_USED = """
+SELECT DISTINCT tile / (:tiles + 1) FROM (
+    SELECT tile, kinds FROM sets WHERE tile > :tiles UNION ALL SELECT tile, kinds FROM folded WHERE tile > :tiles
+) WHERE length(kinds) > 0
+"""
+"""Numbers of classes for which alone something is marked, or was until compaction set it aside."""
 _DELETE = "DELETE FROM sets WHERE tile = ? AND author = ? AND (epoch, seq) <= (?, ?)"
 _OUTDATE = "DELETE FROM folded WHERE tile = ? AND author = ? AND (epoch, seq) < (?, ?)"
 """What was dropped from a set counts only until its author states something newer."""
@@ -117,8 +124,12 @@ class KeeperStore:
             log.warning("moved the damaged store to %s", _move_aside(self.path))
             self._db = _open(str(path))
 
-    def bind(self, terrain: str, grid: GridSpec) -> None:
-        """Tie the store to this terrain. Raises StoreError if it holds the marks of another."""
+    def bind(self, terrain: str, grid: GridSpec, classes: Sequence[str] | None = ()) -> None:
+        """Tie the store to this terrain, and to these classes. Raises StoreError if it holds the marks of another
+        terrain, or marks for one class alone by whose number another is meant.
+
+        classes  those of the scenario beside "ground", in the order of their numbers; None: not known
+        """
         bound = self.terrain
         if bound is None:
             try:
@@ -132,6 +143,34 @@ class KeeperStore:
                 f"the store {self.path} holds marks on terrain {bound}, but this run has terrain {terrain}: "
                 "give another --store, or the terrain and cost rules that it was made with"
             )
+        if classes is not None:
+            self._bind_classes(list(classes), grid)
+
+    def _bind_classes(self, classes: list[str], grid: GridSpec) -> None:
+        stored = self.classes
+        try:
+            used = {row[0] for row in self._db.execute(_CLASSES_USED, {"tiles": grid.tiles})}
+            order = agreed(stored, classes, used)
+            if isinstance(order, str):
+                raise StoreError(
+                    f"the store {self.path} holds {order}: list it in [[classes]] at its old place, or give "
+                    "another --store"
+                )
+            if order != stored:
+                with self._db:
+                    self._db.execute("REPLACE INTO meta VALUES ('classes', ?)", (json.dumps(order),))
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    @property
+    def classes(self) -> list[str]:
+        """The classes of vehicles beside "ground", in the order of the numbers by which marks name them; none in a
+        store that was not told them."""
+        text = self._meta("classes")
+        try:
+            return [] if text is None else msgspec.json.decode(text, type=list[str])
+        except (msgspec.MsgspecError, ValueError) as error:
+            raise StoreError(_damaged(self.path, f"classes: {error}")) from error
 
     @property
     def terrain(self) -> str | None:

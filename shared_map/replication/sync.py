@@ -36,6 +36,8 @@ _MAX_ASKS = 16
 _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
 _OFFERS_AT_ONCE = 256
+_TILES_AT_ONCE = 1 << 16
+"""Named in one question: the tiles of all classes on a large map are more than a message has room for."""
 _QUANTUM = 16_384
 """Statements of one author that are merged before its quota is looked at again."""
 _MANY = "-"
@@ -135,8 +137,9 @@ class MapSync:
         tiles = of_all_classes(grid, [tile for region in new for tile in region_tiles(grid, region)])
         if not before:
             tiles.append(beyond_tile(grid))
-        if tiles:
-            self._bus.ask(MARKS, MarksRequest(tiles=tiles, bulk=True), self._post, tag=_ENTER)
+        for first in range(0, len(tiles), _TILES_AT_ONCE):
+            request = MarksRequest(tiles=tiles[first : first + _TILES_AT_ONCE], bulk=True)
+            self._bus.ask(MARKS, request, self._post, tag=_ENTER)
 
     def _listen(self, **fields: int) -> None:
         if self._at_ticks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 
@@ -35,10 +35,10 @@ class Member:
     """One process's membership in a run.
 
     A process asks all others for their run when it starts, whenever a link comes back and whenever a router
-    appears, as behind it there may be others. Two processes belong together when run id and terrain digest are the
-    same; each is then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs. A
-    confirmed one never exits because of an answer; it reports the sender as a stranger: counts it, and names it
-    once.
+    appears, as behind it there may be others. Two processes belong together when run id, terrain digest and the
+    classes of vehicles, in their order, are the same; each is then confirmed. An unconfirmed process exits, with
+    RunMismatchError, if every answer differs. A confirmed one never exits because of an answer; it reports the
+    sender as a stranger: counts it, and names it once.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
@@ -239,3 +239,12 @@ def check_same_run(mine: RunInfo, other: RunInfo) -> None:
             f"{mine.role} {mine.id} has terrain {mine.terrain} ({mine.rows} x {mine.cols}), but {who} has "
             f"{other.terrain} ({other.rows} x {other.cols}): terrain files or cost rules differ"
         )
+    if other.classes != mine.classes:
+        raise RunMismatchError(
+            f"{mine.role} {mine.id} has the classes of vehicles {_listed(mine.classes)}, but {who} has "
+            f"{_listed(other.classes)}: marks name classes by their place in [[classes]], which differs"
+        )
+
+
+def _listed(classes: Sequence[str]) -> str:
+    return ", ".join(classes) if classes else "none"

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from support import slow_twins as naive
 from support.effort import few
-from support.planner_strategies import random_pace
+from support.planner_strategies import STRATEGIES, random_pace
 from support.scripted_planner import TICK, chasers
 
 from planner_service.map_intake import LONGEST_WAIT_NS
 from planner_service.planner import Planner
+from planner_service.search.target_search import Hidden, TargetSearch
 from planner_service.target_tree import TargetTree
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import walk
 from swarm.runtime.stats import Counters
@@ -34,17 +36,26 @@ class Watched:
         self.rng = rng = np.random.default_rng(seed)
         self.map = CostMap(terrain_of_pace(random_pace(rng, SIDE, SIDE, 5.0, (0.0, 0.15, 0.3)[seed % 3])))
         self.grid = self.map.grid
-        config = PlannerConfig(strategy=("exact", "auto", "full")[seed // 3 % 3])  # type: ignore[arg-type]
+        config = PlannerConfig(strategy=STRATEGIES[seed // 3 % len(STRATEGIES)])  # type: ignore[arg-type]
         tree = TargetTree(self.grid, config)
         self.planner = Planner("t0", 7, config, tree, self.map, Counters())
         self.now_ns = self.seq = 0
+        self.at: int | None = None
+        """Where the target is."""
         self.routes = self.waited = 0
         self.told_at: dict[int, int] = {}
         """Version of the map -> when there was one first."""
         self.pose()
 
     def pose(self) -> None:
-        cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
+        open_ = np.flatnonzero(np.isfinite(self.map.pace_s_per_m))
+        cell = int(self.rng.choice(open_))
+        if self.at is not None and self.rng.integers(4):  # a step or two, after which most trees are not exact
+            rows, cols = np.divmod(open_, SIDE)
+            row, col = divmod(self.at, SIDE)
+            near = open_[np.maximum(abs(rows - row), abs(cols - col)) <= 2]
+            cell = int(self.rng.choice(near)) if len(near) else cell
+        self.at = cell
         self.seq += 1
         told = TargetPose(
             target="t0", tracker="radar", incarnation=1, seq=self.seq, stamp_ns=0, cell=cell, x_m=0, y_m=0
@@ -95,7 +106,7 @@ class Watched:
 
 def test_no_route_leads_through_a_change_that_waits_and_none_waits_for_long() -> None:
     routes = waited = 0
-    for seed in range(few(36)):
+    for seed in range(few(72)):
         watched = Watched(seed)
         watched.tick()
         for _ in range(40):
@@ -111,6 +122,54 @@ def test_no_route_leads_through_a_change_that_waits_and_none_waits_for_long() ->
         routes, waited = routes + watched.routes, waited + watched.waited
     assert routes > 100
     assert waited > 10, "every change was taken in at once"
+
+
+class Searched(Watched):
+    """The same of a target that nobody sees, once its planner has begun to search for it."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        grid, config = self.grid, PlannerConfig(strategy="exact")
+        tree = TargetTree(grid, config)
+        hidden = Hidden(
+            tracked=False, sense_range_m=4.0, capture_range_m=1.0, slowness=2.0, jumps=False, seed=str(seed)
+        )
+        search = TargetSearch(hidden, tree.cost_grid, 1.0)
+        self.planner = Planner("t0", 7, config, tree, self.map, Counters(), target_search=search)
+        if seed % 2:  # seen once; else never
+            cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
+            x_m, y_m = grid.centre_m(cell)
+            seen = TargetPose(target="t0", incarnation=1, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m)
+            self.planner.set_pose(seen, 0)
+            east_m, south_m = np.array([x_m - grid.west_m]), np.array([grid.north_m - y_m])
+            search.hear_vehicles(east_m.astype(np.float32), south_m.astype(np.float32))
+        while not search.active:
+            self.now_ns += TICK
+            self.planner.tick(self.now_ns)
+            assert self.now_ns < 10 * NS_PER_S
+
+    def check(self, route: Route) -> None:
+        if route.status is not RouteStatus.SEARCHING or not route.directions:
+            return
+        self.routes += 1
+        driven = naive.follow(self.map.pace_s_per_m, route.start, route.directions)
+        assert driven is not None, "through a cell that is known to be lethal"
+        assert driven[1] * self.grid.resolution_m == pytest.approx(route.cost_s, rel=1e-5)
+
+
+def test_nobody_is_sent_to_look_for_a_target_through_a_change_that_waits() -> None:
+    routes = 0
+    for seed in range(few(24)):
+        watched = Searched(seed)
+        for _ in range(60):
+            if watched.rng.integers(3):
+                watched.mark()
+            else:
+                watched.ask()
+            if watched.rng.integers(3) == 0:
+                watched.tick()
+        routes += watched.routes
+    assert routes > 100
 
 
 def test_routes_are_read_as_places_as_they_are_walked() -> None:

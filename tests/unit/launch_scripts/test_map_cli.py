@@ -39,7 +39,7 @@ def stored(path: Path, sets: list[MarkSet]) -> Path:
 
 @given(st.lists(mark_sets(), max_size=6, unique_by=lambda each: (each.tile, each.author)))
 def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
-    terrain, grid, read = from_json(to_json("t", GRID, sets))
+    terrain, grid, read, _ = from_json(to_json("t", GRID, sets))
     assert (terrain, grid) == ("t", GRID)
 
     def bare(each: MarkSet) -> MarkSet:  # a pace means something in a PACE mark only
@@ -82,6 +82,25 @@ def test_export_import_and_inspect_on_the_command_line(tmp_path: Path) -> None:
     assert (found["marks"], found["sets"], found["cells_with_marks"], found["cells_lethal"]) == (3, 3, 2, 1)
     assert found["authors"]["a2.1"] == {"sets": 2, "marks": 1, "tombstones": 1}
     assert "3 marks in 3 sets" in CliRunner().invoke(app, ["inspect", str(again)]).output
+
+
+def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path) -> None:
+    store, out, again = tmp_path / "map.sqlite", tmp_path / "map.json", tmp_path / "again.sqlite"
+    for_truck = set_of("a1.1", GRID.tile_for(0, 2), 3, {5: (LETHAL, 0, 10)})
+    with KeeperStore(store) as kept:
+        kept.bind("fedcba9876543210", GRID, ["walker", "truck"])
+        kept.save([for_truck, SETS[0]])
+    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    assert CliRunner().invoke(app, ["import", str(out), str(again)]).exit_code == 0
+    with KeeperStore(again) as copy:
+        assert copy.classes == ["walker", "truck"]
+        assert sorted(copy.load(), key=lambda each: each.tile) == [SETS[0], for_truck]
+        with pytest.raises(StoreError, match="marks for truck alone"):
+            copy.bind("fedcba9876543210", GRID, ["truck", "walker"])
+    pixels = CliRunner().invoke(app, ["export", str(store), str(tmp_path / "map.tif")]).output
+    assert "2 marks in 1 sets; 1 marks for one class alone are left out, .json has them" in pixels.replace(
+        "\n", " "
+    )
 
 
 def test_a_geotiff_says_where_and_what(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
+from support.map_strategies import set_of
 from support.planner_swarm import TICK, Ear
 from support.swarm_model import SwarmModel
 
@@ -18,6 +19,7 @@ from planner_service.service import PlannerService
 from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps, read_by
 from shared_map.cost_map import CostMap
+from shared_map.keeper.zones import rows_of
 from shared_map.learning.words import ONE, Said
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -25,8 +27,9 @@ from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.grid import walk
+from swarm.grid import TILE_CELLS, walk
 from swarm.wire.fields import column
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, RouteRequest
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import RouteStatus
@@ -206,6 +209,24 @@ def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(
         world.run(2)
         assert world.trees() == ["ground"]
     assert world.service._asked_by(world.service._tag("grow-tree", "ground")) is not None
+
+
+def test_a_zone_for_one_class_is_obeyed_once_the_tree_of_that_class_knows_of_it() -> None:
+    world = _World()
+    world.run(2.0)
+    world.ask(CostRequest(cells=[world.target], vehicle_class="low"))
+    world.run(1.0)
+    grid, replica = world.terrain.grid, world.service._replica
+    row, col = grid.row_col(_open_cell())
+    cell = row % TILE_CELLS * TILE_CELLS + col % TILE_CELLS
+    tile = grid.tile_for(grid.tile_of(_open_cell()), _NUMBERS["low"])
+    for seq, kind in ((1, MarkKind.LETHAL), (2, MarkKind.CLEAR)):
+        zone = set_of("operator.z1", tile, seq, {cell: (kind, 0.0, seq)}, group="operator")
+        replica.merge([zone])
+        order = Obey(author=zone.author, sets=rows_of([zone]))
+        assert not world.service._obeys(order)
+        world.run(1.2)
+        assert world.service._obeys(order)
 
 
 def test_a_class_that_says_nothing_has_the_routes_of_ground_to_the_bit(world: _World) -> None:

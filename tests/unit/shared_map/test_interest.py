@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,11 +16,15 @@ from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import WIDE_TERRAIN, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.sync import MapSync
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.classes import MOST_CLASSES
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
-from swarm.wire.messages.marks import MarkSet
+from swarm.config.scenario import MapConfig, Scenario
+from swarm.grid import GridSpec
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.statements import MarkKind
 from vehicle_agent.service import AgentService
 
@@ -95,6 +101,21 @@ sense_range_m = 240
 capture_range_m = 60
 reassign_s = 2
 """)
+
+
+def test_one_that_enters_a_whole_large_map_asks_for_every_tile_of_every_class_in_messages_that_can_be_read() -> (
+    None
+):
+    grid, bus = GridSpec(8192, 8192, 1.0), mock.Mock()
+    sync = MapSync(MapReplica(grid), bus, lambda event: None, MapConfig(), "agent", near=True)
+    sync.enter(frozenset(range(grid.regions)))
+    asked = [decode(encode(call.args[1]), MarksRequest).tiles for call in bus.ask.call_args_list]
+    every = [
+        tile
+        for number in range(MOST_CLASSES + 1)
+        for tile in range(grid.tile_for(0, number), grid.tile_for(grid.tiles, number))
+    ]
+    assert sorted(tile for tiles in asked for tile in tiles) == sorted([*every, grid.tiles])
 
 
 def check_interest(simulation: Simulation) -> tuple[int, int]:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.map_strategies import GRID, Acknowledged, set_of
 from support.swarm_model import SwarmModel
 
@@ -14,12 +16,14 @@ from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.learning.words import ONE, Said, told
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.load import parse_scenario
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.errors import StoreError
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import MarkKind
 
 LETHAL = MarkKind.LETHAL
+CLASSES = ["walker", "truck", "drone", "mule"]
 
 
 def some_sets(count: int = 5) -> list[MarkSet]:
@@ -85,6 +89,40 @@ def test_the_store_of_another_terrain_is_refused(tmp_path: Path) -> None:
     store.bind("0123456789abcdef", GRID)
     with pytest.raises(StoreError, match="holds marks on terrain 0123456789abcdef, but this run has terrain fed"):
         store.bind("fed", GRID)
+
+
+@given(st.permutations(CLASSES), st.integers(0, 4), st.permutations(CLASSES), st.integers(0, 4), st.data())
+def test_a_mark_for_one_class_alone_is_for_that_class_in_every_run_that_has_the_store(
+    before: list[str], many: int, after: list[str], later: int, data: st.DataObject
+) -> None:
+    first, then = before[:many], after[:later]
+    marked = data.draw(st.sets(st.sampled_from(first))) if first else set()
+    with KeeperStore(":memory:") as store:
+        store.bind("t", GRID, first)
+        store.save(
+            [set_of("a1.1", GRID.tile_for(3, first.index(name) + 1), 2, {5: (LETHAL, 0.0, 9)}) for name in marked]
+        )
+        store.save([set_of("a2.1", GRID.tile_for(3, n), 2, {}) for n in range(1, 5)])  # nothing is said by these
+        sound = all(
+            then.index(name) == first.index(name) if name in then else first.index(name) >= later for name in marked
+        )
+        if not sound:
+            with pytest.raises(StoreError, match=r"the store :memory: holds marks for .* alone, which is class"):
+                store.bind("t", GRID, then)
+            return
+        store.bind("t", GRID, then)
+        for name in marked:  # also of a class that is not there now
+            assert store.classes[first.index(name)] == name
+
+
+def test_a_keeper_refuses_a_store_whose_marks_for_one_class_would_be_for_another(tmp_path: Path) -> None:
+    terrain = terrain_of_pace(np.ones((9, 9), np.float32))
+    scenario = parse_scenario('[[classes]]\nname = "walker"\n[[classes]]\nname = "truck"\n')
+    store = KeeperStore(tmp_path / "map.sqlite")
+    store.bind(terrain.digest, terrain.grid, ["truck"])
+    store.save([set_of("a1.1", terrain.grid.tile_for(0, 1), 2, {5: (LETHAL, 0.0, 9)})])
+    with pytest.raises(StoreError, match="marks for truck alone, which is class 1 there"):
+        SwarmModel(terrain=terrain, scenario=scenario).keeper("keeper", store)
 
 
 def test_a_store_in_use_is_refused(tmp_path: Path) -> None:

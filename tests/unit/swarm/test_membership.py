@@ -58,6 +58,10 @@ def test_members_of_one_run_get_along():
             {"terrain": "bbbb", "rows": 8},
             "planner t1 has terrain bbbb (8 x 5), but planner t0 has aaaa (4 x 5): terrain files or ",
         ),
+        (
+            {"classes": ["truck", "walker"]},
+            "planner t1 has the classes of vehicles truck, walker, but planner t0 has none: marks name classes by",
+        ),
     ],
 )
 def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words):
