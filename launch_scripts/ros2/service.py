@@ -256,11 +256,11 @@ class _Loop:
             if time.monotonic() >= self._look_due_s:
                 self._look_due_s = time.monotonic() + _LOOK_S
                 self._look()
-            now_ns = time.time_ns()
-            for action in self._gateway.tick(now_ns, self._swarm.now_ns, self._view, self._health()):
+            now_ns, stamp_ns = time.monotonic_ns(), time.time_ns()
+            for action in self._gateway.tick(now_ns, stamp_ns, self._swarm.now_ns, self._view, self._health()):
                 self._out.perform(action)
             self._tell()
-            due_s = (self._gateway.due_ns - time.time_ns()) / 1e9
+            due_s = (self._gateway.due_ns - time.monotonic_ns()) / 1e9
             if self._incoming is not None:
                 self._incoming.tick(time.monotonic_ns())
             longest_s = _LONGEST_SLEEP_S if self._incoming is None else TICK_S

@@ -15,12 +15,9 @@ from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.packed_path import packed_path
 from launch_scripts.ros2.topics import VEHICLE, TopicRow
 from swarm.client.observer import SeenVehicle
-from swarm.clock import NS_PER_S
 
 MOST_VEHICLES = 1000
 """More are not told: each has topics of its own, and each topic a token."""
-_PLAN_NS = NS_PER_S
-"""A vehicle's plan is put at most so often."""
 BARE = ("tf", "tf_static")
 """Topics that each vehicle has for itself where its frames are bare."""
 ToWgs84 = Callable[[float, float], tuple[float, float]]
@@ -61,8 +58,12 @@ class VehicleTopics:
     def told(self) -> Iterable[Moving]:
         return self._told.values()
 
-    def follow(self, seen: Mapping[str, SeenVehicle], now_ns: int) -> list[Action]:
-        """Take in who is where. Topics of those that are new are declared, of those that have left taken down."""
+    def follow(self, seen: Mapping[str, SeenVehicle], now_ns: int, stamp_ns: int) -> list[Action]:
+        """Take in who is where. Topics of those that are new are declared, of those that have left taken down.
+
+        now_ns    by a clock that never leaps
+        stamp_ns  since 1970
+        """
         gone = [name for name, moving in self._told.items() if moving.id not in seen]
         actions: list[Action] = [Remove(self._channels(name)) for name in gone]
         for name in gone:
@@ -74,9 +75,11 @@ class VehicleTopics:
         actions += [Declare(self._channels(name)) for name in came]
         if "tf_static" in self._rows and self._told:
             if self._bare:
-                actions += [self._put("tf_static", self._static([self._told[name]], now_ns), name) for name in came]
+                actions += [
+                    self._put("tf_static", self._static([self._told[name]], stamp_ns), name) for name in came
+                ]
             elif came or gone:
-                actions.append(self._put("tf_static", self._static(self.told, now_ns)))
+                actions.append(self._put("tf_static", self._static(self.told, stamp_ns)))
         return actions
 
     def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> str | None:
@@ -104,51 +107,51 @@ class VehicleTopics:
         if moving is not None and moving.id == id:
             moving.follow(np.array(list(points_m), np.float64).reshape(-1, 2))
 
-    def tell(self, due: Collection[str], now_ns: int) -> Iterator[Action]:
-        """Messages of the rows that are due."""
+    def tell(self, due: Collection[str], now_ns: int, stamp_ns: int) -> Iterator[Action]:
+        """Messages of the rows that are due. Times as those of `follow`."""
         for moving in self._told.values():
-            yield from self._of_one(due, moving, now_ns)
+            yield from self._of_one(due, moving, now_ns, stamp_ns)
         if "tf" in due and not self._bare and self._told:
-            moved = [self._transform(moving, now_ns) for moving in self._told.values()]
+            moved = [self._transform(moving, stamp_ns) for moving in self._told.values()]
             yield self._put("tf", self._messages.transforms(moved))
         if "poses" in due:
             told = sorted(self._told.values(), key=lambda moving: moving.id)
             places = np.array([(each.x_m, each.y_m) for each in told], np.float64).reshape(-1, 2)
             headings = [each.heading_rad for each in told]
-            yield self._put("poses", self._messages.pose_array(now_ns, places, headings))
+            yield self._put("poses", self._messages.pose_array(stamp_ns, places, headings))
 
-    def _of_one(self, due: Collection[str], moving: Moving, now_ns: int) -> Iterator[Action]:
+    def _of_one(self, due: Collection[str], moving: Moving, now_ns: int, stamp_ns: int) -> Iterator[Action]:
         messages, name = self._messages, moving.name
         here = moving.x_m, moving.y_m, moving.heading_rad
         if "odom" in due:
-            odometry = messages.odometry(now_ns, name, *here, moving.speed_m_per_s, moving.turn_rad_per_s)
+            odometry = messages.odometry(stamp_ns, name, *here, moving.speed_m_per_s, moving.turn_rad_per_s)
             if self._bare:
                 odometry.header.frame_id, odometry.child_frame_id = "odom", "base_link"
             yield self._put("odom", odometry, name)
         if "pose" in due:
-            yield self._put("pose", messages.pose_stamped(now_ns, *here), name)
+            yield self._put("pose", messages.pose_stamped(stamp_ns, *here), name)
         if "fix" in due and self._to_wgs84 is not None:
             frame = "base_link" if self._bare else f"{name}/base_link"
-            yield self._put("fix", messages.fix(now_ns, frame, *self._to_wgs84(moving.x_m, moving.y_m)), name)
-        if "plan" in due and moving.route_is_new and now_ns - moving.route_told_ns >= _PLAN_NS:
+            yield self._put("fix", messages.fix(stamp_ns, frame, *self._to_wgs84(moving.x_m, moving.y_m)), name)
+        if "plan" in due and moving.route_is_due(now_ns):
             moving.route_is_new, moving.route_told_ns = False, now_ns
-            yield self._put("plan", packed_path(messages.map, now_ns, moving.route), name)
+            yield self._put("plan", packed_path(messages.map, stamp_ns, moving.route), name)
         if "tf" in due and self._bare:
-            yield self._put("tf", messages.transforms([self._transform(moving, now_ns)]), name)
+            yield self._put("tf", messages.transforms([self._transform(moving, stamp_ns)]), name)
 
-    def _transform(self, moving: Moving, now_ns: int) -> Any:
+    def _transform(self, moving: Moving, stamp_ns: int) -> Any:
         place = moving.x_m, moving.y_m, moving.heading_rad
-        transform = self._messages.vehicle_transforms(now_ns, moving.name, *place)[1]
+        transform = self._messages.vehicle_transforms(stamp_ns, moving.name, *place)[1]
         if self._bare:
             transform.header.frame_id, transform.child_frame_id = "odom", "base_link"
         return transform
 
-    def _static(self, told: Iterable[Moving], now_ns: int) -> Any:
+    def _static(self, told: Iterable[Moving], stamp_ns: int) -> Any:
         transforms = []
         for moving in told:
-            transform = self._messages.vehicle_transforms(now_ns, moving.name, *self._messages.map.origin_m, None)[
-                0
-            ]
+            transform = self._messages.vehicle_transforms(
+                stamp_ns, moving.name, *self._messages.map.origin_m, None
+            )[0]
             if self._bare:
                 transform.child_frame_id = "odom"
             transforms.append(transform)
