@@ -177,7 +177,7 @@ class Ros2Service:
                     f"node /{settings.ros.node} in domain {settings.ros.domain} at {settings.ros.endpoint}, "
                     f"{settings.ros.distribution}; run {swarm.run_id}, scenario {swarm.scenario}"
                 )
-                incoming = self._incoming(node, swarm, gateway)
+                incoming = self._incoming(node, swarm, gateway, observer)
                 try:
                     _Loop(self, node, swarm, observer, gateway, incoming, self._say).run(until_s)
                 finally:
@@ -186,14 +186,14 @@ class Ros2Service:
         finally:
             node.close()
 
-    def _incoming(self, node: Node, swarm: Swarm, gateway: Gateway) -> Incoming | None:
+    def _incoming(self, node: Node, swarm: Swarm, gateway: Gateway, observer: Observer) -> Incoming | None:
         settings = self._settings
         if settings.incoming == IncomingSettings():
             return None
         map = RosMap(swarm.frame.grid, settings.frames.map)
         has_map = any(row.name == "map" for row in settings.rows())
         map_now = (lambda: gateway.whole_map(time.time_ns())) if has_map else None
-        return Incoming(node, swarm, settings.incoming, map, map_now)
+        return Incoming(node, swarm, settings.incoming, map, map_now, lambda: observer.vehicles)
 
     def _gateway(self, swarm: Swarm) -> Gateway:
         settings, grid = self._settings, swarm.frame.grid

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from launch_scripts.ros2.frames import RosMap
@@ -17,8 +17,10 @@ from launch_scripts.ros2.incoming.places import FrameReader
 from launch_scripts.ros2.incoming.robot import Robot
 from launch_scripts.ros2.incoming.settings import POSE_TYPES, IncomingSettings, Robots
 from launch_scripts.ros2.messages import RosMessages
+from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.node import Node
 from swarm.client import Swarm
+from swarm.config.agents import agent_of
 from swarm.orders import Acknowledged
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,7 @@ class Incoming:
     settings  checked
     map       the frame in which ROS has the terrain
     map_now   makes a nav_msgs/OccupancyGrid, on the thread of `tick`; None: nobody can ask for the map
+    vehicles  ids of those that the swarm has now
     """
 
     def __init__(
@@ -57,6 +60,7 @@ class Incoming:
         settings: IncomingSettings,
         map: RosMap | None = None,
         map_now: Callable[[], Any] | None = None,
+        vehicles: Callable[[], Iterable[str]] = tuple,
     ) -> None:
         self._node, self._swarm, self._settings = node, swarm, settings
         self._map = map or RosMap(swarm.frame.grid)
@@ -78,6 +82,7 @@ class Incoming:
         ]
         self._services: list[Endpoint] = []
         self._map_now = map_now
+        self._vehicles = vehicles
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
         if map_now is not None:
@@ -173,7 +178,14 @@ class Incoming:
                 log.warning("robot %s is not taken in: there are %d already", id, MOST_ROBOTS)
             self._full_said = True
             return
-        self._robots[id] = Robot(id, robots, self._node, self._swarm, self._routes, self._messages)
+        self._robots[id] = Robot(
+            id, robots, self._node, self._swarm, self._routes, self._messages, self._is_of_an_agent
+        )
+
+    def _is_of_an_agent(self, name: str) -> bool:
+        """Whether an agent of the swarm has a vehicle with this name in ROS. What another gateway tells of it looks
+        like a robot, and would be a body where the vehicle itself is."""
+        return any(ros_name(id) == name and agent_of(id) != id for id in self._vehicles())
 
     def _serve_order(self, name: str, order: Paused) -> None:
         """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""
