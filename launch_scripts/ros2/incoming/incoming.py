@@ -20,6 +20,7 @@ from launch_scripts.ros2.messages import RosMessages
 from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.node import Node
 from swarm.client import Swarm
+from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.orders import Acknowledged
 
@@ -28,6 +29,8 @@ log = logging.getLogger(__name__)
 TICK_S = 0.02
 """How often `tick` is best called."""
 MOST_ROBOTS = 256
+_LOOK_NS = NS_PER_S // 2
+"""The swarm's own vehicles are looked at so often."""
 _MOST_ASKED = 16
 _MAP = "nav_msgs/srv/GetMap"
 _MOST_NEWS = 1 << 14
@@ -83,6 +86,10 @@ class Incoming:
         self._services: list[Endpoint] = []
         self._map_now = map_now
         self._vehicles = vehicles
+        self._taken: frozenset[str] = frozenset()
+        """Names in ROS of vehicles that agents of the swarm have. What another gateway tells of one looks like a
+        robot, and would be a body where the vehicle itself is."""
+        self._taken_due_ns = 0
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
         if map_now is not None:
@@ -120,6 +127,9 @@ class Incoming:
 
         now_ns  by time.monotonic_ns
         """
+        if self._robots and now_ns >= self._taken_due_ns:
+            self._taken_due_ns = now_ns + _LOOK_NS
+            self._taken = frozenset(ros_name(id) for id in self._vehicles() if agent_of(id) != id)
         for _ in range(len(self._news)):
             self._hear(*self._news.popleft())
         for part in self._parts:
@@ -179,13 +189,8 @@ class Incoming:
             self._full_said = True
             return
         self._robots[id] = Robot(
-            id, robots, self._node, self._swarm, self._routes, self._messages, self._is_of_an_agent
+            id, robots, self._node, self._swarm, self._routes, self._messages, lambda name: name in self._taken
         )
-
-    def _is_of_an_agent(self, name: str) -> bool:
-        """Whether an agent of the swarm has a vehicle with this name in ROS. What another gateway tells of it looks
-        like a robot, and would be a body where the vehicle itself is."""
-        return any(ros_name(id) == name and agent_of(id) != id for id in self._vehicles())
 
     def _serve_order(self, name: str, order: Paused) -> None:
         """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""

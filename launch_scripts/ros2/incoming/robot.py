@@ -106,12 +106,13 @@ class Robot:
     def _tell(self, place: Place) -> None:
         robots = self._robots
         try:
+            if self._is_taken(self.id):  # which may be seen late: the swarm's vehicles come after the connection
+                self._leave()
+                raise ConfigError(
+                    f"robot {self.id} is not taken in: the swarm has a vehicle that ROS knows by this name; is "
+                    "its topic that of another gateway?"
+                )
             if self._vehicle is None:
-                if self._is_taken(self.id):
-                    raise ConfigError(
-                        f"robot {self.id} is not taken in: the swarm has a vehicle that ROS knows by this name; is "
-                        "its topic that of another gateway?"
-                    )
                 self._vehicle = self._swarm.vehicle(
                     self.id, group=robots.group, radius_m=robots.radius_m, lease_s=robots.lease_s,
                     vehicle_class=robots.vehicle_class,

@@ -137,3 +137,6 @@ def test_what_is_called_as_a_vehicle_of_the_swarm_is_no_robot_and_said_once(
     taken.clear()
     world.say("two", "odom", 2, 2)
     assert world.robots["two"].present
+    taken.add("two")
+    world.say("two", "odom", 2, 3)
+    assert not world.robots["two"].present, "the swarm's own was seen late"
