@@ -69,12 +69,12 @@ class Gateway:
 
     @property
     def due_ns(self) -> int:
-        """When `tick` has something to do again."""
+        """When `tick` has something to do again, by the clock that never leaps."""
         return min(self._due_ns.values(), default=0)
 
-    def whole_map(self, now_ns: int) -> Any:
+    def whole_map(self, stamp_ns: int) -> Any:
         """nav_msgs/OccupancyGrid of the map as it is known now."""
-        return occupancy_grid(self._messages, now_ns, self._feed.occupancy(self._feed.grid.window))
+        return occupancy_grid(self._messages, stamp_ns, self._feed.occupancy(self._feed.grid.window))
 
     def take_problems(self) -> list[str]:
         """Sentences for people since the last call."""
@@ -82,10 +82,11 @@ class Gateway:
         self._problems.clear()
         return taken
 
-    def tick(self, now_ns: int, swarm_now_ns: int, view: View, health: Health) -> list[Action]:
+    def tick(self, now_ns: int, stamp_ns: int, swarm_now_ns: int, view: View, health: Health) -> list[Action]:
         """What is to be done now, in order.
 
-        now_ns        by the clock of this machine, which stamps what ROS hears
+        now_ns        by a clock that never leaps, by which all rates are kept
+        stamp_ns      by the clock of this machine, since 1970, which stamps what ROS hears
         swarm_now_ns  by the swarm's clocks, by which marks expire
         """
         due = {name for name, at_ns in self._due_ns.items() if now_ns >= at_ns}
@@ -94,18 +95,22 @@ class Gateway:
         for name in due:
             self._due_ns[name] = _next_ns(self._rows[name], now_ns)
         vehicles, targets = view.vehicles, view.targets
-        actions = [*self._begin(), *self._vehicles.follow(vehicles, now_ns), *self._targets.follow(targets)]
+        actions = [
+            *self._begin(),
+            *self._vehicles.follow(vehicles, now_ns, stamp_ns),
+            *self._targets.follow(targets),
+        ]
         for id, points_m in view.take_routes().items():
             self._vehicles.route(id, points_m)
-        actions += self._vehicles.tell(due, now_ns)
-        actions += self._targets.tell(due, targets, now_ns)
+        actions += self._vehicles.tell(due, now_ns, stamp_ns)
+        actions += self._targets.tell(due, targets, stamp_ns)
         if due & {"map", "map_updates", "markers"}:
-            self._feed.merge(view.take_mark_sets(), swarm_now_ns)
-            actions += self._map.tell(due, self._vehicles.told, now_ns, swarm_now_ns)
+            self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
+            actions += self._map.tell(due, self._vehicles.told, now_ns, stamp_ns, swarm_now_ns)
         if "diagnostics" in due:
             told = diagnostics_of(self._messages, vehicles, targets, health, self._feed.knows_ground)
             channel = Channel("diagnostics", self._rows["diagnostics"].topic)
-            actions.append(Put(channel, self._messages.diagnostics(now_ns, told)))
+            actions.append(Put(channel, self._messages.diagnostics(stamp_ns, told)))
         return actions
 
     def _begin(self) -> list[Action]:

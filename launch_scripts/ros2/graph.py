@@ -185,6 +185,8 @@ def read_token(key: str) -> SeenEndpoint | None:
         raise ProtocolError(
             f"token {key[:200]!r} has {len(parts)} parts, expected {_TOKEN_PARTS} below {TOKEN_SPACE}"
         )
+    if not key.isprintable():  # names go to logs and terminals, which they might steer
+        raise ProtocolError(f"token {key[:200]!r} has signs that no name in ROS has")
     try:
         domain, kind = int(parts[1]), Kind(parts[5])
     except ValueError as error:

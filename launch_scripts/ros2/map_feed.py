@@ -118,12 +118,13 @@ class MapFeed:
         """Tile -> cells of it that are marked as lethal, and with a pace."""
         self._redraw_due_ns = 0
 
-    def merge(self, sets: Sequence[MarkSet], now_ns: int) -> None:
+    def merge(self, sets: Sequence[MarkSet], now_ns: int, swarm_now_ns: int) -> None:
         """Take in sets of marks, and let expire what has expired.
 
-        now_ns  by the swarm's clocks
+        now_ns        by a clock that never leaps
+        swarm_now_ns  by the swarm's clocks
         """
-        self._replica.tick(now_ns)
+        self._replica.tick(swarm_now_ns)
         taken = self._replica.merge(sets, measured=False).sets if sets else []
         tiles = {each.tile for each in taken}
         if now_ns >= self._redraw_due_ns:
@@ -134,7 +135,10 @@ class MapFeed:
                 self._mark(tile)
 
     def change(self, now_ns: int, *, whole: bool = True) -> Change:
-        """What is to be told since the last call. At first the whole map, if that is wanted."""
+        """What is to be told since the last call. At first the whole map, if that is wanted.
+
+        now_ns  by a clock that never leaps
+        """
         windows = self._sink.take_dirty()
         self._changed_cells += sum(each.cells for each in windows)
         much = self._changed_cells > _WHOLE_SHARE * self.grid.cells and self._changed_cells > 1000

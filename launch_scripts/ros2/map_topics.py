@@ -15,6 +15,7 @@ from launch_scripts.ros2.markers import ZONE, Drawing, Form, MarkerBook, marked_
 from launch_scripts.ros2.messages import RosMessages
 from launch_scripts.ros2.moving import Moving
 from launch_scripts.ros2.topics import TopicRow
+from shared_map.cost_map import merged
 from swarm.grid import GridSpec, Window
 
 MOST_CUBES = 5000
@@ -31,29 +32,35 @@ class MapTopics:
         self._book = MarkerBook(messages)
         self._fresh: list[Window] = []
         """Windows that have changed since markers were put last."""
+        self._changed: list[Window] = []
+        """Windows that have changed since the map or its updates were put last."""
 
     def tell(
-        self, due: Collection[str], moving: Iterable[Moving], now_ns: int, swarm_now_ns: int
+        self, due: Collection[str], moving: Iterable[Moving], now_ns: int, stamp_ns: int, swarm_now_ns: int
     ) -> Iterator[Action]:
         """Messages of the rows that are due."""
         if "map" in due or "map_updates" in due:
-            yield from self._map(now_ns)
+            yield from self._map(due, now_ns, stamp_ns)
         if "markers" in due:
             drawn = [*self._routes(moving), *self._marks(), *self._zones(swarm_now_ns)]
             drawn.append(windows(self._feed.grid, "changed", self._fresh))
             self._fresh = []
-            yield self._put("markers", self._book.array(now_ns, drawn))
+            yield self._put("markers", self._book.array(stamp_ns, drawn))
 
-    def _map(self, now_ns: int) -> Iterator[Action]:
-        change = self._feed.change(now_ns, whole="map" in self._rows)
+    def _map(self, due: Collection[str], now_ns: int, stamp_ns: int) -> Iterator[Action]:
+        change = self._feed.change(now_ns, whole="map" in due)
         if change.whole:
+            self._changed = []
             whole = self._feed.occupancy(self._feed.grid.window)
-            yield self._put("map", occupancy_grid(self._messages, now_ns, whole))
+            yield self._put("map", occupancy_grid(self._messages, stamp_ns, whole))
         self._fresh += change.windows
         if "map_updates" in self._rows:
-            for window in change.windows:
+            self._changed = merged(change.windows, self._changed)
+        if "map_updates" in due:
+            changed, self._changed = self._changed, []
+            for window in changed:
                 cells = self._feed.occupancy(window)
-                yield self._put("map_updates", occupancy_update(self._messages, now_ns, cells, window))
+                yield self._put("map_updates", occupancy_update(self._messages, stamp_ns, cells, window))
 
     def _routes(self, moving: Iterable[Moving]) -> Iterator[Drawing]:
         for each in moving:

@@ -14,11 +14,14 @@ _STANDS_NS = NS_PER_S // 2
 """A vehicle of which no other place was told for so long stands."""
 _LEAP_M_PER_S = 100.0
 """What moves faster was put elsewhere: it has no speed that anybody could use."""
+_PLAN_NS = NS_PER_S
+"""A vehicle's route is told at most so often."""
 _NO_ROUTE = np.empty((0, 2), np.float64)
 
 
 class Moving:
-    """One vehicle. Its speed is the difference of the last two places that were told, by the wall clock.
+    """One vehicle. Its speed is the difference of the last two places that were told, by a clock that
+    never leaps: so are all times here.
 
     id, name        in the swarm, and in ROS
     x_m, y_m, heading_rad  as the swarm has them; a heading of None is told as the last known
@@ -49,7 +52,7 @@ class Moving:
         self.speed_m_per_s = self.turn_rad_per_s = 0.0
         self.route: NDArray[np.float64] = _NO_ROUTE
         self.route_is_new = False
-        self.route_told_ns = 0
+        self.route_told_ns: int | None = None
         self._moved_ns = now_ns
 
     @property
@@ -68,6 +71,10 @@ class Moving:
         if since_s > 0:
             self._measure(seen.x_m - self.x_m, seen.y_m - self.y_m, heading_rad, since_s)
         self.x_m, self.y_m, self.heading_rad, self._moved_ns = seen.x_m, seen.y_m, heading_rad, now_ns
+
+    def route_is_due(self, now_ns: int) -> bool:
+        """Whether its route is to be told now."""
+        return self.route_is_new and (self.route_told_ns is None or now_ns - self.route_told_ns >= _PLAN_NS)
 
     def follow(self, points_m: NDArray[np.float64]) -> None:
         self.route, self.route_is_new = points_m, True

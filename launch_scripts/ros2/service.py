@@ -177,7 +177,7 @@ class Ros2Service:
                     f"node /{settings.ros.node} in domain {settings.ros.domain} at {settings.ros.endpoint}, "
                     f"{settings.ros.distribution}; run {swarm.run_id}, scenario {swarm.scenario}"
                 )
-                incoming = self._incoming(node, swarm, gateway)
+                incoming = self._incoming(node, swarm, gateway, observer)
                 try:
                     _Loop(self, node, swarm, observer, gateway, incoming, self._say).run(until_s)
                 finally:
@@ -186,14 +186,14 @@ class Ros2Service:
         finally:
             node.close()
 
-    def _incoming(self, node: Node, swarm: Swarm, gateway: Gateway) -> Incoming | None:
+    def _incoming(self, node: Node, swarm: Swarm, gateway: Gateway, observer: Observer) -> Incoming | None:
         settings = self._settings
         if settings.incoming == IncomingSettings():
             return None
         map = RosMap(swarm.frame.grid, settings.frames.map)
         has_map = any(row.name == "map" for row in settings.rows())
         map_now = (lambda: gateway.whole_map(time.time_ns())) if has_map else None
-        return Incoming(node, swarm, settings.incoming, map, map_now)
+        return Incoming(node, swarm, settings.incoming, map, map_now, lambda: observer.vehicles)
 
     def _gateway(self, swarm: Swarm) -> Gateway:
         settings, grid = self._settings, swarm.frame.grid
@@ -256,11 +256,11 @@ class _Loop:
             if time.monotonic() >= self._look_due_s:
                 self._look_due_s = time.monotonic() + _LOOK_S
                 self._look()
-            now_ns = time.time_ns()
-            for action in self._gateway.tick(now_ns, self._swarm.now_ns, self._view, self._health()):
+            now_ns, stamp_ns = time.monotonic_ns(), time.time_ns()
+            for action in self._gateway.tick(now_ns, stamp_ns, self._swarm.now_ns, self._view, self._health()):
                 self._out.perform(action)
             self._tell()
-            due_s = (self._gateway.due_ns - time.time_ns()) / 1e9
+            due_s = (self._gateway.due_ns - time.monotonic_ns()) / 1e9
             if self._incoming is not None:
                 self._incoming.tick(time.monotonic_ns())
             longest_s = _LONGEST_SLEEP_S if self._incoming is None else TICK_S

@@ -44,16 +44,16 @@ class TargetTopics:
                 actions.append(Declare((self._channel("target_pose", name),)))
         return actions
 
-    def tell(self, due: Collection[str], seen: Mapping[str, SeenTarget], now_ns: int) -> Iterator[Action]:
+    def tell(self, due: Collection[str], seen: Mapping[str, SeenTarget], stamp_ns: int) -> Iterator[Action]:
         """Messages of the rows that are due."""
         tracked = {name: seen[id] for name, id in self._ids.items() if id in seen and not seen[id].lost}
         if "target_pose" in due:
             for name, each in tracked.items():
-                pose = self._messages.pose_stamped(now_ns, each.x_m, each.y_m)
+                pose = self._messages.pose_stamped(stamp_ns, each.x_m, each.y_m)
                 yield Put(self._channel("target_pose", name), pose)
         if "targets" in due:
             places = [(each.x_m, each.y_m) for each in sorted(tracked.values(), key=lambda each: each.id)]
-            array = self._messages.pose_array(now_ns, np.array(places, np.float64).reshape(-1, 2))
+            array = self._messages.pose_array(stamp_ns, np.array(places, np.float64).reshape(-1, 2))
             yield Put(self._channel("targets", ""), array)
 
     def _channel(self, row: str, name: str) -> Channel:

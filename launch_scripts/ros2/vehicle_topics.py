@@ -17,12 +17,9 @@ from launch_scripts.ros2.packed_path import packed_path
 from launch_scripts.ros2.packed_places import PackedOdometry, PackedPose, PackedTransforms
 from launch_scripts.ros2.topics import VEHICLE, TopicRow
 from swarm.client.observer import SeenVehicle
-from swarm.clock import NS_PER_S
 
 MOST_VEHICLES = 1000
 """More are not told: each has topics of its own, and each topic a token."""
-_PLAN_NS = NS_PER_S
-"""A vehicle's plan is put at most so often."""
 BARE = ("tf", "tf_static")
 """Topics that each vehicle has for itself where its frames are bare."""
 ToWgs84 = Callable[[float, float], tuple[float, float]]
@@ -69,8 +66,12 @@ class VehicleTopics:
     def told(self) -> Iterable[Moving]:
         return self._told.values()
 
-    def follow(self, seen: Mapping[str, SeenVehicle], now_ns: int) -> list[Action]:
-        """Take in who is where. Topics of those that are new are declared, of those that have left taken down."""
+    def follow(self, seen: Mapping[str, SeenVehicle], now_ns: int, stamp_ns: int) -> list[Action]:
+        """Take in who is where. Topics of those that are new are declared, of those that have left taken down.
+
+        now_ns    by a clock that never leaps
+        stamp_ns  since 1970
+        """
         gone = [name for name, moving in self._told.items() if moving.id not in seen]
         actions: list[Action] = [Remove(self._channels(name)) for name in gone]
         for name in gone:
@@ -84,9 +85,11 @@ class VehicleTopics:
         actions += [Declare(self._channels(name)) for name in came]
         if "tf_static" in self._rows and self._told:
             if self._bare:
-                actions += [self._put("tf_static", self._static([self._told[name]], now_ns), name) for name in came]
+                actions += [
+                    self._put("tf_static", self._static([self._told[name]], stamp_ns), name) for name in came
+                ]
             elif came or gone:
-                actions.append(self._put("tf_static", self._static(self.told, now_ns)))
+                actions.append(self._put("tf_static", self._static(self.told, stamp_ns)))
         return actions
 
     def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> str | None:
@@ -119,47 +122,47 @@ class VehicleTopics:
         if moving is not None and moving.id == id:
             moving.follow(np.array(list(points_m), np.float64).reshape(-1, 2))
 
-    def tell(self, due: Collection[str], now_ns: int) -> Iterator[Action]:
-        """Messages of the rows that are due."""
+    def tell(self, due: Collection[str], now_ns: int, stamp_ns: int) -> Iterator[Action]:
+        """Messages of the rows that are due. Times as those of `follow`."""
         for moving in self._told.values():
-            yield from self._of_one(due, moving, now_ns)
+            yield from self._of_one(due, moving, now_ns, stamp_ns)
         if "tf" in due and not self._bare and self._told:
             if self._transforms is None:
                 self._transforms = PackedTransforms(self._messages, [self._frames(name) for name in self._told])
             places = [moving.place for moving in self._told.values()]
-            yield self._put("tf", self._transforms.at(now_ns, places))
+            yield self._put("tf", self._transforms.at(stamp_ns, places))
         if "poses" in due:
             told = sorted(self._told.values(), key=lambda moving: moving.id)
             points_m = np.array([(each.x_m, each.y_m) for each in told], np.float64).reshape(-1, 2)
             headings = [each.heading_rad for each in told]
-            yield self._put("poses", self._messages.pose_array(now_ns, points_m, headings))
+            yield self._put("poses", self._messages.pose_array(stamp_ns, points_m, headings))
 
-    def _of_one(self, due: Collection[str], moving: Moving, now_ns: int) -> Iterator[Action]:
+    def _of_one(self, due: Collection[str], moving: Moving, now_ns: int, stamp_ns: int) -> Iterator[Action]:
         messages, name = self._messages, moving.name
         if "odom" in due:
             speeds = moving.speed_m_per_s, moving.turn_rad_per_s
-            yield self._put("odom", self._odometry[name].at(now_ns, moving.place, *speeds), name)
+            yield self._put("odom", self._odometry[name].at(stamp_ns, moving.place, *speeds), name)
         if "pose" in due:
-            yield self._put("pose", self._pose.at(now_ns, moving.place), name)
+            yield self._put("pose", self._pose.at(stamp_ns, moving.place), name)
         if "fix" in due and self._to_wgs84 is not None:
             frame = self._frames(name)[1]
-            yield self._put("fix", messages.fix(now_ns, frame, *self._to_wgs84(moving.x_m, moving.y_m)), name)
-        if "plan" in due and moving.route_is_new and now_ns - moving.route_told_ns >= _PLAN_NS:
+            yield self._put("fix", messages.fix(stamp_ns, frame, *self._to_wgs84(moving.x_m, moving.y_m)), name)
+        if "plan" in due and moving.route_is_due(now_ns):
             moving.route_is_new, moving.route_told_ns = False, now_ns
-            yield self._put("plan", packed_path(messages.map, now_ns, moving.route), name)
+            yield self._put("plan", packed_path(messages.map, stamp_ns, moving.route), name)
         if "tf" in due and self._bare:
-            yield self._put("tf", self._own_transform[name].at(now_ns, [moving.place]), name)
+            yield self._put("tf", self._own_transform[name].at(stamp_ns, [moving.place]), name)
 
     def _frames(self, name: str) -> tuple[str, str]:
         """Of a vehicle: the one that does not move, and its own."""
         return ("odom", "base_link") if self._bare else (odom_frame(name), base_frame(name))
 
-    def _static(self, told: Iterable[Moving], now_ns: int) -> Any:
+    def _static(self, told: Iterable[Moving], stamp_ns: int) -> Any:
         transforms = []
         for moving in told:
-            transform = self._messages.vehicle_transforms(now_ns, moving.name, *self._messages.map.origin_m, None)[
-                0
-            ]
+            transform = self._messages.vehicle_transforms(
+                stamp_ns, moving.name, *self._messages.map.origin_m, None
+            )[0]
             transform.child_frame_id = self._frames(moving.name)[0]
             transforms.append(transform)
         return self._messages.transforms(transforms)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from launch_scripts.ros2.frames import RosMap
@@ -17,8 +17,11 @@ from launch_scripts.ros2.incoming.places import FrameReader
 from launch_scripts.ros2.incoming.robot import Robot
 from launch_scripts.ros2.incoming.settings import POSE_TYPES, IncomingSettings, Robots
 from launch_scripts.ros2.messages import RosMessages
+from launch_scripts.ros2.names import ros_name
 from launch_scripts.ros2.node import Node
 from swarm.client import Swarm
+from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
 from swarm.orders import Acknowledged
 
 log = logging.getLogger(__name__)
@@ -26,6 +29,8 @@ log = logging.getLogger(__name__)
 TICK_S = 0.02
 """How often `tick` is best called."""
 MOST_ROBOTS = 256
+_LOOK_NS = NS_PER_S // 2
+"""The swarm's own vehicles are looked at so often."""
 _MOST_ASKED = 16
 _MAP = "nav_msgs/srv/GetMap"
 _MOST_NEWS = 1 << 14
@@ -48,6 +53,7 @@ class Incoming:
     settings  checked
     map       the frame in which ROS has the terrain
     map_now   makes a nav_msgs/OccupancyGrid, on the thread of `tick`; None: nobody can ask for the map
+    vehicles  ids of those that the swarm has now
     """
 
     def __init__(
@@ -57,6 +63,7 @@ class Incoming:
         settings: IncomingSettings,
         map: RosMap | None = None,
         map_now: Callable[[], Any] | None = None,
+        vehicles: Callable[[], Iterable[str]] = tuple,
     ) -> None:
         self._node, self._swarm, self._settings = node, swarm, settings
         self._map = map or RosMap(swarm.frame.grid)
@@ -78,6 +85,11 @@ class Incoming:
         ]
         self._services: list[Endpoint] = []
         self._map_now = map_now
+        self._vehicles = vehicles
+        self._taken: frozenset[str] = frozenset()
+        """Names in ROS of vehicles that agents of the swarm have. What another gateway tells of one looks like a
+        robot, and would be a body where the vehicle itself is."""
+        self._taken_due_ns = 0
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
         if map_now is not None:
@@ -115,6 +127,9 @@ class Incoming:
 
         now_ns  by time.monotonic_ns
         """
+        if self._robots and now_ns >= self._taken_due_ns:
+            self._taken_due_ns = now_ns + _LOOK_NS
+            self._taken = frozenset(ros_name(id) for id in self._vehicles() if agent_of(id) != id)
         for _ in range(len(self._news)):
             self._hear(*self._news.popleft())
         for part in self._parts:
@@ -173,7 +188,9 @@ class Incoming:
                 log.warning("robot %s is not taken in: there are %d already", id, MOST_ROBOTS)
             self._full_said = True
             return
-        self._robots[id] = Robot(id, robots, self._node, self._swarm, self._routes, self._messages)
+        self._robots[id] = Robot(
+            id, robots, self._node, self._swarm, self._routes, self._messages, lambda name: name in self._taken
+        )
 
     def _serve_order(self, name: str, order: Paused) -> None:
         """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""

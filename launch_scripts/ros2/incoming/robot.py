@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from launch_scripts.ros2.graph import Qos
@@ -16,7 +17,7 @@ from launch_scripts.ros2.incoming.settings import POSE_TYPES, ROBOT, Robots
 from launch_scripts.ros2.incoming.tracks import Track
 from launch_scripts.ros2.messages import RosMessages
 from launch_scripts.ros2.node import Node, Publisher
-from swarm.client import BusError, Route, Swarm, SwarmError, Vehicle
+from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, Vehicle
 from swarm.clock import NS_PER_S
 
 log = logging.getLogger(__name__)
@@ -31,20 +32,31 @@ TARGET_FRAMES = "targets/"
 class Robot:
     """Made when a robot is found, closed when it is gone.
 
-    topic  where it says where it is
+    topic     where it says where it is
+    is_taken  whether a vehicle of the swarm's own is called so in ROS
     """
 
     def __init__(
-        self, id: str, robots: Robots, node: Node, swarm: Swarm, routes: PlaceRoutes, messages: RosMessages
+        self,
+        id: str,
+        robots: Robots,
+        node: Node,
+        swarm: Swarm,
+        routes: PlaceRoutes,
+        messages: RosMessages,
+        is_taken: Callable[[str], bool] = lambda name: False,
     ) -> None:
         self.id, self.topic = id, robots.topic_of(id)
         self.counts: Counter[str] = Counter()
         self._robots, self._node, self._swarm, self._routes, self._messages = robots, node, swarm, routes, messages
+        self._is_taken = is_taken
         self._reader = FrameReader.of(robots, id, messages.map)
         self._track = Track(self._reader, robots.lease_s, robots.hz, self._say)
         self._vehicle: Vehicle | None = None
         self._goal: tuple[str, int] | None = None
         """Target that is lent for its goal, and its cell; None while it has no goal of its own."""
+        self._said: str | None = None
+        """What was said last of messages that are refused; said once until one is not."""
         self._goal_ns = -_GOAL_NS
         self._goal_cell: int | None = None
         """Of the goal_pose that was put last."""
@@ -94,6 +106,12 @@ class Robot:
     def _tell(self, place: Place) -> None:
         robots = self._robots
         try:
+            if self._is_taken(self.id):  # which may be seen late: the swarm's vehicles come after the connection
+                self._leave()
+                raise ConfigError(
+                    f"robot {self.id} is not taken in: the swarm has a vehicle that ROS knows by this name; is "
+                    "its topic that of another gateway?"
+                )
             if self._vehicle is None:
                 self._vehicle = self._swarm.vehicle(
                     self.id, group=robots.group, radius_m=robots.radius_m, lease_s=robots.lease_s,
@@ -104,6 +122,7 @@ class Robot:
             first = not self.counts["told"]
             self._vehicle.at(place.x_m, place.y_m, heading_rad=place.heading_rad, speed_m_per_s=place.speed_m_per_s)
             self.counts["told"] += 1
+            self._said = None
             if first:
                 self._follow_target()
             elif self._goal is not None and self._vehicle.cell == self._goal[1]:
@@ -123,13 +142,18 @@ class Robot:
 
     def _say(self, sentence: str) -> None:
         self.counts["refused"] += 1
-        log.warning("topic %s: %s", self.topic, sentence)
+        if sentence != self._said:
+            self._said = sentence
+            log.warning("topic %s: %s", self.topic, sentence)
 
     # --- where it goes ------------------------------------------------------------------------------------------
 
     def _follow_target(self) -> None:
         if self._robots.target and self._vehicle is not None:
-            self._vehicle.follow(self._robots.target)
+            try:
+                self._vehicle.follow(self._robots.target)
+            except SwarmError as error:
+                self._say(str(error))
 
     def _end_goal(self) -> None:
         if self._goal is not None:
@@ -151,32 +175,32 @@ class Robot:
             self.counts["goals"] += 1
             self._hear_pose(now_ns)  # which may have come just before
             fault = self._go(message)
-        if fault is not None:
-            log.warning("topic %s: %s", self._goals.endpoint.topic, fault)
-            self._put_plan(fault)
+            if fault is not None:
+                log.warning("topic %s: %s", self._goals.endpoint.topic, fault)
+                self._put_plan(fault)
+                self._follow_target()
 
     def _go(self, message: Any) -> str | None:
-        """Give it a goal. Returns why it cannot have this one."""
-        vehicle, start = self._vehicle, self._track.place
-        if vehicle is None or start is None:
+        """Give it a goal. Returns why it cannot have this one: then it has none, as its plan says."""
+        self._end_goal()
+        if self._vehicle is None or self._track.place is None:
             return f"robot {self.id} has not said where it is, so it gets no goal"
         try:
             if (target := _target_frame(message)) is not None:
-                self._end_goal()
-                vehicle.follow(target)
+                self._vehicle.follow(target)
                 return None
             goal = self._reader.pose(message.header, message.pose)
-            if isinstance(goal, str):
-                return goal
-            before, self._goal = self._goal, None
-            if before is not None:
-                self._routes.give_back(before[0])
-            lent = self._routes.lend(goal)
-            if lent is None:
-                return self._routes.none_free
-            self._goal = lent, self._swarm.frame.cell(goal.x_m, goal.y_m)
+            return goal if isinstance(goal, str) else self._go_to(goal, self._vehicle, self._track.place)
         except SwarmError as error:
+            self._end_goal()
             return str(error)
+
+    def _go_to(self, goal: Place, vehicle: Vehicle, start: Place) -> str | None:
+        """As `_go`. Raises SwarmError."""
+        lent = self._routes.lend(goal)
+        if lent is None:
+            return self._routes.none_free
+        self._goal = lent, self._swarm.frame.cell(goal.x_m, goal.y_m)
         self._routes.to_lent(lent, start, self._robots.vehicle_class, self._hear_first)
         vehicle.follow(lent)
         return None

@@ -81,9 +81,10 @@ def gateway(text: str = "", fixes: bool = True) -> Gateway:
     return Gateway(parse_settings(text), TYPES, RosMap(GRID), feed, (lambda x, y: (48.0, 9.0)) if fixes else None)
 
 
-def told(gateway: Gateway, world: World, at_s: float) -> list[Any]:
-    now_ns = BEGAN_NS + int(at_s * NS_PER_S)
-    return gateway.tick(now_ns, now_ns, world, Health())
+def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = None) -> list[Any]:
+    since_ns = int(at_s * NS_PER_S)
+    stamp_ns = BEGAN_NS + (since_ns if stamp_s is None else int(stamp_s * NS_PER_S))
+    return gateway.tick(since_ns, stamp_ns, BEGAN_NS + since_ns, world, Health())
 
 
 def puts(actions: list[Any], row: str) -> list[Any]:
@@ -143,6 +144,41 @@ def test_messages_go_to_topics_that_are_declared_and_none_comes_more_often_than_
     for channel, at in times.items():
         if (hz := ROWS[channel.row].hz) is not None and channel.row != "map_updates":
             assert len(at) <= (at[-1] - at[0]) * hz + 2
+
+
+@settings(max_examples=few(30), deadline=None)
+@given(st.lists(MOMENTS, min_size=1, max_size=12), st.data())
+def test_a_clock_that_leaps_changes_stamps_and_nothing_else(moments: list[Any], data: st.DataObject) -> None:
+    steady, leaping = gateway(), gateway()
+    at_s = 0.0
+    for step_s, vehicles, routes, _ in moments:
+        at_s += step_s
+        seen = {id: vehicle(id, *place, heading) for id, (place, heading) in vehicles.items()}
+        stamp_s = data.draw(st.floats(-1e8, 1e8))
+        actions = told(steady, World(seen, routes=dict(routes)), at_s)
+        others = told(leaping, World(seen, routes=dict(routes)), at_s, stamp_s)
+        assert [without_message(each) for each in actions] == [without_message(each) for each in others]
+        odometry = zip(puts(actions, "odom"), puts(others, "odom"), strict=True)
+        assert all(one.twist.twist.linear.x == other.twist.twist.linear.x for one, other in odometry)
+
+
+def without_message(action: Any) -> Any:
+    return action.channel if isinstance(action, Put) else action
+
+
+def test_updates_of_the_map_keep_their_rate_and_lose_nothing() -> None:
+    core, marks = gateway("topics.map_updates.hz = 0.2"), OwnMarks("all.a.1", "all", GRID)
+    (grid,) = puts(told(core, World(), 0.0), "map")
+    heard = grid.data.reshape(GRID.rows, GRID.cols).copy()
+    told_s = []
+    for second in range(1, 9):
+        world = World(sets=marks.state([40 * second], MarkKind.LETHAL, 0.0, BEGAN_NS + second))
+        for update in puts(told(core, world, second), "map_updates"):
+            told_s.append(second)
+            data = update.data.reshape(update.height, update.width)
+            heard[update.y : update.y + update.height, update.x : update.x + update.width] = data
+    assert set(told_s) == {5}
+    assert np.flatnonzero(heard[::-1] == 100).tolist() == [40 * second for second in range(1, 6)]
 
 
 def test_a_vehicle_that_leaves_takes_its_topics_along_and_frees_its_name() -> None:

@@ -80,7 +80,18 @@ def test_a_token_reads_back_what_it_says(
 @given(st.text(max_size=80) | NAMES.map(lambda text: f"@ros2_lv/0/{text}/0/0/MP/%/%/n/{text}/{text}/h/q"))
 def test_a_strange_token_raises_only_a_protocol_error(key: str) -> None:
     with suppress(ProtocolError):
-        read_token(key)
+        seen = read_token(key)
+        assert seen is None or all(part.isprintable() for part in (seen.node, seen.topic, seen.type_name))
+
+
+@pytest.mark.parametrize("place", [8, 9, 10, 11, 12])
+@pytest.mark.parametrize("sign", ["\x1b[2J", "\n", "\u202e"])
+def test_no_name_of_a_peer_steers_a_terminal(place: int, sign: str) -> None:
+    parts = Endpoint(NODE, 1, Kind.PUBLISHER, "/map", "nav_msgs/msg/Path", "RIHS01_00", "").token.split("/")
+    parts[place] = sign + parts[place]
+    with pytest.raises(ProtocolError) as error:
+        read_token("/".join(parts))
+    assert str(error.value).isprintable()
 
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
