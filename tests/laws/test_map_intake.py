@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 from support import slow_twins as naive
 from support.effort import few
 from support.planner_strategies import STRATEGIES, random_pace
-from support.scripted_planner import TICK, chasers
+from support.scripted_planner import TICK, World, chasers
 
 from planner_service.map_intake import LONGEST_WAIT_NS
 from planner_service.planner import Planner
@@ -181,3 +182,23 @@ def test_routes_are_read_as_places_as_they_are_walked() -> None:
     rows, cols = routes.places(watched.grid)
     walked = [cell for route in routes for cell in walk(watched.grid, route.start, route.directions)]
     assert sorted((rows * SIDE + cols).tolist()) == sorted(walked)
+
+
+def test_a_route_that_a_growth_by_force_has_changed_passes_nothing_that_waits_either() -> None:
+    world = World()
+    world.tree.gap = 2.0  # no route is good enough not to be forced
+    world.pose(5, 25)
+    world.tick()
+    world.mark(world.map.grid.cell(0, 0))
+    world.tick()
+    world.mark(world.map.grid.cell(5, 15))  # waits, as the one before came just now
+    assert world.tree.map_version < world.map.version
+    straight, at, elsewhere = world.tree.routes, world.map.grid.cell(5, 5), world.map.grid.cell(15, 25)
+
+    def routes(cells: Any, max_cells: int = 0) -> Any:
+        return straight(cells if world.tree.named("force") else [elsewhere], max_cells)
+
+    with mock.patch.object(world.tree, "routes", routes):
+        world.ask(at, force=True)
+    assert world.tree.named("force")
+    assert world.tree.map_version == world.map.version
