@@ -194,13 +194,13 @@ def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway) -> 
 
 def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> None:
     process = gateway.start()
-    eventually(lambda: "run " in gateway.said, 30, "the gateway's first word")
+    eventually(lambda: "run " in gateway.said, 60, "the gateway's first word")
     process.send_signal(2)
-    assert process.wait(20) == 0, gateway.said
+    assert process.wait(40) == 0, gateway.said
     assert "Traceback" not in gateway.said
     alone = subprocess.run(
         [*SWARM, "ros2", "--connect", gateway.swarm, "--ros", "tcp/127.0.0.1:9"],
-        capture_output=True, text=True, timeout=30, check=False,
+        capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert alone.returncode == 4
     assert alone.stderr == (
