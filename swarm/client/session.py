@@ -59,6 +59,8 @@ class Session:
         self.post: Post = post if post is not None else self.handle
         self.connected = True
         """Whether the link to the router is up, as far as is known."""
+        self._compare_due_ns: int | None = None
+        """When the run is asked for again, as nobody answered after a cut; None: it is known."""
         self.ended: SwarmError | None = None
         """Why nothing can be said any more: closed, or the run is another one."""
         self._clock = clock
@@ -204,6 +206,9 @@ class Session:
         with self.lock:
             self._owner = threading.get_ident()
             if self.ended is None:
+                if self._compare_due_ns is not None and self.connected and now_ns >= self._compare_due_ns:
+                    self._compare_due_ns = None
+                    self._compare_run()
                 for part in self._parts:
                     part.tick(now_ns)
         self._call_later()
@@ -225,6 +230,8 @@ class Session:
 
         def compare(done: Future[list[Any]]) -> None:
             runs = [] if done.exception() else [each for each in done.result() if each.run_id]
+            if not runs:  # a run's router is there seconds before those who can answer
+                self._compare_due_ns = self.now_ns() + int(_RUN_TIMEOUT_S * NS_PER_S)
             if not runs or any(each.run_id == self.run.run_id for each in runs):
                 return
             with self.lock:

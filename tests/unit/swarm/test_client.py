@@ -543,7 +543,8 @@ def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> N
     assert bodies[-1].x_m == 15.0
 
 
-def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm) -> None:
+@pytest.mark.parametrize("late_s", [0.0, 15.0])
+def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm, late_s: float) -> None:
     program = Program(world)
     rover = program.swarm.vehicle("rover")
     world.kill("planner-t-1")
@@ -555,10 +556,10 @@ def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Sw
         event.answer(run_info(GRID, "run2"))
         event.end()
 
-    other.serve(RUN, answer, role="keeper", id="0")
-    world.run(0.5)
     world.heal(program.bus)
-    world.run(3.0)
+    world.run(late_s)
+    other.serve(RUN, answer, role="keeper", id="0")
+    world.run(6.0)
     with pytest.raises(RunMismatchError, match="run run is over, and run run2 is in its namespace: connect again"):
         rover.at(5.0, -5.0)
 
