@@ -309,8 +309,14 @@ def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state:
         swarm.close()
 
 
-@pytest.mark.parametrize("run", TEXTS)
-@pytest.mark.parametrize("state", [state for state in STATES if state != "without target"])
+@pytest.mark.parametrize(
+    ("run", "state"),
+    [
+        *[("plain", state) for state in STATES if state != "without target"],
+        *[pytest.param("whole", state, marks=pytest.mark.thorough) for state in ("fresh", "running")],
+        *[("whole", state) for state in ("cut", "restarted")],
+    ],
+)
 def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -> None:
     swarm = lied_to(run, state, 7, few(40), False)
     swarm.take_back()
