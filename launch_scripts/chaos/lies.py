@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import random
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from types import NoneType
 from typing import Any, Literal, TypeVar
@@ -14,16 +15,22 @@ from typing import Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
+from shared_map.learning.words import KEYS, MOST, MOST_CELLS, ONE, Said, stated
 from shared_map.replication.mark_sets import packed
-from swarm.errors import ProtocolError
+from shared_map.replication.tiles import beyond_tile, region_of
+from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
+from swarm.config.classes import GROUND, MOST_CLASSES
+from swarm.errors import OutsideGridError, ProtocolError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.wire.codec import decode, encode
-from swarm.wire.fields import OR_INFINITE, Characters, Column, taken_apart
+from swarm.wire.fields import OR_INFINITE, Bounded, Characters, Column, pack_column, taken_apart
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap
 from swarm.wire.messages.marks import DIGEST_ROW, MarkSet, MarkSets
-from swarm.wire.messages.vehicles import NO_TARGET, SharedCosts
+from swarm.wire.messages.planning import PushedRoute
+from swarm.wire.messages.vehicles import NO_TARGET, Followed, SharedCosts
 from swarm.wire.routes import Route, RouteBatch, Routes
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 from swarm.wire.topics import Topic
@@ -41,18 +48,38 @@ M = TypeVar("M")
 class Lies:
     """Makes lies from a seed: the same seed, the same lies.
 
-    cells  how many the grid has: lies name cells in it, at its end and beyond
-    names  ids that lies use: of those who exist, and others
+    grid     lies name cells, tiles and places in it, at its end and beyond
+    names    ids that lies use: of those who exist, and others
+    classes  of vehicles beside "ground", in the order of their numbers
+    now_ns   of the clock around which lies are stamped
     """
 
-    def __init__(self, cells: int, seed: int, names: Sequence[str] = NAMES) -> None:
-        self._cells = cells
+    def __init__(
+        self,
+        grid: GridSpec,
+        seed: int,
+        names: Sequence[str] = NAMES,
+        classes: Sequence[str] = (),
+        now_ns: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self._grid = grid
         self._names = names
+        self._classes = (GROUND, *classes)
+        self._now_ns = now_ns
+        self._authors = [name for name in names if name.count(".") == 2] or ["all.a0.1"]
+        """<group>.<agent>.<life>"""
+        self._vehicles = [name for name in names if agent_of(name) != name] or ["a0-00"]
         self._chance = random.Random(seed)
 
     def fields(self, topic: Topic, message: Message) -> dict[str, Any]:
-        """The fields of the lie's key: what the message says itself, else any name."""
+        """The fields of the lie's key: what the message says itself, the region of its tile and the agent of its
+        vehicle, else any name."""
         named = {name: getattr(message, name, None) for name in topic.fields}
+        if isinstance(message, MarkSet):
+            with contextlib.suppress(OutsideGridError):
+                named["region"] = region_of(self._grid, message.tile)
+        if isinstance(message, PushedRoute | Followed):
+            named["agent"] = agent_of(message.vehicle)
         return {name: self._name() if value is None else value for name, value in named.items()}
 
     def token(self, role: str) -> Peer:
@@ -70,19 +97,58 @@ class Lies:
                 continue  # fields that contradict each other
         raise AssertionError(f"no {kind.__name__} of {_TRIES} decodes: its types say less than its checks")
 
+    def altered(self, message: M) -> M:
+        """A message with one thing in it, at any depth, replaced by a lie, so that it decodes; itself where nothing
+        in it can be."""
+        for _ in range(20):
+            with contextlib.suppress(ProtocolError, ValueError):
+                return decode(encode(self._altered(message)), type(message))  # type: ignore[type-var]
+        return message
+
+    def _altered(self, struct: Any) -> Any:
+        names = [name for name in struct.__struct_fields__ if name != "schema"]
+        if not names:
+            return struct
+        name = self._chance.choice(names)
+        hint = _hints(type(struct))[name]  # type: ignore[arg-type]
+        return msgspec.structs.replace(struct, **{name: self._instead_of(getattr(struct, name), name, hint)})
+
+    def _instead_of(self, value: Any, name: str, hint: Any) -> Any:
+        rule = next((note for note in taken_apart(hint)[1] if isinstance(note, Column)), None)
+        match value:
+            case bytes() if rule is not None and value:
+                width = len(self._column(rule, 1))
+                at = width * self._chance.randrange(len(value) // width)
+                return value[:at] + self._column(rule, 1) + value[at + width :]
+            case Bounded():
+                return self._altered(value)
+            case [*_, Bounded()]:
+                at = self._chance.randrange(len(value))
+                return [*value[:at], self._altered(value[at]), *value[at + 1 :]]
+            case _:
+                return self._value(name, hint)
+
     def _made(self, kind: type[Any]) -> Any:
         if kind is Routes:
             return RouteBatch.of([self._made(Route) for _ in range(self._chance.randrange(4))]).columns()
         if kind is MarkSets:
-            sets = [msgspec.structs.replace(self._made(MarkSet), author="a1", group="all") for _ in range(3)]
+            author = self._chance.choice(self._authors)
+            own = {"author": author, "group": author.partition(".")[0]}
+            sets = [msgspec.structs.replace(self._made(MarkSet), **own) for _ in range(3)]
             return next(iter(packed({each.tile: each for each in sets}.values())))
         hints = _hints(kind)  # type: ignore[arg-type]
         fields = {name: self._value(name, hint) for name, hint in hints.items() if not _per(hint)}
         for name, hint in hints.items():
             if rule := _per(hint):
                 fields[name] = self._column(rule, len(fields[rule.per]))
+        if {"author", "group"} <= fields.keys() and self._chance.random() < 0.7:
+            fields["author"] = author = self._chance.choice(self._authors)
+            fields["group"] = author.partition(".")[0]
         if kind is MarkSet:
-            fields |= self._statements()
+            tells_of_ground = fields["tile"] == beyond_tile(self._grid) and self._chance.random() < 0.8
+            fields |= self._learned() if tells_of_ground else self._statements()
+        if kind is Route or kind is Followed:
+            fields["legs"] = self._legs(len(fields["directions"]))
         if kind is BaseMap:
             regions = GridSpec(fields["rows"], fields["cols"], 1.0).regions
             fields["digests"] = {"ground": bytes(BASE_DIGEST_BYTES * regions)}
@@ -92,7 +158,8 @@ class Lies:
 
     def _shared_costs(self) -> dict[str, Any]:
         """One agent's, about its own vehicles."""
-        agent = self._chance.choice(("a0", "a1"))
+        author = self._chance.choice(self._authors)
+        group, agent, _ = author.split(".")
         ids = [f"{agent}-{n:02d}" for n in range(self._chance.choice((0, 1, 2, 9)))]
         target_ids = self._chance.sample(
             list(dict.fromkeys(self._names)), self._chance.choice((0, 1, min(len(set(self._names)), 5)))
@@ -100,8 +167,8 @@ class Lies:
         costs_s = self._column(Column("<f4", least=0, most=math.inf), len(ids) * len(target_ids))
         chased = [self._chance.choice((*range(len(target_ids)), NO_TARGET)) for _ in ids]
         return {
-            "author": f"all.{agent}.1",
-            "group": "all",
+            "author": author,
+            "group": group,
             "ids": ids,
             "target_ids": target_ids,
             "costs_s": costs_s,
@@ -112,7 +179,7 @@ class Lies:
         many = self._chance.choice([0, 1, 3, 40])
         where = sorted(self._chance.sample(range(1024), many))
         paces = [self._chance.choice([PACE_LEAST, PACE_MOST, 1.0]) for _ in where]
-        stamps = [self._whole(0, (1 << 62) - 1) for _ in where]
+        stamps = [self._stamp_ns(0, (1 << 62) - 1) for _ in where]
         return {
             "cells": np.array(where, "<u2").tobytes(),
             "kinds": bytes(self._chance.randrange(3) for _ in where),
@@ -120,6 +187,47 @@ class Lies:
             "stamps_ns": np.array(stamps, "<i8").tobytes(),
             "untils_ns": self._chance.choice([b"", np.array(stamps, "<i8").tobytes()]),
         }
+
+    def _learned(self) -> dict[str, bytes]:
+        """The word of an author about kinds of ground."""
+        choice = self._chance.choice
+        said = {
+            choice((0, 1, self._chance.randrange(KEYS), KEYS - 1)): Said(
+                choice((1, 30, MOST_CELLS)), choice((-MOST, 0, ONE, MOST)), choice((0, 1, ONE, MOST * MOST // ONE))
+            )
+            for _ in range(choice((1, 3, 40)))
+        }
+        columns = stated(said, self._stamp_ns(0, (1 << 62) - 1))
+        return {name: each.tobytes() for name, each in columns._asdict().items()}
+
+    def _legs(self, steps: int) -> bytes:
+        """Segments over so many steps, or none."""
+        if not steps or self._chance.random() < 0.3:
+            return b""
+        turns = sorted(self._chance.sample(range(1, steps), self._chance.randrange(min(steps, 5))))
+        return pack_column(np.diff([0, *turns, steps]), "<u4")
+
+    def _tile(self, most: int) -> int:
+        """A tile of any class of vehicles, one between those, or none."""
+        last = beyond_tile(self._grid)
+        number = self._chance.choice((*[*range(len(self._classes))] * 2, MOST_CLASSES, MOST_CLASSES + 1))
+        told = self._grid.tile_for(self._chance.randrange(last), number)
+        return self._chance.choice([*[told, last] * 3, told, self._grid.tile_for(last, number), most])
+
+    def _stamp_ns(self, least: int, most: int) -> int:
+        if self._chance.random() < 0.5:
+            return self._whole(least, most)
+        return min(max(self._now_ns() + int(self._chance.uniform(-20, 20) * NS_PER_S), least), most)
+
+    def _within(self, name: str) -> float:
+        """A place in the grid, in its frame by that name, in rows and columns by any other."""
+        side = self._chance.randrange(max(self._grid.rows, self._grid.cols)) + 0.5
+        match name:
+            case "x_m":
+                return self._grid.west_m + side * self._grid.resolution_m
+            case "y_m":
+                return self._grid.north_m - side * self._grid.resolution_m
+        return side
 
     def _value(self, name: str, hint: Any) -> Any:
         bare, notes = taken_apart(hint)
@@ -131,14 +239,25 @@ class Lies:
         if origin is Literal:
             return self._chance.choice(args)
         if origin is int:
-            return self._whole(*_limits(metas), cell="cell" in name or name in ("start", "held"))
+            least, most = _limits(metas)
+            if name in ("tile", "tiles"):
+                return self._tile(most)
+            if name.endswith("_ns"):
+                return self._stamp_ns(least, most)
+            return self._whole(least, most, cell="cell" in name or name in ("start", "held"))
         if origin is float:
             least, most = (float(limit) for limit in _limits(metas))
+            inside = min(max(self._within(name), least), most)
             some = [least, 0.0 if least <= 0 else least, 5e-324 if least <= 0 else least, 1.0, min(most, 1e300)]
+            some += [inside, inside]
             return self._chance.choice([*some, math.inf] if OR_INFINITE in notes else some)
         if origin is bool:
             return self._chance.random() < 0.5
         if origin is str:
+            if name in ("vehicle_class", "classes") and self._chance.random() < 0.8:
+                return self._chance.choice(self._classes)
+            if name in ("vehicle", "vehicles", "ids") and self._chance.random() < 0.8:
+                return self._chance.choice(self._vehicles)
             is_id = any(isinstance(note, Characters) for note in notes)
             return self._name() if is_id else self._chance.choice(["", "a/b", "ü" * 90, *self._names])
         if origin is bytes:
@@ -171,7 +290,7 @@ class Lies:
         return np.array([self._whole(least, most, cell=True) for _ in range(many)], dtype).tobytes()
 
     def _whole(self, least: int, most: int, cell: bool = False) -> int:
-        near = [self._chance.randrange(self._cells), self._cells - 1, self._cells, 0, 1, 2]
+        near = [self._chance.randrange(self._grid.cells), self._grid.cells - 1, self._grid.cells, 0, 1, 2]
         some = [*near, *([] if cell else [10**12, 1 << 45]), least, most, most - 1]
         return min(max(self._chance.choice(some), least), most)
 

@@ -88,7 +88,8 @@ class Siege:
         self._recovery = Recovery(vehicles)
         self._names = [spec.name for spec in processes_of(scenario)]
         names = (*NAMES, *scenario.target_ids, *(plan.id for plan in plan_agents(scenario)), *vehicles)
-        lies = Lies(terrain.grid.cells, options.seed, tuple(dict.fromkeys(names)))
+        classes = [each.name for each in scenario.classes]
+        lies = Lies(terrain.grid, options.seed, tuple(dict.fromkeys(names)), classes)
         namespace = scenario.network.namespace
         self._hostile = Hostile(namespace, lies, options.seed, options.hostile, options.spared)
         self.run_dir = make_run_dir(options.runs, f"chaos-{time.strftime('%Y%m%d-%H%M%S')}-{options.seed}")

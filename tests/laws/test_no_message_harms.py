@@ -2,38 +2,46 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
+from functools import cache
 
 import numpy as np
 import pytest
 import rerun as rr
+from support.effort import few
 from support.liar import Liar, asked, published
 from support.swarm_model import SwarmModel
 
-from launch_scripts.chaos.lies import ROLES
+from launch_scripts.chaos.lies import NAMES, ROLES, Lies
 from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.world.service import TargetsService
 from planner_service.service import PlannerService
+from shared_map.arrays import Floats
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
-from shared_map.terrain.terrain import terrain_of_pace
+from shared_map.terrain.terrain import Terrain, build_terrain, build_truth, terrain_of_pace
 from swarm.bus.bus import Event, Replied
 from swarm.bus.scheduler import InlineWorker
+from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.authentication import Authenticator
+from swarm.wire.codec import decode
 from swarm.wire.fields import unbounded
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import GIVE_ORDER, ROUTE, RUN, ZONES
+from swarm.wire.topics import GIVE_ORDER, MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED, ZONES
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
-SCENARIO = parse_scenario("""
+PLAIN = """
 name = "lied-to"
 time_scale = 10
 [[targets]]
@@ -50,34 +58,115 @@ planner = 1
 targets = 1
 [monitor]
 live = false
-""")
+"""
+WHOLE = """
+name = "lied-to-whole"
+seed = 3
+time_scale = 10
+[terrain]
+source = "synthetic"
+rows = 48
+cols = 64
+relief_m = 150.0
+[terrain.hidden]
+rubble_fields = 6
+class_factor = { grass = 3.0 }
+[cost]
+max_slope_deg = 22.0
+[map]
+learning = true
+[wind]
+speed_m_per_s = 7.0
+from_deg = 250.0
+[planner]
+routes = "pulled"
+[[targets]]
+speed_m_per_s = 2
+[[targets]]
+name = "h"
+speed_m_per_s = 2
+tracker = "sighted"
+[[groups]]
+assignment = "balanced"
+vehicles = 4
+[[groups]]
+name = "walkers"
+class = "walker"
+targets = ["h"]
+vehicles = 2
+[[groups]]
+name = "drones"
+class = "drone"
+vehicles = 2
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 2.0
+sense_range_m = 40.0
+accel_m_per_s2 = 1.0
+turn_rate_deg_per_s = 120.0
+cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.8, road_speed_m_per_s = 2.0, max_slope_deg = 38.0 }
+[[classes]]
+name = "drone"
+[classes.air]
+speed_m_per_s = 12.0
+clearance_m = 40.0
+[vehicles]
+per_agent = 2
+sense_range_m = 60
+capture_range_m = 20
+reassign_s = 1.0
+[standbys]
+planner = 1
+targets = 1
+[monitor]
+live = false
+"""
+"""With all that a run may have: classes that drive and that fly, in a wind, pulled routes, a target that is
+searched for, a group that shares its targets out, and ground that is learned."""
+TEXTS = {"plain": PLAIN, "whole": WHOLE}
+NAMED = ("t", "h", "h.r1", "walkers", "drones", *(f"a{n}-0{m}" for n in range(4) for m in range(2)))
+AUTHORS = ("all.a0.1", "all.a1.1", "all.a1.2", "walkers.a2.1", "drones.a3.1")
 PACE = np.ones((40, 72), np.float32) / 5
 PACE[10:30, 30] = np.inf
 STATES = ("fresh", "running", "cut", "without target", "restarted")
 
+OFTEN = (MARKS, MARKS, MARKS, SIGHTED, PUSHED_ROUTE)
+"""Told more often than others, as most of what they state is about what is not there."""
+
 
 class Lied(SwarmModel):
-    """One process of every role, two agents, and a liar."""
+    """Of a run the router, a keeper, the targets, the monitor, the first planner or, of the whole, all, the agents,
+    and a liar.
 
-    def __init__(self, state: str, seed: int) -> None:
-        super().__init__(terrain=terrain_of_pace(PACE, 10.0), scenario=SCENARIO)
+    run  of TEXTS
+    """
+
+    def __init__(self, run: str, state: str, seed: int) -> None:
+        scenario, terrain, self.truth = world(run)
+        super().__init__(terrain=terrain, scenario=scenario)
         self.authenticator = Authenticator(b"the liar has no secret", "run")
         self.chance = random.Random(seed)
         self.state = state
         self.ear = self.bus("ear")
         self.heard: list[RouteReply] = []
         self.stores: list[KeeperStore] = []
-        self.promises = {id: MemoryPromiseStore(n) for n, id in enumerate(("a0", "a1"), 1)}
-        self.liar = Liar(self.bus("liar"), self.terrain.grid.cells, seed)
+        agents = [plan.id for plan in plan_agents(scenario)]
+        self.target, *others = scenario.target_ids
+        planners = [self.target] if run == "plain" else [self.target, *others]
+        self.promises = {id: MemoryPromiseStore(n) for n, id in enumerate(agents, 1)}
+        classes = [each.name for each in scenario.classes]
+        names = tuple(dict.fromkeys((*NAMES, *NAMED, *AUTHORS)))
+        lies = Lies(terrain.grid, seed, names, classes, lambda: self.now_ns)
+        self.liar = Liar(self.bus("liar"), lies, seed)
         for role in ROLES:
-            for id in ("a0", "a1") if role == "agent" else ("t0",) if role == "planner" else ("0",):
+            for id in {"agent": agents, "planner": planners}.get(role, ["0"]):
                 if not (role == "targets" and state == "without target"):
                     self.begin(role, id, 1)
         if state != "fresh":
-            self.run(3)
+            self.run(3 if run == "plain" else 7)  # whoever searches has begun
 
     def begin(self, role: str, id: str, incarnation: int) -> object:
-        setup, terrain, truth = self.setup(role, id, incarnation), self.terrain, PACE
+        setup, terrain, truth = self.setup(role, id, incarnation), self.terrain, self.truth
 
         def make(bus, post):  # type: ignore[no-untyped-def]
             match role:
@@ -101,10 +190,10 @@ class Lied(SwarmModel):
     def disturb(self, step: int) -> None:
         """What happens to the processes while they are lied to."""
         if self.state == "cut" and step in (4, 12):
-            for node in ("agent-a0", "planner-t0"):
+            for node in ("agent-a0", f"planner-{self.target}"):
                 (self.cut if step == 4 else self.heal)(self.buses[node])
         if self.state == "restarted" and step == 6:
-            for role, id in (("planner", "t0"), ("agent", "a0"), ("keeper", "0")):
+            for role, id in (("planner", self.target), ("agent", "a0"), ("keeper", "0")):
                 self.kill(f"{role}-{id}")
                 self.begin(role, id, 2)
 
@@ -115,7 +204,7 @@ class Lied(SwarmModel):
             if isinstance(event, Replied) and isinstance(event.message, RouteReply):
                 heard.append(event.message)
 
-        self.ear.ask(ROUTE, RouteRequest(cells=[cell]), post, tag="q", target="t0")
+        self.ear.ask(ROUTE, RouteRequest(cells=[cell]), post, tag="q", target=self.target)
         self.run(0.1)
         return heard
 
@@ -150,20 +239,33 @@ def ignore(event: Event) -> None:
     pass
 
 
-def lied_to(state: str, seed: int, steps: int, besides: tuple[object, ...] = ()) -> Lied:
-    """A swarm after many lies of every kind."""
-    swarm = Lied(state, seed)
+@cache
+def world(run: str) -> tuple[Scenario, Terrain, Floats]:
+    """Scenario, terrain and truth."""
+    scenario = parse_scenario(TEXTS[run])
+    if run == "plain":
+        return scenario, terrain_of_pace(PACE, 10.0), PACE
+    terrain = build_terrain(scenario)
+    return scenario, terrain, build_truth(scenario, terrain)
+
+
+def lied_to(run: str, state: str, seed: int, steps: int, altered: bool) -> Lied:
+    """A swarm after many lies of every kind.
+
+    altered  half of the lies are what was said, with one thing in it altered
+    """
+    swarm = Lied(run, state, seed)
     liar = swarm.liar
+    if altered:
+        liar.listen()
     # Only a process that nobody has confirmed yet ends when it is told of another run.
-    liar.serve(tuple(t for t in asked() if t not in besides and (t is not RUN or state == "running")))
-    puts = [topic for topic in published() if topic not in besides]
+    liar.serve(tuple(topic for topic in asked() if topic is not RUN or state == "running"))
     for step in range(steps):
-        for topic in puts:
+        for topic in (*published(), *OFTEN):
             liar.put(topic)
         for topic in asked():
-            if topic not in besides:
-                liar.ask(topic, ignore)
-        if not besides and step % 5 == 0:
+            liar.ask(topic, liar.hear)
+        if step % 5 == 0:
             liar.token(swarm.chance.choice(ROLES))
         swarm.disturb(step)
         swarm.run(0.1)
@@ -176,36 +278,68 @@ def test_no_field_of_any_message_is_without_bounds() -> None:
     assert [lack for kind in Message.__subclasses__() for lack in unbounded(kind)] == []
 
 
-@pytest.mark.parametrize("state", STATES)
-def test_no_service_raises_on_what_passes_the_door_in_any_state(state: str) -> None:
-    swarm = lied_to(state, 1, 20)
-    assert swarm.liar.told > 500
-    swarm.run(3)
+def test_the_whole_run_searches_pulls_and_flies_and_lies_reach_classes_and_what_is_learned() -> None:
+    swarm = lied_to("whole", "running", 1, 20, False)
+    said = [(node, topic, payload) for _, node, _, topic, payload in swarm.deliveries if node.startswith("planner")]
+    replies = [reply for _, topic, payload in said if topic == "route" and (reply := route_reply(payload))]
+    pulled = {(reply.target, reply.vehicle_class) for reply in replies if reply.routes.legs}
+    assert {("t", "ground"), ("t", "drone")} <= pulled
+    assert any(route.status is RouteStatus.SEARCHING for reply in replies for route in reply.routes)
+    grid, keeper, planner = swarm.terrain.grid, swarm.services["keeper-0"], swarm.services["planner-t"]
+    held = [grid.class_of_tile(tile) for tile in keeper.replica.held.tiles]
+    assert {number for number, tile in held if tile < grid.tiles} >= {0, 1, 2}
+    assert (planner._cost_map.factors != 1).any()
     swarm.close()
 
 
-@pytest.mark.parametrize("state", [state for state in STATES if state != "without target"])
-def test_after_the_lies_each_service_does_its_work_again(state: str) -> None:
-    swarm = lied_to(state, 7, 16)
+def route_reply(payload: bytes) -> RouteReply | None:
+    with contextlib.suppress(ProtocolError):
+        return decode(payload, RouteReply)
+    return None
+
+
+@pytest.mark.parametrize("run", TEXTS)
+@pytest.mark.parametrize("state", STATES)
+def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state: str) -> None:
+    for altered in (False, True):
+        swarm = lied_to(run, state, 1, few(20), altered)
+        assert swarm.liar.told > 250
+        assert (swarm.liar.altered > 100) == altered
+        swarm.run(3)
+        swarm.close()
+
+
+@pytest.mark.parametrize(
+    ("run", "state"),
+    [
+        *[("plain", state) for state in STATES if state != "without target"],
+        *[pytest.param("whole", state, marks=pytest.mark.thorough) for state in ("fresh", "running")],
+        *[("whole", state) for state in ("cut", "restarted")],
+    ],
+)
+def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -> None:
+    swarm = lied_to(run, state, 7, few(40), False)
     swarm.take_back()
     swarm.run(8)
     [targets] = [each for name, each in swarm.services.items() if name == "targets-0"]
-    truth = targets._world._targets["t0"].walker.cell
+    truth = targets._world._targets[swarm.target].walker.cell
     grid = swarm.terrain.grid
-    [reply] = swarm.routes(grid.cell(2, 2))
+    home = int(np.flatnonzero(np.isfinite(swarm.terrain.pace_s_per_m))[0])
+    [reply] = swarm.routes(home)
     assert reply.target_cell is not None
     assert grid.distance_cells(reply.target_cell, truth) <= 3
     assert reply.routes[0].status is RouteStatus.OK
-    agents = [swarm.services["agent-a0"], swarm.services["agent-a1"]]
+    agents = [each for each in swarm.services.values() if isinstance(each, AgentService)]
     before = [vehicle.motion.place_m() for agent in agents for vehicle in agent.agent.vehicles.values()]
     swarm.run(8)
     after = [vehicle.motion.place_m() for agent in agents for vehicle in agent.agent.vehicles.values()]
-    assert len(after) == 4
-    assert sum(was != now for was, now in zip(before, after, strict=True)) >= 2
+    assert len(after) == 2 * len(agents)
+    assert sum(was != now for was, now in zip(before, after, strict=True)) >= len(agents)
     writer = swarm.writer("all.w.1")
-    writer.sync.publish(writer.replica.write([grid.cell(39, 71)], MarkKind.PACE, 7.0, swarm.now_ns))
+    row, col = grid.row_col(home)
+    writer.sync.publish(writer.replica.write([home], MarkKind.PACE, 7.0, swarm.now_ns))
     swarm.run(2)
-    planner, keeper = swarm.services["planner-t0"], swarm.services["keeper-0"]
-    assert planner._cost_map.pace_s_per_m[39, 71] == 7.0
-    assert keeper.replica.held.get(grid.tile_of(grid.cell(39, 71)), "all.w.1") is not None
+    planner, keeper = swarm.services[f"planner-{swarm.target}"], swarm.services["keeper-0"]
+    assert planner._cost_map.pace_s_per_m[row, col] == 7.0
+    assert keeper.replica.held.get(grid.tile_of(home), "all.w.1") is not None
     swarm.close()

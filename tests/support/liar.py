@@ -3,36 +3,68 @@
 from __future__ import annotations
 
 import random
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 
 from launch_scripts.chaos.lies import Lies
-from swarm.bus.bus import Asked, Event
+from swarm.bus.bus import Asked, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryBus
+from swarm.wire.codec import encode
+from swarm.wire.messages.base import Message
 from swarm.wire.topics import TOPICS, Topic
+
+_KEPT = 20
+"""Of what was heard about each topic."""
 
 
 class Liar:
-    """Tells lies from a bus of its own. `cells` is how many the grid has."""
+    """Tells lies from a bus of its own."""
 
-    def __init__(self, bus: MemoryBus, cells: int, seed: int) -> None:
+    def __init__(self, bus: MemoryBus, lies: Lies, seed: int) -> None:
         self.bus = bus
-        self.lies = Lies(cells, seed)
+        self.lies = lies
         self._chance = random.Random(f"liar/{seed}")
+        self._heard: dict[str, deque[tuple[dict[str, str], Message]]] = defaultdict(lambda: deque(maxlen=_KEPT))
+        """Topic -> what was put and answered last, with the fields of its key."""
+        self._own: set[bytes] = set()
+        """Payloads of its own lies, which it hears, too."""
         self.told = 0
+        self.altered = 0
         self.serving = True
+
+    def listen(self) -> None:
+        """Hear everything from now on, and tell it again with one thing in it altered, half of the time."""
+        for topic in published():
+            self.bus.subscribe(topic, self.hear)
+
+    def hear(self, event: Event) -> None:
+        if isinstance(event, Heard | Replied) and encode(event.message) not in self._own:
+            self._heard[event.topic.name].append((event.fields, event.message))
+
+    def _message(self, topic: Topic, kind: type[Message]) -> tuple[Message, dict[str, str]]:
+        """A lie of this type, and the fields of its key."""
+        known = [(fields, each) for fields, each in self._heard[topic.name] if type(each) is kind]
+        if not known or self._chance.random() < 0.5:
+            message = self.lies.lie(kind)
+            self._own.add(encode(message))
+            return message, self.lies.fields(topic, message)
+        fields, heard = self._chance.choice(known)
+        message = self.lies.altered(heard)
+        self._own.add(encode(message))
+        said = {name: value for name in topic.fields if (value := getattr(message, name, None)) is not None}
+        self.altered += 1
+        return message, {**fields, **said}
 
     def put(self, topic: Topic) -> None:
         """A lie on its own key: access is granted by key, so this is what a sender may do at worst."""
-        message = self.lies.lie(topic.message)
-        self.bus.publish(topic, message, **self.lies.fields(topic, message))
+        message, fields = self._message(topic, topic.message)
+        self.bus.publish(topic, message, **fields)
         self.told += 1
 
     def ask(self, topic: Topic, post: Callable[[Event], None]) -> None:
         assert topic.request is not None
-        request = self.lies.lie(topic.request)
-        fields = {
-            name: value for name, value in self.lies.fields(topic, request).items() if self._chance.random() < 0.5
-        }
+        request, named = self._message(topic, topic.request)
+        fields = {name: value for name, value in named.items() if self._chance.random() < 0.5}
         self.bus.ask(topic, request, post, tag="lie", timeout_s=0.5, **fields)
         self.told += 1
 
@@ -41,10 +73,11 @@ class Liar:
 
         def answer(event: Event) -> None:
             assert isinstance(event, Asked)
+            self._heard[event.topic.name].append((event.fields, event.request))
             for _ in range(self._chance.randrange(4) if self.serving else 0):
                 kind = self._chance.choice([each for each in (event.topic.message, event.topic.bulk) if each])
-                message = self.lies.lie(kind)
-                event.answer(message, **self.lies.fields(event.topic, message))
+                message, fields = self._message(event.topic, kind)
+                event.answer(message, **fields)
                 self.told += 1
             if self._chance.random() < 0.2:
                 event.refuse("no")

@@ -60,8 +60,8 @@ def _placed(
 ) -> Iterator[_Placed]:
     for alarm in alarms:
         place_m = None
-        if alarm.cell is not None and 0 <= alarm.cell < grid.cells:
-            row, col = grid.row_col(alarm.cell)
+        if place := alarm.place(grid):
+            row, col = place
             place_m = (col + 0.5) * grid.resolution_m, (row + 0.5) * grid.resolution_m
         elif alarm.target is not None:
             place_m = places_m.get(alarm.target)

@@ -105,12 +105,16 @@ class Alarm:
             return f"at {self.since_s:.0f} s"
         return f"from {self.since_s:.0f} s to {self.over_s:.0f} s"
 
+    def place(self, grid: GridSpec) -> tuple[int, int] | None:
+        """Row and column; None if it has no place, or names one that is not in the grid, as a tracker may."""
+        if self.cell is None or not 0 <= self.cell < grid.cells:
+            return None
+        return grid.row_col(self.cell)
+
     def where(self, grid: GridSpec) -> str:
         """In words: `row 40, col 200`; empty if it has no place."""
-        if self.cell is None or self.cell >= grid.cells:
-            return ""
-        row, col = grid.row_col(self.cell)
-        return f"row {row}, col {col}"
+        place = self.place(grid)
+        return "" if place is None else f"row {place[0]}, col {place[1]}"
 
     def line(self, grid: GridSpec) -> str:
         """All of it in one line."""
@@ -118,7 +122,7 @@ class Alarm:
 
     def fields(self, grid: GridSpec) -> dict[str, object]:
         """For a report."""
-        row, col = (None, None) if self.cell is None or self.cell >= grid.cells else grid.row_col(self.cell)
+        row, col = self.place(grid) or (None, None)
         return {
             "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
             "over_s": self.over_s, "row": row, "col": col, "target": self.target,

@@ -12,6 +12,7 @@ from launch_scripts.chaos.lies import Lies
 from launch_scripts.chaos.picture import draw
 from launch_scripts.chaos.recovery import Recovery
 from launch_scripts.chaos.tally import Ended, Outcome, Sample, Tally
+from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Message
@@ -42,15 +43,15 @@ def test_a_seed_decides_the_blows_and_their_order() -> None:
 
 @pytest.mark.parametrize("kind", sorted({k for t in TOPICS for k in (t.message, t.request, t.bulk) if k}, key=str))
 def test_there_is_a_lie_of_every_message_and_it_passes_the_door(kind: type[Message]) -> None:
-    lies = Lies(cells=1600, seed=3)
+    lies = Lies(GridSpec(40, 40, 10.0), seed=3, classes=["walker"])
     for _ in range(20):
         lie = lies.lie(kind)
         assert decode(encode(lie), kind) == lie
 
 
 def hostile(seed: int = 1, **options: object) -> Hostile:
-    made = Hostile("swarm", Lies(1600, seed), seed, **options)  # type: ignore[arg-type]
-    lies = Lies(1600, 9)
+    made = Hostile("swarm", Lies(GridSpec(40, 40, 10.0), seed), seed, **options)  # type: ignore[arg-type]
+    lies = Lies(GridSpec(40, 40, 10.0), 9)
     for _ in range(50):
         pose = lies.lie(POSE.message)
         made.heard(POSE.keyed("swarm", **lies.fields(POSE, pose)), encode(pose))
@@ -71,7 +72,7 @@ def test_nothing_hostile_is_said_under_a_topic_that_is_spared() -> None:
 
 
 def test_a_replay_is_byte_for_byte_what_was_said() -> None:
-    made = Hostile("swarm", Lies(10, 1), 1, ["replayed"])
+    made = Hostile("swarm", Lies(GridSpec(2, 5, 10.0), 1), 1, ["replayed"])
     made.heard("swarm/x", b"said", b"code")
     assert made.next() == ("replayed", "swarm/x", b"said", b"code")
 
