@@ -20,11 +20,20 @@ class ClassPlanners:
 
     make   makes the planner of a class
     known  the classes that there are, beside "ground"
+    ready  whether the kernels are there by which their trees are grown; once it says so, it is not asked again
     """
 
-    def __init__(self, ground: Planner, make: Callable[[str, int], Planner], known: Collection[str]) -> None:
+    def __init__(
+        self,
+        ground: Planner,
+        make: Callable[[str, int], Planner],
+        known: Collection[str],
+        ready: Callable[[], bool] = lambda: True,
+    ) -> None:
         self._make = make
         self._known = known
+        self._ready = ready
+        self._may_begin = False
         self._by_class: dict[str, Planner] = {GROUND: ground}
         self._used_ns: dict[str, int] = {}
         self._begun_ns: dict[str, int] = {}
@@ -35,8 +44,11 @@ class ClassPlanners:
 
     def fault(self, name: str) -> str | None:
         """Why nothing can be asked for a class; None if something can."""
-        if name == GROUND or name in self._known:
+        if name == GROUND:
             return None
+        if name in self._known:
+            self._may_begin = self._may_begin or self._ready()
+            return None if self._may_begin else f"the kernels for class {name} are still being compiled"
         known = [GROUND, *self._known]
         return f"there is no class {name!r}{choice(name, known, ' there are ')}"
 

@@ -1,10 +1,10 @@
 """Compiling kernels: what a first route needs before the rest, by several processes, into numba's cache on disk.
 
-    python -m planner_service.kernel_build [--directed | --all]
+    python -m planner_service.kernel_build [KERNEL ...]
 
-is one builder, for maps where uphill is not downhill or, without the option, for the others; or for both. Any
-number of them, started by whomever, share the work: each claims a kernel by a lock on a file beside numba's,
-compiles it and writes it there, where planners find it. A builder that dies leaves its claim.
+is one builder, of these kernels in this order, or of all. Any number of them, started by whomever, share the work:
+each claims a kernel by a lock on a file beside numba's, compiles it and writes it there, where planners find it. A
+builder that dies leaves its claim.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,7 @@ from planner_service.kernels import (
     pieces_labels,
     pieces_mend,
     pieces_totals,
+    pull,
     repair,
     route_walk,
     stride_growth,
@@ -40,6 +43,8 @@ from planner_service.kernels import (
     wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
+from swarm.config.classes import aloft_classes
+from swarm.config.scenario import Scenario
 
 Kernel = Any
 """What `kernels.compile.kernel` makes; numba has no types."""
@@ -88,25 +93,57 @@ LATER: tuple[Kernel | StepKernel, ...] = (
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
+PULL = pull.pull_routes
+"""Only for planners that pull their routes."""
+
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"
 """Each builder holds this lock shared, so that others see that one is at work."""
 
 
-def first_kernels(directed: bool) -> list[Kernel]:
-    """What a planner's first route takes. directed: its terrain is one where uphill is not downhill."""
-    return _of_kind(FIRST, directed)
+@dataclass(frozen=True, slots=True)
+class NeededKernels:
+    """What planners call, none of them twice. Whoever compiles for them and they themselves go by the same.
+
+    first    until the first route of the class "ground" is served
+    classes  beside these, until the first route of any other class is
+    later    what saves growing whole trees
+    """
+
+    first: tuple[Kernel, ...]
+    classes: tuple[Kernel, ...]
+    later: tuple[Kernel, ...]
+
+    def __iter__(self) -> Iterator[Kernel]:
+        """In the order in which they are needed."""
+        yield from (*self.first, *self.classes, *self.later)
 
 
-def later_kernels(directed: bool) -> list[Kernel]:
-    """What a planner takes beside these."""
-    return _of_kind(LATER, directed)
+def needed_kernels(scenario: Scenario) -> NeededKernels:
+    """What the planners of a scenario call. Its ground may be of one kind, and a class that flies of the other."""
+    ground = scenario.cost.directional
+    aloft = bool(aloft_classes(scenario))
+    pulled = scenario.planner.routes == "pulled"
+    first = _of_kind([*FIRST, PULL] if pulled and not ground else FIRST, ground)
+    classes = _of_kind([*FIRST, PULL] if pulled else FIRST, True) if aloft else []
+    later = [*_of_kind(LATER, ground), *(_of_kind(LATER, True) if aloft else [])]
+    return NeededKernels(*_once(first, classes, later))
 
 
 def all_kernels() -> list[Kernel]:
-    """Of both kinds of map, each once: those that are asked for more often come first."""
-    every = [kernel for directed in (False, True) for part in (FIRST, LATER) for kernel in _of_kind(part, directed)]
-    return list({name_of(kernel): kernel for kernel in every}.values())
+    """Those of planners on any map, each once: what is asked for more often comes first."""
+    return [*chain(*_once(*(_of_kind(part, kind) for part in (FIRST, LATER, [PULL]) for kind in (False, True))))]
+
+
+def _once(*parts: Sequence[Kernel]) -> list[tuple[Kernel, ...]]:
+    """The same parts, each kernel in the first of them that has it."""
+    known: set[str] = set()
+    kept = []
+    for part in parts:
+        fresh = {name_of(kernel): kernel for kernel in part if name_of(kernel) not in known}
+        known |= fresh.keys()
+        kept.append(tuple(fresh.values()))
+    return kept
 
 
 def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
@@ -139,9 +176,10 @@ def load_what_is_there() -> None:
         load_all()
 
 
-def load_all(directed: bool = False) -> None:
-    """Make all kernels for one kind of map ready in this process, compiled here where they are not on disk."""
-    for kernel in (*first_kernels(directed), *later_kernels(directed)):
+def load_all() -> None:
+    """Make all kernels for maps where uphill is as downhill ready in this process, compiled here where they are not
+    on disk."""
+    for kernel in _of_kind([*FIRST, *LATER], False):
         load(kernel)
 
 
@@ -186,16 +224,15 @@ def is_building() -> bool:
 class KernelLoader:
     """The kernels of one planner, which are compiled elsewhere.
 
-    directed  its terrain is one where uphill is not downhill
-    whole     the first route waits for all kernels: where growing a whole tree takes long, none should be grown
-              only because another kernel is not there yet
+    needed  what it calls
+    whole   the first route waits for all kernels: where growing a whole tree takes long, none should be grown
+            only because another kernel is not there yet
     """
 
-    def __init__(self, directed: bool, whole: bool) -> None:
-        first = first_kernels(directed)
-        self._directed = directed
-        self._kernels = [*first, *later_kernels(directed)]
-        self._first = self._kernels if whole else first
+    def __init__(self, needed: NeededKernels, whole: bool) -> None:
+        self._kernels = list(needed)
+        self._first = self._kernels if whole else list(needed.first)
+        self._classes = list(needed.classes)
         self._missing = list(self._kernels)
         self._asked_s = -math.inf
         self.builders: list[subprocess.Popen[bytes]] = []
@@ -207,11 +244,21 @@ class KernelLoader:
         """Whether all may be called. Once true, it stays so."""
         return not self._missing
 
+    @property
+    def classes_complete(self) -> bool:
+        """Whether whole trees of all classes may be grown, beside those of "ground". Once true, it stays so."""
+        if self._classes and self._missing:
+            gone = {name_of(kernel) for kernel in self._missing}
+            self._classes = [kernel for kernel in self._classes if name_of(kernel) in gone]
+            return not self._classes
+        return True
+
     def load_first(self, tell: Callable[[str], None] = lambda _: None) -> None:
         """Wait until a first route can be planned; what comes after it is loaded as it is there. `tell` is handed a
         sentence now and then."""
         if not can_build():
-            load_all(self._directed)
+            for kernel in self._kernels:
+                load(kernel)
         began_s = told_s = time.monotonic()
         while waiting := missing(self._first):
             self._have_built()
@@ -240,17 +287,19 @@ class KernelLoader:
         now_s = time.monotonic()
         if now_s - self._asked_s > 20.0 and not is_building():
             self._asked_s = now_s
-            command = [sys.executable, "-m", "planner_service.kernel_build", *["--directed"] * self._directed]
+            command = [sys.executable, "-m", "planner_service.kernel_build", *map(name_of, self._missing)]
             self.builders = [subprocess.Popen(command) for _ in range(min(len(os.sched_getaffinity(0)), 8))]
 
 
 def main() -> None:
-    """Compile all kernels for one kind of map, or for both, those of a first route before the others."""
+    """Compile the kernels that are named, or all of planners."""
     os.nice(5)
-    directed = "--directed" in sys.argv[1:]
-    every = all_kernels() if "--all" in sys.argv[1:] else [*first_kernels(directed), *later_kernels(directed)]
+    every = {name_of(kernel): kernel for kernel in all_kernels()}
+    names = sys.argv[1:] or list(every)
+    if unknown := [name for name in names if name not in every]:
+        sys.exit(f"expected names of kernels, found {unknown[0]!r}; there are {', '.join(every)}")
     if can_build():
-        build([each for each in every if not is_loaded(each)])
+        build([every[name] for name in names if not is_loaded(every[name])])
 
 
 if __name__ == "__main__":

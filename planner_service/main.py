@@ -8,17 +8,14 @@ from collections.abc import Callable
 from contextlib import closing
 
 from planner_service.growth_times import is_slow_to_grow
-from planner_service.kernel_build import KernelLoader
+from planner_service.kernel_build import KernelLoader, needed_kernels
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
 from shared_map.prepared_classes import load_classes
 from shared_map.terrain.kept import kept_key
 from shared_map.terrain.prepared import load_terrain
-from shared_map.terrain.terrain import Terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.config.classes import aloft_classes
-from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
@@ -31,11 +28,6 @@ from swarm.runtime.turns import Turns
 log = logging.getLogger(__name__)
 
 
-def _climbs(scenario: Scenario, terrain: Terrain) -> bool:
-    """Whether steps cost by what they climb, for any class."""
-    return terrain.climb is not None or bool(aloft_classes(scenario))
-
-
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Plan for one target, as its planner or a standby, until SIGTERM, SIGINT or the end of the launcher."""
     scenario = setup.scenario
@@ -45,7 +37,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
-    kernels = KernelLoader(directed=_climbs(scenario, terrain), whole=is_slow_to_grow(terrain.grid))
+    kernels = KernelLoader(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
     prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
     clock = MonotonicClock()
@@ -64,6 +56,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.worker(worker),
             boundary.function("stopwatch", time.thread_time_ns, int),
             boundary.function("all kernels", lambda: kernels.complete, bool),
+            boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
             boundary.outside(prepared, PREPARED_COSTS),
         )
         process = Process(boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id))

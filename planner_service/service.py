@@ -59,6 +59,7 @@ class PlannerService:
     stopwatch     the CPU time of this thread, ns, that growths on it are timed with; a simulation gives none, and a
                   model is used
     all_kernels   whether all kernels may be called by now, not only those for whole trees; if not given, they may
+    class_kernels whether those for whole trees of all classes may, not only of "ground"; if not given, they may
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class PlannerService:
         worker: Worker,
         stopwatch: Callable[[], int] | None = None,
         all_kernels: Callable[[], bool] | None = None,
+        class_kernels: Callable[[], bool] | None = None,
         prepared: PreparedCosts | None = None,
     ) -> None:
         scenario = setup.scenario
@@ -135,7 +137,9 @@ class PlannerService:
         """The newest that a tracker told, for the planner of a class that is made later."""
         self._planner_of = planner_of
         self._planner = planner_of(GROUND, self._cost_map)
-        self._planners = ClassPlanners(self._planner, self._begin_class, self._maps.of)
+        self._planners = ClassPlanners(
+            self._planner, self._begin_class, self._maps.of, class_kernels or (lambda: True)
+        )
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version = 0
         self._removed = False

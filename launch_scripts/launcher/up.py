@@ -133,8 +133,7 @@ class _Run:
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
         planners = "planner" in self._options.roles
-        directed = self._scenario.cost.directional
-        self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, planners, directed)
+        self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
         self._warm_up.begin()
         try:
             return self._run()

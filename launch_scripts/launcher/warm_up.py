@@ -13,6 +13,7 @@ from multiprocessing.context import ForkServerProcess
 from launch_scripts.launcher.child import wait_for_launcher
 from launch_scripts.launcher.local_swarm import without_main
 from launch_scripts.launcher.preload import start_forkserver
+from swarm.config.scenario import Scenario
 
 _BACKGROUND = 5
 """Niceness of what compiles kernels that no first route needs."""
@@ -23,13 +24,12 @@ class WarmUp:
     missing.
 
     preload  module that the forkserver imports
-    planners whether planners are to run; directed: on a terrain where uphill is not downhill
+    scenario that of the planners that are to run; None if none are
     """
 
-    def __init__(self, preload: str | None, planners: bool = False, directed: bool = False) -> None:
+    def __init__(self, preload: str | None, scenario: Scenario | None = None) -> None:
         start_forkserver(preload)
-        self._planners = planners
-        self._directed = directed
+        self._scenario = scenario
         self._context = multiprocessing.get_context("forkserver")
         self._failure: BaseException | None = None
         self._loaded = threading.Event()
@@ -93,10 +93,10 @@ class WarmUp:
     def _probe(self) -> None:
         """The forkserver answers once it has loaded everything; its child tells what is missing."""
         found, tell = self._context.Pipe(duplex=False)
-        self._start(_find_missing if self._planners else _find_nothing, tell, self._directed).join()
+        self._start(_find_missing if self._scenario else _find_nothing, tell, self._scenario).join()
         tell.close()
-        first, later = found.recv()
-        self._first, self._left, self._all = set(first), {*first, *later}, {*first, *later}
+        first, others = found.recv()
+        self._first, self._left, self._all = set(first), {*first, *others}, {*first, *others}
 
     def _ready_if_first(self) -> None:
         if not self._first:
@@ -111,7 +111,7 @@ class WarmUp:
             with self._lock:
                 if self._closed:
                     return
-                self._builders.append(self._start(_build, tell, self._directed))
+                self._builders.append(self._start(_build, tell, self._scenario))
             tell.close()
             pipes.append(compiled)
         while pipes:
@@ -134,27 +134,29 @@ class WarmUp:
         return process
 
 
-def _find_nothing(tell: Connection, _: bool) -> None:
+def _find_nothing(tell: Connection, _: None) -> None:
     tell.send(((), ()))
 
 
-def _find_missing(tell: Connection, directed: bool) -> None:
+def _find_missing(tell: Connection, scenario: Scenario) -> None:
     """Tell the names of kernels that are not compiled: of those for a first route, and of the others."""
-    from planner_service.kernel_build import can_build, first_kernels, later_kernels, missing, name_of
+    from planner_service.kernel_build import can_build, missing, name_of, needed_kernels
 
     if not can_build():
         tell.send(((), ()))
         return
-    first, later = missing(first_kernels(directed)), missing(later_kernels(directed))
-    tell.send((list(map(name_of, first)), list(map(name_of, later))))
+    needed = needed_kernels(scenario)
+    first, others = missing(needed.first), missing((*needed.classes, *needed.later))
+    tell.send((list(map(name_of, first)), list(map(name_of, others))))
 
 
-def _build(tell: Connection, directed: bool) -> None:
+def _build(tell: Connection, scenario: Scenario) -> None:
     """Compile what is missing, together with the other builders."""
-    from planner_service.kernel_build import build, first_kernels, later_kernels, name_of
+    from planner_service.kernel_build import build, name_of, needed_kernels
 
     threading.Thread(target=_end_with_launcher, daemon=True).start()
-    for kernels, niceness in ((first_kernels(directed), 0), (later_kernels(directed), _BACKGROUND)):
+    needed = needed_kernels(scenario)
+    for kernels, niceness in ((needed.first, 0), ((*needed.classes, *needed.later), _BACKGROUND)):
         os.nice(niceness)
         build(kernels, lambda kernel: tell.send(name_of(kernel)))
 

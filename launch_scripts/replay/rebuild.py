@@ -126,6 +126,7 @@ def _planner(setup: RoleSetup, terrain: Terrain, boundary: Replaying) -> Planner
         boundary.worker(),
         boundary.function("stopwatch", None, int),
         boundary.function("all kernels", None, bool),
+        boundary.function("kernels of classes", None, bool),
         boundary.outside(costs, PREPARED_COSTS),
     )
 

@@ -136,8 +136,9 @@ class Node:
             case "planner":
                 stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
                 kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
+                of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
                 prepared = boundary.outside(None, PREPARED_COSTS)
-                return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, prepared)
+                return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
             case "targets":
                 return TargetsService(setup, terrain, truth, bus, post)
             case "agent":

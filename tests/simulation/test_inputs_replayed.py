@@ -94,7 +94,11 @@ def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
     terrain = build_terrain(scenario)
     calls = itertools.count()
     # As a live planner is given them: CPU time, kernels that are compiled by and by, networks in files.
-    live = {"stopwatch": time.thread_time_ns, "all kernels": lambda: next(calls) > 40}
+    live = {
+        "stopwatch": time.thread_time_ns,
+        "all kernels": lambda: next(calls) > 40,
+        "kernels of classes": lambda: True,
+    }
     function, outside = Recording.function, Recording.outside
 
     def functions(self: Recording, name: str, given: object, kind: Any) -> Any:

@@ -51,13 +51,13 @@ def start(what: str, size: int, started_ns: int) -> dict[str, float]:
     """
     import numpy as np
 
-    from planner_service.kernel_build import KernelLoader
+    from planner_service.kernel_build import KernelLoader, needed_kernels
     from planner_service.target_tree import TargetTree
-    from swarm.config.scenario import PlannerConfig
+    from swarm.config.scenario import PlannerConfig, Scenario
     from swarm.grid import GridSpec
 
     grid, target = GridSpec(size, size, 1.0), size * size // 2
-    loader = KernelLoader(directed=False, whole=False)
+    loader = KernelLoader(needed_kernels(Scenario()), whole=False)
     if what != "tree":
         loader.load_first()
     tree = TargetTree(grid, PlannerConfig(strategy="full"))

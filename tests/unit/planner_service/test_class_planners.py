@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -32,9 +33,10 @@ from swarm.wire.fields import column
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, RouteRequest
 from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import COST, POSE, ROUTE
+from swarm.wire.topics import CHASERS, COST, POSE, ROUTE
 
 _TEXT = """
 seed = 3
@@ -138,14 +140,16 @@ def _apply(maps: ClassMaps, batch: list[Any], class_number: int = 0) -> None:
 
 
 class _World(SwarmModel):
-    def __init__(self) -> None:
+    def __init__(self, class_kernels: Callable[[], bool] | None = None) -> None:
         scenario, terrain, _ = _made()
         super().__init__(terrain=terrain, scenario=scenario)
         self.ear = Ear(self)
         setup = self.setup("planner", "t", 1)
         worker = InlineWorker(self.scheduler)
         self.service = self.start(
-            "planner-t", lambda bus, post: PlannerService(setup, terrain, bus, post, worker), phase_ns=0
+            "planner-t",
+            lambda bus, post: PlannerService(setup, terrain, bus, post, worker, class_kernels=class_kernels),
+            phase_ns=0,
         )
         self.target = _open_cell()
         self._seq = 0
@@ -263,6 +267,24 @@ def test_what_one_class_reaches_another_may_not(world: _World) -> None:
     assert reached["walker"] > reached["ground"] > reached["low"] > 0
     both = np.isfinite(costs["walker"]) & np.isfinite(costs["ground"]) & (costs["ground"] > 0)
     assert (costs["walker"][both] > costs["ground"][both]).mean() > 0.9  # on foot
+
+
+def test_while_the_kernels_of_classes_are_compiled_a_class_is_refused_at_once_and_the_ground_is_served() -> None:
+    compiled = False
+    world = _World(lambda: compiled)
+    world.run(2.0)
+    cells = np.array([world.target], "<u4").tobytes()
+    told = Chasers(target="t", author="a0", stamp_ns=0, ids=["a0.v0"], cells=cells, vehicle_class="walker")
+    world.ear.bus.publish(CHASERS, told, target="t", author="a0")
+    began_ns = world.now_ns
+    assert world.ask(RouteRequest(cells=[world.target], vehicle_class="walker")) is None
+    assert "the kernels for class walker are still being compiled" in str(world.ear.ended[0].failure)
+    assert world.now_ns - began_ns < NS_PER_S / 2, "nobody behind it waits"
+    assert world.ask(RouteRequest(cells=[world.target])) is not None
+    assert world.trees() == ["ground"]
+    compiled = True
+    reply = world.ask(RouteRequest(cells=[world.target], vehicle_class="walker"))
+    assert (reply.vehicle_class, world.trees()) == ("walker", ["ground", "walker"])
 
 
 def test_an_unknown_class_is_refused_with_those_there_are(world: _World) -> None:

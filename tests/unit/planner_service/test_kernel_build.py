@@ -6,19 +6,72 @@ import os
 import subprocess
 import sys
 import textwrap
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from planner_service import kernel_build
-from planner_service.kernel_build import KernelLoader, all_kernels, first_kernels, later_kernels, name_of
+from planner_service.kernel_build import KernelLoader, all_kernels, name_of, needed_kernels
 from planner_service.kernels.compile import KERNELS
+from planner_service.pulled_routes import pulls
+from shared_map.class_grounds import class_terrains
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.classes import GROUND
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
 
 
 def test_every_kernel_of_a_planner_is_built() -> None:
     built = [name_of(kernel) for kernel in all_kernels()]
-    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first", "pull_routes", "pull_routes_directed"})
+    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first"})
+
+
+def scenario(*, directional: bool = False, aloft: bool = False, routes: str = "grid") -> Scenario:
+    """On any ground, with a class that drives and, if so, one that flies."""
+    return parse_scenario(
+        f"""
+terrain = {{ source = "synthetic", rows = 24, cols = 24, roads = 0 }}
+cost = {{ directional = {str(directional).lower()} }}
+planner = {{ routes = "{routes}" }}
+[[classes]]
+name = "truck"
+max_speed_m_per_s = 5.0
+"""
+        + '[[classes]]\nname = "drone"\nair = {}\n' * aloft
+    )
+
+
+@pytest.mark.parametrize("directional", [False, True])
+@pytest.mark.parametrize("aloft", [False, True])
+@pytest.mark.parametrize("routes", ["grid", "pulled"])
+def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(
+    directional: bool, aloft: bool, routes: str
+) -> None:
+    """By the terrains themselves, as planners come by their kernels."""
+    given = scenario(directional=directional, aloft=aloft, routes=routes)
+    needed = needed_kernels(given)
+    terrain = build_terrain(given)
+    climbs = {GROUND: terrain.climb, **{k: v.climb for k, v in class_terrains(given, terrain).items()}}
+    growths = {False: "grow_by_buckets", True: "grow_directed_by_buckets"}
+    mends = {False: "mend", True: "mend_directed"}
+    pulled = {False: "pull_routes", True: "pull_routes_directed"}
+    first, later = set(map(name_of, needed.first)), set(map(name_of, needed.later))
+    classes = first | set(map(name_of, needed.classes))
+    assert first & set(growths.values()) == {growths[climbs[GROUND] is not None]}
+    assert classes & set(growths.values()) == {growths[climb is not None] for climb in climbs.values()}
+    assert later & set(mends.values()) == {mends[climb is not None] for climb in climbs.values()}
+    straight = {name: climb for name, climb in climbs.items() if pulls(given.planner, climb)}
+    assert classes & set(pulled.values()) == {pulled[climb is not None] for climb in straight.values()}
+    assert len(list(needed)) == len(set(map(name_of, needed)))
+
+
+def test_nothing_of_classes_keeps_the_first_route_of_the_ground_waiting() -> None:
+    plain, mixed = needed_kernels(scenario()), needed_kernels(scenario(aloft=True))
+    assert mixed.first == plain.first
+    assert not plain.classes
+    assert mixed.classes
 
 
 _KERNELS = "\n\n\n".join(f'@kernel("(i8,)")\ndef k{n}(x):\n    return x + {n}' for n in range(6))
@@ -124,22 +177,31 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     disk = Disk(monkeypatch)
-    disk.coming = [name_of(kernel) for kernel in first_kernels(False)]
-    loader = KernelLoader(directed=False, whole=False)
+    needed = needed_kernels(scenario(aloft=True))
+    disk.coming = [name_of(kernel) for kernel in needed.first]
+    loader = KernelLoader(needed, whole=False)
     loader.load_first()
     assert not disk.coming
     assert disk.started >= 1, "nobody was building"
+    assert disk.options == [name_of(kernel) for kernel in needed], "in the order in which they are needed"
     assert not loader.complete
-    disk.coming = [name_of(kernel) for kernel in later_kernels(False)]
+    assert not loader.classes_complete
+    disk.coming = [name_of(kernel) for kernel in needed.classes]
+    while not loader.classes_complete:
+        time.sleep(0.001)
+    assert not loader.complete
+    disk.coming = [name_of(kernel) for kernel in needed.later]
     loader.wait()
     assert loader.complete
+    assert loader.classes_complete
 
 
 def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
     disk.building = True
-    disk.coming = [name_of(kernel) for kernel in (*first_kernels(False), *later_kernels(False))]
-    loader = KernelLoader(directed=False, whole=True)
+    needed = needed_kernels(scenario())
+    disk.coming = [name_of(kernel) for kernel in needed]
+    loader = KernelLoader(needed, whole=True)
     loader.load_first()
     assert loader.complete
     assert not disk.started
@@ -147,17 +209,18 @@ def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.Monke
 
 def test_a_directed_terrain_waits_for_the_kernels_that_grow_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
-    disk.coming = [*map(name_of, later_kernels(True)), *map(name_of, first_kernels(True))]
-    loader = KernelLoader(directed=True, whole=False)
+    needed = needed_kernels(scenario(directional=True))
+    disk.coming = [*map(name_of, needed.later), *map(name_of, needed.first)]
+    loader = KernelLoader(needed, whole=False)
     loader.load_first()
     assert not disk.coming
-    assert disk.options == ["--directed"]
+    assert "grow_directed_by_buckets" in disk.options
 
 
 def test_what_only_the_other_kind_of_map_needs_is_not_compiled() -> None:
     """Uphill is not downhill: other growths, one of which serves all costs, and else as many kernels."""
     alike, directed = (
-        {name_of(kernel) for kernel in (*first_kernels(kind), *later_kernels(kind))} for kind in (False, True)
+        {name_of(kernel) for kernel in needed_kernels(scenario(directional=kind))} for kind in (False, True)
     )
     assert len(alike) == len(directed) + 1
     assert {name for name in alike & directed if name.startswith("grow")} == set()
@@ -167,12 +230,11 @@ def test_what_only_the_other_kind_of_map_needs_is_not_compiled() -> None:
 @pytest.mark.parametrize(
     ("options", "wanted"),
     [
-        ([], [*first_kernels(False), *later_kernels(False)]),
-        (["--directed"], [*first_kernels(True), *later_kernels(True)]),
-        (["--all"], all_kernels()),
+        ([], all_kernels()),
+        (["mend", "arrivals"], [*filter(lambda kernel: name_of(kernel) in ("mend", "arrivals"), all_kernels())]),
     ],
 )
-def test_a_builder_by_hand_builds_for_one_kind_of_map_or_for_both(
+def test_a_builder_by_hand_builds_what_is_named_or_all(
     options: list[str], wanted: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built: list[Any] = []
@@ -185,3 +247,6 @@ def test_a_builder_by_hand_builds_for_one_kind_of_map_or_for_both(
     monkeypatch.setattr(kernel_build, "can_build", lambda: False)  # nobody would find what is built
     kernel_build.main()
     assert len(built) == len(wanted)
+    monkeypatch.setattr(sys, "argv", ["kernel_build", "nothing"])
+    with pytest.raises(SystemExit, match="expected names of kernels, found 'nothing'"):
+        kernel_build.main()
