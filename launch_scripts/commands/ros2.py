@@ -70,6 +70,7 @@ def _columns(lines: Iterable[tuple[str, ...]]) -> list[str]:
 def serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
     """Forward until Ctrl-C. Raises BusError if one of the two sides does not answer at the start."""
     from launch_scripts.ros2.service import Ros2Service
+    from launch_scripts.stop_requests import stop_requests
 
     ros = settings.ros.endpoint
     if ros in network.connect:
@@ -81,5 +82,5 @@ def serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
     if not listening(ros):
         raise BusError(f"no router of the ROS side listens at {ros}: start rmw_zenohd, or name it by --ros")
     service = Ros2Service(settings, network, runs, lambda sentence: typer.echo(sentence, err=True))
-    with suppress(KeyboardInterrupt):
-        service.run()
+    with stop_requests() as stopping, suppress(KeyboardInterrupt):
+        service.run(stopping=stopping)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from launch_scripts.mavlink.adapter import Adapter, Wishes
 from launch_scripts.mavlink.link import Address, Link, open_link
 from launch_scripts.mavlink.messages import Action, Follow, Report, Tell, Unfollow, Way, Withdraw
 from launch_scripts.mavlink.wire import Wire, pymavlink
+from launch_scripts.stop_requests import stop_requests
 from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
 
 _TURN_S = 0.02
@@ -74,9 +73,9 @@ def run(
         try:
             shell = Shell(swarm, link, Wire(sysid, key, time.time()), body, wishes, tell)
             tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
-            with _interrupts():
+            with stop_requests() as stopping:  # so that the vehicle is told to stop
                 try:
-                    while True:
+                    while not stopping():
                         shell.turn()
                 except KeyboardInterrupt:
                     pass
@@ -189,17 +188,3 @@ class Shell:
             radius_m=body.radius_m,
             vehicle_class=body.vehicle_class,
         )
-
-
-@contextmanager
-def _interrupts() -> Iterator[None]:
-    """SIGTERM ends as Ctrl-C does, so that the vehicle is told to stop."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -131,21 +131,25 @@ class Ros2Service:
         self._say = say
         self._types = types_of(Distribution(settings.ros.distribution))
 
-    def run(self, until_s: float | None = None) -> None:
-        """Forward until a time of `time.monotonic`, or for ever. Raises BusError if one of the sides does not
-        answer at the start; after that both are waited for."""
+    def run(self, until_s: float | None = None, stopping: Callable[[], bool] = lambda: False) -> None:
+        """Forward until a time of `time.monotonic`, or until it is `stopping`. Raises BusError if one of the sides
+        does not answer at the start; after that both are waited for."""
+
+        def over() -> bool:
+            return stopping() or (until_s is not None and time.monotonic() >= until_s)
+
         ros = open_ros(self._settings.ros.endpoint)
         try:
             swarm = self._connect()
             while True:
                 try:
                     with swarm:
-                        self._forward(ros, swarm, until_s)
+                        self._forward(ros, swarm, over)
                 except _RunOverError:
                     self._say(f"{swarm.ended}")
-                if until_s is not None and time.monotonic() >= until_s:
+                if over():
                     return
-                swarm = self._connect_again(until_s)
+                swarm = self._connect_again(over)
         finally:
             close_ros(ros)
 
@@ -156,17 +160,17 @@ class Ros2Service:
             network.connect[0], namespace=network.namespace, timeout_s=network.connect_timeout_s, **files
         )
 
-    def _connect_again(self, until_s: float | None) -> Swarm:
+    def _connect_again(self, over: Callable[[], bool]) -> Swarm:
         while True:
             try:
                 return self._connect()
             except SwarmError as error:
-                if until_s is not None and time.monotonic() >= until_s:
+                if over():
                     raise
                 log.info("%s", error)
                 time.sleep(_AGAIN_S)
 
-    def _forward(self, ros: RosSession, swarm: Swarm, until_s: float | None) -> None:
+    def _forward(self, ros: RosSession, swarm: Swarm, over: Callable[[], bool]) -> None:
         """One run. Raises _RunOverError when another one is in its place."""
         settings = self._settings
         node = Node(ros, settings.ros.node, self._types, settings.ros.domain)
@@ -179,7 +183,7 @@ class Ros2Service:
                 )
                 incoming = self._incoming(node, swarm, gateway, observer)
                 try:
-                    _Loop(self, node, swarm, observer, gateway, incoming, self._say).run(until_s)
+                    _Loop(self, node, swarm, observer, gateway, incoming, self._say).run(over)
                 finally:
                     if incoming is not None:
                         incoming.close()
@@ -250,9 +254,9 @@ class _Loop:
         self._seen: deque[SeenEndpoint] = deque(maxlen=_MOST_SEEN)
         self._look_due_s = 0.0
 
-    def run(self, until_s: float | None) -> None:
+    def run(self, over: Callable[[], bool]) -> None:
         self._node.watch("*", lambda seen, there: self._seen.append(seen) if there else None)
-        while until_s is None or time.monotonic() < until_s:
+        while not over():
             if time.monotonic() >= self._look_due_s:
                 self._look_due_s = time.monotonic() + _LOOK_S
                 self._look()
