@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Tells whether SIGINT or SIGTERM has come. Either raises KeyboardInterrupt, too, so that waits end at once; but
+    """Tells whether SIGINT or SIGTERM has come. Both raise KeyboardInterrupt, too, so that waits end at once. But
     an exception may be lost, where the library that is just at work takes it for its own. So loops ask as well.
     Called on the main thread."""
     asked = threading.Event()
