@@ -337,3 +337,12 @@ def test_no_text_gets_past_the_bounds_of_toml(parts: list[str]) -> None:
     except ConfigError:
         return
     assert len(repr(values)) < 10_000
+
+
+def test_a_raster_with_a_name_inside_that_is_no_text_is_refused_in_one_line(tmp_path: Path) -> None:
+    content = bytearray(SEEDS["a.tif"])
+    content[326], content[342] = 1, 128  # in the name of its coordinate system
+    path = tmp_path / "a.tif"
+    path.write_bytes(content)
+    with pytest.raises(SwarmError, match=r"^terrain .*a\.tif is truncated or no raster: 'utf-8' codec"):
+        _read(path)

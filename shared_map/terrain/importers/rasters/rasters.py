@@ -96,7 +96,7 @@ def opened(path: Path, what: str) -> Iterator[Any]:
                 if name is path:
                     _check_length(path, dataset, what)
                 yield dataset
-    except (RasterioError, CPLE_BaseError) as error:
+    except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:_LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
     except OSError as error:
