@@ -1,4 +1,4 @@
-"""What comes over the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
+"""The door and the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
 
 from __future__ import annotations
 
