@@ -28,8 +28,8 @@ from launch_scripts.mavlink.messages import (
     Way,
     Withdraw,
 )
-from launch_scripts.mavlink.waypoints import Point
 from swarm.client import ConfigError, Frame
+from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
 
 BEAT_NS = NS_PER_S
