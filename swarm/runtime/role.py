@@ -10,6 +10,7 @@ from swarm.config.classes import class_numbers
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.fields import MOST_IDS
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo, Stats
 
 
@@ -60,6 +61,7 @@ class RoleSetup:
             crew=[f"{role}-{id}" for role, id in crew_of(self.scenario)][:MOST_IDS],
             restarts=self.restarts,
             classes=list(class_numbers(self.scenario)),
+            wire_version=WIRE_VERSION,
         )
 
     @property
