@@ -13,6 +13,8 @@ import shlex
 from launch_scripts.deploy.plan import Plan, PlannedHost
 
 UNIT = "swarm.service"
+HEALTH_PORT = 9464
+"""Where a machine's launcher answers probes and Prometheus, on loopback."""
 _HOME, _PROGRAM = "/etc/swarm", "/opt/swarm/bin/swarm"
 
 _UNIT = """\
@@ -25,13 +27,16 @@ After=network-online.target time-sync.target
 StartLimitIntervalSec=0
 
 [Service]
-Type=exec
+Type=notify
 ExecStart={command}
 User=swarm
 Group=swarm
 WorkingDirectory={home}
 Restart=always
 RestartSec=1
+# It is up once its processes are started, and may wait for other machines before that.
+TimeoutStartSec=infinity
+WatchdogSec=30
 # The launcher ends its processes role by role; what is left after that is killed.
 KillMode=mixed
 TimeoutStopSec=30
@@ -148,7 +153,8 @@ exec "${{SWARM:-swarm}}" {arguments} --runs "${{RUNS:-runs}}" "$@"
 def up_arguments(plan: Plan, host: PlannedHost, scenario: str) -> list[str]:
     """The words after `swarm` that start a machine's processes, without --runs."""
     only = [word for process in host.processes for word in ("--only", process.selector)]
-    return ["up", scenario, "--run-id", plan.run_id, "--plain", *only]
+    signals = ("--metrics-port", str(HEALTH_PORT))
+    return ["up", scenario, "--run-id", plan.run_id, "--plain", *signals, *only]
 
 
 def unit_text(plan: Plan, host: PlannedHost) -> str:
