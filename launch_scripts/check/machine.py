@@ -22,7 +22,7 @@ from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import SwarmError
 
 PACKAGE = "terrain-swarm"
-_EXTRAS = ("all", "vectors")
+_EXTRAS = ("all", "roles", "vectors")
 """What the command needs beside what is always there."""
 _ENOUGH_BYTES = 1 << 30
 _ENOUGH_DISK_BYTES = 1 << 30
