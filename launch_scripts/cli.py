@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import nullcontext
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +19,7 @@ from typer.exceptions import TyperException
 from launch_scripts.command_line import complete, usage
 from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
-from launch_scripts.commands import afterwards, before, chaos, mavlink, query, roles
+from launch_scripts.commands import afterwards, before, chaos, health, mavlink, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
     AsJson,
@@ -192,7 +193,7 @@ def _up(
     # Beside the imports below and the terrain, which take as long.
     start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
 
-    with busy_loading(as_json=run.as_json, plain=run.plain):
+    with busy_loading(as_json=run.as_json, plain=run.plain) if run.log_format == "text" else nullcontext():
         import msgspec
 
         from launch_scripts.launcher import options
@@ -234,6 +235,8 @@ def _up(
         as_json=run.as_json,
         plain=run.plain,
         metrics_port=run.metrics_port,
+        signals_address=run.signals_address,
+        log_format=run.log_format,
         began_s=_began_s(),
         record_inputs=run.record_inputs,
     )
@@ -294,6 +297,7 @@ app.add_typer(chaos.app)
 app.add_typer(afterwards.app)
 app.add_typer(roles.app)
 app.add_typer(query.app)
+app.add_typer(health.app)
 app.add_typer(orders.app)
 app.add_typer(mavlink.app)
 

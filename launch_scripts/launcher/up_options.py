@@ -6,9 +6,10 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from launch_scripts.launcher.log_file import log_to
+from launch_scripts.launcher.log_file import LogFormat, log_to
 from launch_scripts.launcher.options import as_process, common_run_id, new_run_id
 from launch_scripts.launcher.run_terrain import find_members
+from launch_scripts.monitor.serving.loopback_guard import LOOPBACK
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.run_state.plan import plan_of_members
 from swarm.config.scenario import Scenario
@@ -25,7 +26,9 @@ class UpOptions:
     run_id         the run to take part in; if None it is made or found
     began_s        time.monotonic() at which the command was given
     table          other processes than the scenario's
-    metrics_port   where figures are served to Prometheus; 0 is any
+    metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
+    signals_address  of this machine, on which that port is opened
+    log_format     of all logs of this machine
     record_inputs  of every process, for `swarm replay`
     """
 
@@ -41,6 +44,8 @@ class UpOptions:
     table: tuple[ProcessSpec, ...] | None = None
     record_inputs: bool = False
     metrics_port: int | None = None
+    signals_address: str = LOOPBACK
+    log_format: LogFormat = "text"
 
     @property
     def is_new(self) -> bool:
@@ -69,7 +74,7 @@ def run_id_of(options: UpOptions) -> tuple[str, int | None]:
     the id comes when the run began, if it runs already."""
     found: list[RunInfo] = []
     if options.joins:
-        log_to(None)  # it may have to wait, and says so
+        log_to(None, options.log_format)  # it may have to wait, and says so
         found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
     run_id = options.run_id
     if run_id is None and options.is_whole:
