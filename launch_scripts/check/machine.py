@@ -87,8 +87,8 @@ def _kernels(about: str, runs: Path) -> Finding:
     if cold and cache_folder() is None:
         return failure(
             about,
-            f"{cold} of {len(kernels)} are not in {folder}, which can only be read, so every start compiles them: run"
-            " `python -m planner_service.kernel_build` where it can be written to, with the same NUMBA_CPU_NAME",
+            f"{cold} of {len(kernels)} are not in {folder}, which can only be read, so every start compiles them:"
+            " `python -m planner_service.kernel_build` makes them where it can be written to",
         )
     if cold:
         return warning(about, f"{cold} of {len(kernels)} are not compiled yet: the first start takes half a minute")

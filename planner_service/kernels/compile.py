@@ -102,7 +102,7 @@ def kernel(signature: str) -> Callable[[Any], Any]:
     signature  as numba reads one, of the arguments; any other type is a TypeError
 
     It is compiled, or loaded, by `load`, or else by its first call. Where no folder can be written to, every
-    process compiles for itself what NUMBA_CACHE_DIR does not have. With NUMBA_DISABLE_JIT the function stays as it is.
+    process compiles for itself what NUMBA_CACHE_DIR lacks. With NUMBA_DISABLE_JIT the function stays as it is.
 
     Kernels and helpers allocate nothing, so that no references need to be counted: arrays to write to are handed
     in. That halved the time to compile them all.
