@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from launch_scripts.command_line import complete
+from launch_scripts.commands.deploy_size import size
 from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
@@ -16,6 +17,9 @@ _THIS_MACHINE = ("localhost", "127.0.0.1")
 """Hosts in every router's certificate, for the processes beside it."""
 
 app = typer.Typer(help="Certificates and configurations for a swarm on several machines.", no_args_is_help=True)
+
+
+app.command()(size)
 
 
 @app.command()
