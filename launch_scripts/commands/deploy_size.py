@@ -40,7 +40,7 @@ def size(
     import msgspec
 
     from launch_scripts.bench.scaling.blocks import extrapolated, size_block
-    from launch_scripts.bench.scaling.check import model_of, usable
+    from launch_scripts.bench.scaling.check import model_of, usable, without_each
     from launch_scripts.bench.scaling.needs import Machine, fewest_machines, too_much
     from launch_scripts.bench.scaling.rows import read_rows
     from launch_scripts.bench.show import show
@@ -59,7 +59,7 @@ def size(
     if as_json:
         typer.echo(json.dumps({**msgspec.to_builtins(found), "full": full, "extrapolated": beyond}))
     else:
-        block = size_block(found)
+        block = size_block(found, without_each(rows))
         shown = table(block.title, f"<{block.headings[0]}", *block.headings[1:])
         for line in block.rows:
             shown.add_row(*line)

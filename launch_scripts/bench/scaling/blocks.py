@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from launch_scripts.bench.scaling.check import Compared
+from launch_scripts.bench.scaling.check import Compared, without_each
 from launch_scripts.bench.scaling.cost_model import Fitted
 from launch_scripts.bench.scaling.model import ROLES, Model, Row
 from launch_scripts.bench.scaling.needs import Machine, Needs, crossings_of, fewest_machines, needs, too_much
-from launch_scripts.bench.scaling.quantities import quantities_of
+from launch_scripts.bench.scaling.quantities import Quantities, quantities_of
 from launch_scripts.bench.scaling.terms import SENT, WORK
 from launch_scripts.bench.tables import number
 from launch_scripts.bench.whole_swarm.size import Size, size_of
@@ -25,6 +25,19 @@ _SIZES = ((1000, 10, 1), (10_000, 100, 1), (10_000, 100, 10), (100_000, 1000, 10
 _SHARDS = (1, 4, 10, 25, 50, 100, 200)
 NAMES = ("check", "sent", "work", "needs", "growth", "first", "shards")
 """Of all tables, in the order of the page."""
+_KIND = f"{MACHINE.cores} cores, {MACHINE.memory_gb:g} GB and {MACHINE.link_mbit_per_s:,.0f} Mbit/s"
+_FIRST = (
+    f"A target for each 100 vehicles, a machine of {_KIND} for each 1,000. Full is a process that takes over 60 % "
+    "of a core, a machine over 60 % of its cores or memory, a link over half."
+)
+_POWER = (
+    "*Power*: by which what is delivered grows, from a tenth of all to the whole, and from a tenth of the vehicles "
+    "and agents with all targets."
+)
+_PARTS = (
+    f"Vehicles, targets and machines of each part, of {_KIND}; machines and cores of all; the link of a part's "
+    "first machine; the process which takes most of a core. `-`: no number of machines carries it."
+)
 
 
 @dataclass(frozen=True)
@@ -55,15 +68,24 @@ def sent_block(model: Model) -> Block:
         for sent, (messages, size) in zip(SENT, model.sent, strict=True)
     ]
     return Block(
-        "sent", "Sent a second, each message once", ("topic, sender", "messages", "bytes", "a copy to", "what"), rows,
+        "sent",
+        "Sent a second, each message once",
+        ("topic, sender", "messages", "bytes", "a copy to", "what"),
+        rows,
         wide=True,
-    )  # fmt: skip
+    )
 
 
 def work_block(model: Model) -> Block:
     """Each role with its coefficients."""
     rows = [[work.role, _sum(model.cpu[work.role]), _sum(model.memory[work.role]), work.why] for work in WORK]
-    return Block("work", "CPU and memory of all processes of a role", ("role", "ms of CPU a second", "MB", "what"), rows, wide=True)
+    return Block(
+        "work",
+        "CPU and memory of all processes of a role",
+        ("role", "ms of CPU a second", "MB", "what"),
+        rows,
+        wide=True,
+    )
 
 
 def check_block(compared: Sequence[Compared], rows: Sequence[Row]) -> Block:
@@ -76,7 +98,9 @@ def check_block(compared: Sequence[Compared], rows: Sequence[Row]) -> Block:
             cells += [_percent(errors[len(errors) // 2]), _percent(errors[-1])] if errors else ["-", "-"]
         lines.append(cells)
     simulated = sum(row.run.kind == "simulated" for row in rows)
-    machines = sorted({f"{row.machine['cores']} x {row.machine['machine']}" for row in rows if row.run.kind == "live"})
+    machines = sorted(
+        {f"{row.machine['cores']} x {row.machine['machine']}" for row in rows if row.run.kind == "live"}
+    )
     loads = [row.machine["load"] for row in rows if row.run.kind == "live"]
     remark = (
         f"{simulated} simulations and {len(rows) - simulated} live runs, those on {', '.join(machines) or '-'}, "
@@ -93,15 +117,19 @@ def check_block(compared: Sequence[Compared], rows: Sequence[Row]) -> Block:
 
 def needs_block(model: Model, rows: Sequence[Row]) -> Block:
     """What swarms need; beyond the largest that was measured it is extrapolated, and marked."""
-    cells = []
+    cells, spans = [], []
+    others = without_each(rows)
     for vehicles, targets, machines in _SIZES:
-        found = needs(model, size_of(vehicles, targets, per_agent=200), machines)
+        size = size_of(vehicles, targets, per_agent=200)
+        found = needs(model, size, machines)
         cells.append((found, extrapolated(found, rows)))
+        spans.append(span_of_cores(others, found))
     lines = [
         ["targets", *(f"{found.size.targets:,}" for found, _ in cells)],
         ["machines", *(f"{found.machines:,}" for found, _ in cells)],
         ["agents", *(f"{found.size.agents:,}" for found, _ in cells)],
         ["cells a side", *(f"{found.size.side:,}" for found, _ in cells)],
+        ["cores, any one run left out", *spans],
         *_needs_lines([found for found, _ in cells]),
         ["extrapolated", *("yes" if extrapolated else "no" for _, extrapolated in cells)],
     ]
@@ -109,9 +137,15 @@ def needs_block(model: Model, rows: Sequence[Row]) -> Block:
     return Block("needs", "What swarms need", headings, lines)
 
 
-def size_block(found: Needs) -> Block:
+def span_of_cores(models: Sequence[Model], found: Needs) -> str:
+    """The least and the most cores that any of the models says of the same swarm."""
+    cores = [needs(model, found.size, found.machines).cores for model in models]
+    return f"{number(min(cores))} to {number(max(cores))}"
+
+
+def size_block(found: Needs, others: Sequence[Model]) -> Block:
     """What one swarm needs, role by role."""
-    lines = [[label, value] for label, value in _needs_lines([found])]
+    lines = [["cores, any one run left out", span_of_cores(others, found)], *map(list, _needs_lines([found]))]
     return Block("size", "What this swarm needs", ("", f"{found.machines:,} machines"), lines)
 
 
@@ -131,11 +165,7 @@ def first_block(model: Model) -> Block:
         "What is full first",
         ("full", "from so many vehicles on"),
         lines,
-        [
-            f"A target for each 100 vehicles, a machine of {MACHINE.cores} cores, {MACHINE.memory_gb:g} GB and "
-            f"{MACHINE.link_mbit_per_s:,.0f} Mbit/s for each 1,000. Full is a process that takes over 60 % of a core, "
-            "a machine over 60 % of its cores or memory, a link over half."
-        ],
+        [_FIRST],
     )
 
 
@@ -171,14 +201,19 @@ def growth_block(model: Model) -> Block:
         "growth",
         "Delivered in the goal's swarm",
         (
-            "topic, sender", "messages/s", "% of all", "MB/s", "% of all", "MB/s between machines",
-            "power, all together", "power, vehicles alone",
+            "topic, sender",
+            "messages/s",
+            "% of all",
+            "MB/s",
+            "% of all",
+            "MB/s between machines",
+            "power, all together",
+            "power, vehicles alone",
         ),
         lines,
-        ["*Power*: of what is delivered, from a tenth of the swarm to the whole: of a tenth of all, or of a tenth of the vehicles and "
-         "agents with all targets."],
+        [_POWER],
         wide=True,
-    )  # fmt: skip
+    )
 
 
 def shards_block(model: Model) -> Block:
@@ -208,15 +243,18 @@ def shards_block(model: Model) -> Block:
         "shards",
         "The goal's swarm in parts",
         (
-            "parts", "vehicles", "targets", "machines", "in all", "cores", "Mbit/s", "fullest process",
+            "parts",
+            "vehicles",
+            "targets",
+            "machines",
+            "in all",
+            "cores",
+            "Mbit/s",
+            "fullest process",
         ),
         lines,
-        [
-            f"Vehicles, targets and machines of each part, of {MACHINE.cores} cores, {MACHINE.memory_gb:g} GB and "
-            f"{MACHINE.link_mbit_per_s:,.0f} Mbit/s; machines and cores of all; the link of a part's first machine; the "
-            "process which takes most of a core. `-`: no number of machines carries it."
-        ],
-    )  # fmt: skip
+        [_PARTS],
+    )
 
 
 def blocks(model: Model, compared: Sequence[Compared], rows: Sequence[Row]) -> list[Block]:
@@ -257,7 +295,7 @@ def _delivered(model: Model, size: Size) -> dict[tuple[str, str], tuple[float, f
     return found
 
 
-def _q(size: Size, machines: int):  # type: ignore[no-untyped-def]
+def _q(size: Size, machines: int) -> Quantities:
     return quantities_of(size, machines=machines)
 
 

@@ -30,7 +30,7 @@ _COUNTED = ("agent", "planner", "keeper")
 
 @dataclass(frozen=True)
 class Compared:
-    """One figure of one run: what was measured, what the model says, and whether the run is held out or left out."""
+    """One figure of one run: what was measured, what the model says, and whether the run is held out."""
 
     run: str
     figure: str
@@ -66,6 +66,13 @@ def model_of(rows: Sequence[Row]) -> Model:
         lacking = "simulations" if not simulated else "live runs"
         raise ConfigError(f"the cost model has no measurements of {lacking}: run swarm bench scaling")
     return fit_work(fit_sent(simulated), live)
+
+
+def without_each(rows: Sequence[Row]) -> list[Model]:
+    """A model without each of the live runs of the fit: how far they differ says how sure the whole is."""
+    live = _of(rows, "live", "fit")
+    sent = fit_sent(_of(rows, "simulated", "fit"))
+    return [fit_work(sent, _without(live, row)) for row in live]
 
 
 def compare(rows: Sequence[Row]) -> list[Compared]:

@@ -85,12 +85,17 @@ def scaling(
         "cpu_ms_per_s": {role: dict(fitted.coefficients) for role, fitted in model.cpu.items()},
         "memory_mb": {role: dict(fitted.coefficients) for role, fitted in model.memory.items()},
         "errors": [
-            {"run": each.run, "figure": each.figure, "measured": each.measured, "said": each.said,
-             "held_out": each.held_out}
+            {
+                "run": each.run,
+                "figure": each.figure,
+                "measured": each.measured,
+                "said": each.said,
+                "held_out": each.held_out,
+            }
             for each in compared
         ],
         "remarks": remarks,
-    }  # fmt: skip
+    }
     show(report, as_json, tables)
     if write is not None:
         page.write(write, found)

@@ -1,14 +1,14 @@
 """Fits of costs to terms that each have a mechanism. Pure.
 
-Every cost is a sum of few terms, each a product of quantities with a coefficient that is never negative: no term can
-make a swarm cheaper because there is more of something. Coefficients are those with the smallest relative errors
+Every cost is a sum of few terms, each with a coefficient that is never negative: nothing makes a swarm cheaper
+because there is more of it. Coefficients are those with the smallest relative errors
 (non-negative least squares of rows divided by what was measured), so that a small swarm counts as much as a large
 one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,18 +54,3 @@ def fit(terms: Terms, values: Sequence[Mapping[str, float]], measured: Sequence[
 def relative_error(found: float, measured: float) -> float:
     """By which share of what was measured a prediction is off."""
     return abs(found - measured) / measured if measured > 0 else float(found > 0)
-
-
-def left_out(
-    terms: Terms,
-    values: Sequence[Mapping[str, float]],
-    measured: Sequence[float],
-    predict: Callable[[Fitted, int], float] | None = None,
-) -> list[float]:
-    """What is predicted for each measurement by a fit to all others."""
-    found = []
-    for out in range(len(measured)):
-        others = [row for row in range(len(measured)) if row != out]
-        fitted = fit(terms, [values[row] for row in others], [measured[row] for row in others])
-        found.append(fitted.at(values[out]) if predict is None else predict(fitted, out))
-    return found

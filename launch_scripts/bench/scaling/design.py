@@ -85,6 +85,12 @@ _LIVE_FIT: tuple[_Row, ...] = (
     (1000, 10, 200, None, 5),
     (1000, 4, 250, None, 2.5),
     (600, 4, 200, 800, 2.5),
+    # Where one term is most of the cost: targets, agents, vehicles of an agent, the map.
+    (50, 40, 25, None, 5),
+    (200, 2, 10, None, 2.5),
+    (400, 2, 10, None, 2.5),
+    (800, 2, 400, None, 5),
+    (200, 2, 100, 1536, 5),
 )
 _LIVE_CHECK: tuple[_Row, ...] = (
     (150, 6, 50, None, 5),
@@ -97,6 +103,14 @@ _LIVE_CHECK: tuple[_Row, ...] = (
 SIMULATED_S, LIVE_S = 15.0, 15.0
 
 
+_ALL: tuple[tuple[Kind, Use, tuple[_Row, ...], float], ...] = (
+    ("simulated", "fit", _SIMULATED_FIT, SIMULATED_S),
+    ("simulated", "check", _SIMULATED_CHECK, SIMULATED_S),
+    ("live", "fit", _LIVE_FIT, LIVE_S),
+    ("live", "check", _LIVE_CHECK, LIVE_S),
+)
+
+
 def runs() -> list[Run]:
     """All measurements, those of the fit first of each kind."""
     return [
@@ -106,11 +120,6 @@ def runs() -> list[Run]:
             size=size_of(vehicles, targets, per_agent=per_agent, side=side, tick_hz=tick_hz),
             seconds=seconds,
         )
-        for kind, use, rows, seconds in (
-            ("simulated", "fit", _SIMULATED_FIT, SIMULATED_S),
-            ("simulated", "check", _SIMULATED_CHECK, SIMULATED_S),
-            ("live", "fit", _LIVE_FIT, LIVE_S),
-            ("live", "check", _LIVE_CHECK, LIVE_S),
-        )
+        for kind, use, rows, seconds in _ALL
         for vehicles, targets, per_agent, side, tick_hz in rows
     ]

@@ -11,7 +11,7 @@ import msgspec
 from launch_scripts.bench.scaling.cost_model import Fitted, Terms, fit
 from launch_scripts.bench.scaling.design import Run
 from launch_scripts.bench.scaling.quantities import Quantities, quantities_of
-from launch_scripts.bench.scaling.terms import HEARERS, SENT, TERMS, WORK, Sent
+from launch_scripts.bench.scaling.terms import HEARERS, KINDS_OF_BYTES, SENT, TERMS, WORK, Sent
 
 ROLES = tuple(work.role for work in WORK)
 
@@ -131,17 +131,24 @@ def work_values(q: Quantities, flows: Sequence[Flow], role: str) -> dict[str, fl
         own = [each for (_, source), each in puts.items() if source == role]
         out = sum(each[0] for each in own), sum(each[1] for each in own)
         taken = [flow for flow in flows if flow.to == role]
+    moved: dict[str, float] = {"map": 0.0, "costs": 0.0, "other": 0.0}
+    for flow in taken:
+        moved[KINDS_OF_BYTES.get(flow.sent.topic, "other")] += flow.bytes
+    for (topic, source), (_, size) in puts.items():
+        if source == role or role == "router":
+            moved[KINDS_OF_BYTES.get(topic, "other")] += size
     return {
         **term_values(q),
         "messages": out[0] + sum(flow.messages for flow in taken),
-        "bytes": out[1] + sum(flow.bytes for flow in taken),
+        "bytes": sum(moved.values()),
+        **{f"{kind} bytes": size for kind, size in moved.items()},
     }
 
 
 def _put(row: Row, sent: Sent, figure: str) -> float:
     """What a simulation counted of one row of the table; 0 if there was none."""
     return sum(
-        each[figure]
+        float(each[figure])
         for each in row.figures["puts"]
         if each["topic"] == sent.topic and each["source"] == sent.source
     )

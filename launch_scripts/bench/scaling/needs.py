@@ -17,7 +17,7 @@ from launch_scripts.bench.whole_swarm.size import Size
 from swarm.errors import ConfigError
 
 USED_SHARE = 0.6
-"""Of the cores of a machine, and of one core by a process: beyond it, work waits and ticks are late (decision 58)."""
+"""Of the cores of a machine, and of one core by a process: beyond it work waits (decision 58)."""
 LINK_SHARE = 0.5
 """Of a link's capacity."""
 OVERHEAD_BYTES = 100
@@ -50,7 +50,7 @@ class Needs:
     crossings_per_s  messages from one machine to another
     link_mbit_per_s, first_link_mbit_per_s  into each machine, and as much out of it where each router is linked
                      with each other; into the first
-    link_out_mbit_per_s  out of each machine where a router of the region passes on, so that each message leaves once
+    link_out_mbit_per_s  out of each machine where a router of the region passes on: each message leaves once
     sessions         of a machine's router
     """
 
@@ -83,11 +83,16 @@ def needs(model: Model, size: Size, machines: int, *, standbys: int = 0, monitor
     cpu = {role: each / 1000 for role, each in model.cpu_ms_per_s(q).items()}
     cpu["router"] += _router_cores(model, crossed, crossed_bytes)
     count = {
-        "agent": q.agents, "planner": q.planners, "launcher": machines, "router": machines,
-        "targets": 1, "keeper": q.keepers, "monitor": max(monitors, 1),
-    }  # fmt: skip
-    single = sum(cpu[role] for role in SINGLE)
-    machine_cores = (sum(cpu.values()) - single) / machines
+        "agent": q.agents,
+        "planner": q.planners,
+        "launcher": machines,
+        "router": machines,
+        "targets": 1,
+        "keeper": q.keepers,
+        "monitor": max(monitors, 1),
+    }
+    machine_cores = sum(each for role, each in cpu.items() if role not in SINGLE) / machines
+    single = sum(min(cpu[role], 1.0) for role in SINGLE)  # a process takes one core at most, and falls behind
     memory = _memory_gb(model, q, machines)
     leaving = sum(
         min(1.0, reached) * (first.put_bytes + OVERHEAD_BYTES * first.puts)
@@ -161,9 +166,14 @@ def _memory_gb(model: Model, q: Quantities, machines: int) -> tuple[float, float
     """Of one machine and of the first. What processes share is there once on each machine."""
     each = first = 0.0
     shares = {
-        "agents": 1 / machines, "vehicles": 1 / machines, "planners": 1 / machines, "planners x cells": 1 / machines,
-        "processes": 1 / machines, "launchers": 1 / machines, "cells": 1.0,
-    }  # fmt: skip
+        "agents": 1 / machines,
+        "vehicles": 1 / machines,
+        "planners": 1 / machines,
+        "planners x cells": 1 / machines,
+        "processes": 1 / machines,
+        "launchers": 1 / machines,
+        "cells": 1.0,
+    }
     values = term_values(q)
     for role, fitted in model.memory.items():
         mb = sum(

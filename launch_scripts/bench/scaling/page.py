@@ -15,7 +15,7 @@ def check(path: Path, names: Sequence[str]) -> None:
     for name in names:
         if text.count(_begin(name)) != 1 or text.count(_end(name)) != 1:
             raise ConfigError(
-                f"--write is {path}, which lacks a place for a table: expected {_begin(name)} and {_end(name)} once each"
+                f"--write is {path}, which lacks a place for a table, expected {_begin(name)} and {_end(name)}"
             )
 
 

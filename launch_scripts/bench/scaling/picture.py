@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from launch_scripts.bench.scaling.check import Compared
 from launch_scripts.bench.scaling.model import ROLES, Model, Row
@@ -52,6 +53,8 @@ def _compare(axes: Axes, compared: Sequence[Compared], label: str) -> None:
             [each.measured for each in some], [each.said for each in some], "o", ms=4, color=colour, label=name
         )
     axes.set(xscale="log", yscale="log", xlabel=f"measured: {label}", ylabel="said by the model")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())
     axes.legend(loc="upper left")
 
 
@@ -59,13 +62,12 @@ def _grow(axes: Axes, model: Model, rows: Sequence[Row]) -> None:
     vehicles = np.unique(np.geomspace(100, 100_000, 16).astype(int))
     found = [needs(model, size_of(int(n), max(int(n) // 100, 1), per_agent=min(int(n), 200)), 1) for n in vehicles]
     largest = max(row.run.size.vehicles for row in rows if row.run.kind == "live")
-    below = np.zeros(len(vehicles))
     for role in ROLES:
-        above = below + np.array([each.cpu_cores[role] for each in found])
         axes.plot(vehicles, [each.cpu_cores[role] for each in found], color=_COLOURS[role], label=role)
-        below = above
-    axes.plot(vehicles, below, color=INK, lw=2, label="all")
+    axes.plot(vehicles, [each.cores for each in found], color=INK, lw=2, label="all")
     axes.axvline(largest, color=INK, lw=0.8, ls=":")
-    axes.text(largest * 1.1, axes.get_ylim()[0], "extrapolated", rotation=90, va="bottom", fontsize=7)
-    axes.set(xscale="log", yscale="log", xlabel="vehicles, with a target for each 100", ylabel="cores, on one machine")
+    axes.text(largest * 1.1, 0.02, "extrapolated", transform=axes.get_xaxis_transform(), va="bottom", fontsize=7)
+    axes.set(
+        xscale="log", yscale="log", xlabel="vehicles, with a target for each 100", ylabel="cores, on one machine"
+    )
     axes.legend(loc="upper left", fontsize=6)

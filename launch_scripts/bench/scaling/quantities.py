@@ -8,6 +8,7 @@ are, depends on how agents' vehicles lie over regions; vehicles are drawn at ran
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -100,6 +101,7 @@ def _asks_per_s(captures_per_s: float) -> float:
     return 1 / (_AFTER_CAPTURE_S + waits_s)
 
 
+@functools.lru_cache(1024)
 def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float]:
     """`shared` and `hearers` of `Quantities`, of vehicles anywhere on an empty square map."""
     rng = np.random.default_rng(_SEED)

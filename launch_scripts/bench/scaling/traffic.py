@@ -52,7 +52,7 @@ class Traffic:
         """(topic, role that sends) -> messages that somebody took."""
         self.put_bytes: Counter[tuple[str, str]] = Counter()
         self.crossings: dict[int, Counter[str]] = {machines: Counter() for machines in MACHINES}
-        """Machines -> topic -> messages that go from one machine to another, once for each machine that takes it."""
+        """Machines -> topic -> messages from one machine to another, once for each machine that takes it."""
         self.crossing_bytes: dict[int, Counter[str]] = {machines: Counter() for machines in MACHINES}
 
     def delivered(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
@@ -119,7 +119,9 @@ def run(size: Size, warm_up_s: float, seconds: float, limit_s: float) -> dict[st
     return {
         "simulated_s": passed_s,
         "complete": passed_s > seconds - 1e-6,
-        "captures_per_s": (simulation.report(simulation.now_s)["captures"] - captures) / passed_s if passed_s else None,
+        "captures_per_s": (simulation.report(simulation.now_s)["captures"] - captures) / passed_s
+        if passed_s
+        else None,
         "flows": _rates(traffic.flows, traffic.flow_bytes, ("topic", "source", "to"), passed_s),
         "puts": _rates(traffic.puts, traffic.put_bytes, ("topic", "source"), passed_s),
         "crossings": {

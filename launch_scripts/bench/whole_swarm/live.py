@@ -292,10 +292,7 @@ class _Run:
         roles = sorted({span.role for span in spans})
         return {
             "ticks": {role: ticks(of(role)) for role in ("agent", "planner", "targets")},
-            **{
-                f"{name}_per_s": sum(span.per_s(name) for span in spans) if spans else None
-                for name in _COUNTED
-            },
+            **{f"{name}_per_s": sum(span.per_s(name) for span in spans) if spans else None for name in _COUNTED},
             "traffic": {
                 role: {name: sum(span.per_s(name) for span in of(role)) for name in _COUNTED} for role in roles
             },
