@@ -41,7 +41,7 @@ def plan(
     """
     from launch_scripts.check.settings import check_start
     from launch_scripts.deploy.hosts import load_hosts
-    from launch_scripts.deploy.kits import write_kits
+    from launch_scripts.deploy.kits import keepers_before, write_kits
     from launch_scripts.deploy.plan import make_plan
     from launch_scripts.deploy.systemd import systemd_files
     from launch_scripts.launcher.options import common_run_id, find_scenario, with_network
@@ -49,7 +49,9 @@ def plan(
 
     chosen = with_network(find_scenario(scenario), namespace=namespace)
     try:
-        made = make_plan(chosen, load_hosts(hosts), common_run_id(chosen))
+        run_id = common_run_id(chosen)
+        keepers = {} if out is None else keepers_before(out, run_id)
+        made = make_plan(chosen, load_hosts(hosts), run_id, keepers)
     except ConfigError as error:
         raise ConfigError(_of_file(str(error), hosts)) from error
     if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
