@@ -30,7 +30,6 @@ from launch_scripts.commands.shared_options import (
     Tls,
     spread,
 )
-from swarm.config.explain import choice
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.ranks import HIGHEST_RANK
 
@@ -138,7 +137,8 @@ def up(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            help="Start only this role; may be given several times.",
+            metavar="ROLE[.ID]",
+            help="Start only this role, or one process of it: planner, planner.t0.r1; may be given several times.",
             rich_help_panel=PART,
             autocompletion=complete.words("launch_scripts.process_table", "ROLES"),
         ),
@@ -166,6 +166,8 @@ def up(
 
     swarm up my.toml --only router --only keeper
 
+    swarm up my.toml --only router.1 --only planner.t3 --only planner.t0.r1 --only agent
+
     swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
@@ -191,14 +193,15 @@ def _up(
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long.
-    start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
+    named = {word.partition(".")[0] for word in only or ()}
+    start_forkserver(ROLES_AND_KERNELS if not named or "planner" in named else ROLES_ONLY)
 
     with busy_loading(as_json=run.as_json, plain=run.plain) if run.log_format == "text" else nullcontext():
         import msgspec
 
         from launch_scripts.launcher import options
         from launch_scripts.launcher.up import run_swarm
-        from launch_scripts.launcher.up_options import UpOptions
+        from launch_scripts.launcher.up_options import UpOptions, chosen_processes
         from launch_scripts.process_table import ROLES
 
     scenario = options.find_scenario(name)
@@ -219,10 +222,9 @@ def _up(
         seed=scenario.seed if run.seed is None else run.seed,
         monitor=monitor,
     )
-    for role in only or ():
-        if role not in ROLES:
-            raise ConfigError(f"--only: no role {role!r}{choice(role, ROLES, ' the roles are ')}")
-    roles = tuple(role for role in ROLES if not only or role in only)
+    some = chosen_processes(scenario, only or (), rank)
+    one_by_one = any("." in word for word in only or ())
+    roles = tuple(role for role in ROLES if not named or role in named)
     if connect is not None:
         roles = tuple(role for role in roles if role != "router")
     chosen = UpOptions(
@@ -231,6 +233,7 @@ def _up(
         roles=roles,
         joins="router" not in roles,
         rank=rank,
+        table=tuple(spec for spec in some if spec.role in roles) if one_by_one else None,
         run_id=run_id,
         as_json=run.as_json,
         plain=run.plain,

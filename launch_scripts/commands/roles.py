@@ -82,6 +82,7 @@ def router(
     place: Place,
     tls: Tls,
     listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
+    id: Annotated[str, typer.Option("--id", help="Its name, where several routers pass on for each other.")] = "0",
 ) -> None:
     """Pass everybody's messages on: the process that all others connect to. --connect names another router.
 
@@ -89,7 +90,7 @@ def router(
 
     swarm router my.toml --listen tcp/127.0.0.1:7447
     """
-    run_role("router", "0", place, tls, listen=listen)
+    run_role("router", id, place, tls, listen=listen)
 
 
 @app.command(rich_help_panel=panels.ROLE)
@@ -212,7 +213,7 @@ def run_role(
     ids = [spec.id for spec in processes_of(scenario, (role,))]
     if joins is not None:
         added_agent(scenario, id or "added0", joins.group, joins.count, joins.at)  # refused before anybody is asked
-    if role == "keeper" or (joins is not None and id):
+    if role in ("router", "keeper") or (joins is not None and id):
         _check_id(id)
     elif joins is not None and scenario.network.tls is not None:
         raise ConfigError("give a name with --id: the one in the certificate agent.GROUP.NAME")

@@ -12,6 +12,7 @@ from launch_scripts.deploy.hosts import HostConfig
 LAUNCHER_CORES = 0.06
 ROUTER_CORES = 0.11
 """Cores that a machine's launcher and router take in a swarm of 1,000 vehicles, in docs/scale-figures.md."""
+_AGENT = "agent"
 _WITH_KEEPERS = frozenset({"targets"})
 """Roles that need the terrain's files, as keepers do: beside them, fewer machines get the files."""
 
@@ -34,15 +35,15 @@ def place(jobs: Sequence[Job], hosts: Sequence[HostConfig]) -> dict[str, list[Jo
     """Host name -> its jobs. Every role of the jobs has machines enough.
 
     Each job goes to the machine that is then the least loaded for its cores, of those that have none of the same
-    job, or of all where there is one. Roles that few machines carry come first, so that others leave them room.
-    Agents are shared out last of all that any machine may carry: they are the smallest.
+    job, or of all where there is one. Roles that few machines carry come first, so that others leave them room;
+    then agents, so that the loss of a machine costs no more vehicles than its share.
     """
     placed = _Placed(hosts)
     by_role: dict[str, list[Job]] = defaultdict(list)
     for job in jobs:
         by_role[job.role].append(job)
-    for role in sorted(by_role, key=lambda role: len(placed.carrying(role))):
-        if role == "agent":
+    for role in sorted(by_role, key=lambda role: (len(placed.carrying(role)), role != _AGENT)):
+        if role == _AGENT:
             placed.share_out(by_role[role])
         else:
             for job in by_role[role]:
@@ -73,7 +74,7 @@ class _Placed:
 
     def share_out(self, agents: Sequence[Job]) -> None:
         """Runs of consecutive agents, so long that all machines which get any are equally loaded."""
-        hosts = self.carrying("agent")
+        hosts = self.carrying(_AGENT)
         ends = list(accumulate(self._shares(hosts, sum(agent.cores for agent in agents))))
         taken, n = 0.0, 0
         for agent in agents:

@@ -6,7 +6,7 @@ import msgspec
 
 from launch_scripts.deploy.hosts import HostConfig, HostsConfig
 from launch_scripts.deploy.placement import ROUTER_CORES, Job, place
-from launch_scripts.process_table import ROLES, certificate_name, certificate_names, processes_of
+from launch_scripts.process_table import EXPENDABLE, ROLES, certificate_name, certificate_names, processes_of
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
@@ -16,7 +16,7 @@ _CORES = {"keeper": 0.04, "monitor": 0.17, "targets": 0.09}
 """Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, in docs/scale-figures.md."""
 _CORES_PER_VEHICLE = 0.00066
 """Of an agent; from the same table."""
-_ROUTER, _KEEPER = "router", "keeper"
+ROUTER, KEEPER = "router", "keeper"
 
 
 class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,14 +101,15 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 def make_plan(scenario: Scenario, hosts: HostsConfig, run_id: str) -> Plan:
     """The plan of a scenario on these machines. Raises ConfigError where the machines do not suffice.
 
-    Every process runs once, and each machine that may has a router. Keepers, and the processes of one job, run on
-    machines of their own. Agents with consecutive ids run together, as their vehicles start near each other. The
-    same scenario and machines give the same plan.
+    Every process runs once, a monitor if a machine may have one. Each machine that may has a router. Keepers, and
+    the processes of one job, run on machines of their own. Agents with consecutive ids run together, as their
+    vehicles start near each other. The same scenario and machines give the same plan.
     """
     scenario = _surviving(scenario, hosts.losses)
     _check(scenario, hosts)
-    placed = place(_jobs(scenario, hosts.losses), hosts.hosts)
-    routers = [host for host in hosts.hosts if _ROUTER in host.roles]
+    carried = {role for host in hosts.hosts for role in host.roles}
+    placed = place([job for job in _jobs(scenario, hosts.losses) if job.role in carried], hosts.hosts)
+    routers = [host for host in hosts.hosts if ROUTER in host.roles]
     scenario = _admitting(scenario, hosts, len(routers))
     planned = tuple(_host(scenario, hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
     return Plan(run_id=run_id, scenario=scenario, port=hosts.port, survive=hosts.losses, hosts=planned)
@@ -124,8 +125,8 @@ def _surviving(scenario: Scenario, losses: int) -> Scenario:
 def _admitting(scenario: Scenario, hosts: HostsConfig, routers: int) -> Scenario:
     """The scenario whose routers admit what it does not name itself: all keepers, routers and launchers."""
     names = [
-        *(f"{_ROUTER}.{n}" for n in range(routers)),
-        *(f"{_KEEPER}.{n}" for n in range(hosts.losses + 1)),
+        *(f"{ROUTER}.{n}" for n in range(routers)),
+        *(f"{KEEPER}.{n}" for n in range(hosts.losses + 1)),
         *(f"operator.{host.name}" for host in hosts.hosts),
     ]
     admit = dict.fromkeys((*certificate_names(scenario), *names))
@@ -135,9 +136,9 @@ def _admitting(scenario: Scenario, hosts: HostsConfig, routers: int) -> Scenario
 def _jobs(scenario: Scenario, losses: int) -> list[Job]:
     """Every process but routers, of which each machine that may has one."""
     vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
-    keepers = [Job(_KEEPER, str(n), _KEEPER, _CORES[_KEEPER]) for n in range(losses + 1)]
+    keepers = [Job(KEEPER, str(n), KEEPER, _CORES[KEEPER]) for n in range(losses + 1)]
     others = []
-    for spec in processes_of(scenario, tuple(role for role in ROLES if role not in (_ROUTER, _KEEPER))):
+    for spec in processes_of(scenario, tuple(role for role in ROLES if role not in (ROUTER, KEEPER))):
         match spec.role:
             case "agent":
                 cores = vehicles[spec.id] * _CORES_PER_VEHICLE
@@ -156,11 +157,13 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         raise ConfigError(f"survive: found {hosts.losses} with one machine, expected 0 or more machines")
     # One machine carries a scenario's standbys, too: they cover for a process that hangs.
     apart = {
-        _KEEPER: (hosts.losses + 1, f"survive = {hosts.losses}"),
+        KEEPER: (hosts.losses + 1, f"survive = {hosts.losses}"),
         "planner": (standbys.planner + 1, f"{standbys.planner} standbys of each planner"),
         "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
     }
     for role in ROLES:
+        if role in EXPENDABLE:
+            continue
         names = [host.name for host in hosts.hosts if role in host.roles]
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))
         if len(names) < wanted:
@@ -176,7 +179,7 @@ def _host(
     """A machine with what it runs. Its processes use the routers of others while its own is away."""
     is_router = host in routers
     own = (
-        [Job(_ROUTER, str(routers.index(host)), f"{_ROUTER}.{routers.index(host)}", ROUTER_CORES)]
+        [Job(ROUTER, str(routers.index(host)), f"{ROUTER}.{routers.index(host)}", ROUTER_CORES)]
         if is_router
         else []
     )
@@ -203,5 +206,5 @@ def _host(
         connect=(*local, *others),
         peers=tuple(each.endpoint(port) for each in routers[: routers.index(host)]) if is_router else (),
         operator=f"operator.{host.name}",
-        has_files=any(each.role in (_KEEPER, "targets") for each in processes),
+        has_files=any(each.role in (KEEPER, "targets") for each in processes),
     )

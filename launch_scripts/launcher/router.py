@@ -23,6 +23,7 @@ from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ class RouterService:
         info = RunInfo(
             run_id=NO_RUN, role=peer.role, id=peer.id, incarnation=peer.incarnation, scenario="", terrain="",
             rows=0, cols=0, resolution_m=0.0, started_ns=peer.incarnation, restarts=restarts,
+            wire_version=WIRE_VERSION,
         )  # fmt: skip
         self._member = Member(info, bus, post)
         self._reopened = reopened

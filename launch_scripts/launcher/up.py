@@ -43,6 +43,7 @@ from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
+from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
 from swarm.order_book import OrderBook
 from swarm.plugins.find import check_plugins
@@ -67,7 +68,7 @@ class _RefusedError(SwarmError):
 
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
-    check_start(options.scenario, joins=options.joins)
+    check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
     for spec in table_of(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
@@ -187,7 +188,7 @@ class _Run:
 
     def _prepared(self) -> tuple[Terrain, Floats]:
         """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
-        if self._options.joins and missing_files(self._scenario):
+        if self._options.asks_for_ground and missing_files(self._scenario):
             found = [info for info in find_members(self._scenario) if info.run_id]
             fetch_if_missing(
                 self._scenario, self._run_dir, found, roles=self._options.roles, progress=self._prepares
@@ -273,10 +274,10 @@ class _Run:
 
     def _ordered_planners(self) -> OrderedPlanners:
         options = self._options
-        standbys = range(self._scenario.standbys.planner + 1) if "planner" in options.roles else ()
-        ranks = [rank for rank in standbys if options.rank in (None, rank)]
-        whole = not options.joins and set(ROLES[1:]) <= set(options.roles)
-        return OrderedPlanners(self._scenario, self._swarm, ranks, whole, self._terminal.say)
+        whole = not options.joins and options.table is None and set(ROLES[1:]) <= set(options.roles)
+        return OrderedPlanners(
+            self._scenario, self._swarm, options.ranks_of_added, table_of(options), whole, self._terminal.say
+        )
 
     def _is_up(self, watcher: Watcher) -> bool:
         if self._missing(watcher):
@@ -314,9 +315,10 @@ class _Run:
         if self._up_at_s is None:
             up = facts.fact("processes_well").shown(state)
             return f"{self._scenario.name}: starting, {up} processes are up, {state.elapsed_s:.0f} s"
-        end_s = self._up_at_s + self._scenario.seconds
+        seconds = self._scenario.seconds
+        of = "" if seconds >= UNTIL_STOPPED_S else f" of {self._up_at_s + seconds:.0f}"
         live = f", live view {page_of(self._web_port)}" if self._web_port else ""
-        return f"{self._scenario.name}: {state.elapsed_s:.0f} of {end_s:.0f} s{live}"
+        return f"{self._scenario.name}: {state.elapsed_s:.0f}{of} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:

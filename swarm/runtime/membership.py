@@ -17,6 +17,7 @@ from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
+from swarm.wire.versions import are_neighbours
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +37,9 @@ class Member:
 
     A process asks all others for their run when it starts, whenever a link comes back and whenever a router
     appears, as behind it there may be others. Two processes belong together when run id, terrain digest and the
-    classes of vehicles, in their order, are the same; each is then confirmed. An unconfirmed process exits, with
-    RunMismatchError, if every answer differs. A confirmed one never exits because of an answer; it reports the
-    sender as a stranger: counts it, and names it once.
+    classes of vehicles, in their order, are the same, and their builds speak neighbouring wire versions; each is
+    then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs. A confirmed one
+    never exits because of an answer; it reports the sender as a stranger: counts it, and names it once.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
@@ -253,6 +254,11 @@ def check_same_run(mine: RunInfo, other: RunInfo) -> None:
         raise RunMismatchError(
             f"{mine.role} {mine.id} belongs to run {mine.run_id}, but {who} in the same namespace belongs to run "
             f"{other.run_id} (scenario {other.scenario}): choose another network.namespace or join that run"
+        )
+    if not are_neighbours(mine.wire_version, other.wire_version):
+        raise RunMismatchError(
+            f"{mine.role} {mine.id} speaks wire version {mine.wire_version}, but {who} speaks "
+            f"{other.wire_version}: only neighbouring versions share a run, so upgrade by one at a time"
         )
     if other.terrain != mine.terrain:
         raise RunMismatchError(

@@ -11,6 +11,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo, Stats
 
 
@@ -63,6 +64,7 @@ class RoleSetup:
             crew=[f"{role}-{id}" for role, id in crew_of(self.scenario)][:MOST_IDS],
             restarts=self.restarts,
             classes=list(class_numbers(self.scenario)),
+            wire_version=WIRE_VERSION,
         )
 
     @property

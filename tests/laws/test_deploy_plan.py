@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from pathlib import Path
 
+import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
@@ -11,6 +13,7 @@ from support.effort import few
 from launch_scripts.deploy.hosts import HOST_ROLES, HostConfig, HostsConfig
 from launch_scripts.deploy.placement import LAUNCHER_CORES
 from launch_scripts.deploy.plan import Plan, make_plan
+from launch_scripts.launcher.up_options import UpOptions, chosen_processes
 from launch_scripts.process_table import processes_of
 from swarm.bus.access_control import access_control
 from swarm.config.agents import plan_agents
@@ -69,7 +72,10 @@ def test_every_process_runs_once_where_it_may_and_apart_from_those_that_do_the_s
     assert set(ran.values()) == {1}
     routers = {("router", str(n)) for n in range(sum("router" in host.roles for host in hosts.hosts))}
     keepers = {("keeper", str(n)) for n in range(hosts.losses + 1)}
-    assert set(ran) == {(spec.role, spec.id) for spec in processes_of(plan.scenario)} | routers | keepers
+    table = {(spec.role, spec.id) for spec in processes_of(plan.scenario)}
+    if not any("monitor" in host.roles for host in hosts.hosts):
+        table.remove(("monitor", "0"))
+    assert set(ran) == table | routers | keepers
     assert min(plan.scenario.standbys.planner, plan.scenario.standbys.targets) >= hosts.losses
     may = {host.name: host.roles for host in hosts.hosts}
     assert all(process.role in may[host.name] for host, process in plan.processes)
@@ -96,19 +102,55 @@ def test_consecutive_agents_run_together(scenario: Scenario, hosts: HostsConfig)
 
 @settings(max_examples=few(150), deadline=None)
 @given(SCENARIOS, machines(st.just(HOST_ROLES)))
-def test_machines_that_may_carry_all_are_loaded_by_their_cores_as_far_as_jobs_can_be_kept_apart(
-    scenario: Scenario, hosts: HostsConfig
-) -> None:
-    """No process that is alone in its job would lie better on another machine, by more than its own load."""
+def test_machines_have_agents_by_their_cores(scenario: Scenario, hosts: HostsConfig) -> None:
+    """Whoever has any is as full of router, launcher and agents as the others, by an agent."""
     plan = planned(scenario, hosts)
     if plan is None:
         return
-    load = {host.name: LAUNCHER_CORES + host.load for host in plan.hosts}
+    largest = max(process.cores for _, process in plan.processes if process.role == "agent")
+    full = {
+        host.name: LAUNCHER_CORES + sum(process.cores for process in host.of("router") + host.of("agent"))
+        for host in plan.hosts
+    }
     for host in plan.hosts:
-        for agent in host.of("agent"):
-            others = [(load[each.name] + agent.cores) / each.cores for each in plan.hosts if each is not host]
-            slack = max(each.cores for _, each in plan.processes if each.role == "agent") / host.cores
-            assert all(load[host.name] / host.cores <= other + slack + 1e-9 for other in others)
+        if host.of("agent"):
+            assert all(
+                (full[host.name] - largest) / host.cores <= (full[each.name] + largest) / each.cores
+                for each in plan.hosts
+            )
+
+
+@settings(max_examples=few(150), deadline=None)
+@given(SCENARIOS, machines(st.just(HOST_ROLES)))
+def test_like_machines_are_equally_loaded_but_for_a_process_of_each_job(
+    scenario: Scenario, hosts: HostsConfig
+) -> None:
+    alike = msgspec.structs.replace(
+        hosts, hosts=tuple(msgspec.structs.replace(host, cores=4.0) for host in hosts.hosts)
+    )
+    plan = planned(scenario, alike)
+    if plan is None:
+        return
+    loads = [host.load for host in plan.hosts]
+    largest = max(process.cores for _, process in plan.processes)
+    assert max(loads) - min(loads) <= 2 * largest + 1e-9
+
+
+@settings(max_examples=few(150), deadline=None)
+@given(SCENARIOS, machines())
+def test_planners_of_an_added_target_start_on_one_machine_each(scenario: Scenario, hosts: HostsConfig) -> None:
+    plan = planned(scenario, hosts)
+    if plan is None:
+        return
+    ranks = []
+    for host in plan.hosts:
+        words = [process.selector for process in host.processes]
+        table = tuple(chosen_processes(plan.scenario, words, None))
+        assert [spec.name for spec in table] == [process.name for process in host.processes]
+        own = UpOptions(plan.scenario, Path(), table=table).ranks_of_added
+        ranks += own
+        assert len(own) <= 1 or len(plan.hosts) == 1
+    assert sorted(ranks) == list(range(plan.scenario.standbys.planner + 1))
 
 
 @settings(max_examples=few(150), deadline=None)
