@@ -295,6 +295,38 @@ def simulate(
         raise typer.Exit(1)
 
 
+@app.command(rich_help_panel=RUN)
+def sweep(
+    study: Annotated[Path, typer.Argument(metavar="STUDY", help="A .toml file: scenarios, settings and seeds.")],
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A cluster of Dask that is there, such as tcp://127.0.0.1:8786."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, help="Processes of this machine; as many as it has cores if not given."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; sweeps/NAME of the study if not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
+
+    Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: started again,
+    also with other seeds or settings, it runs what is missing only. Exit code 1 if a law broke in any trial.
+    It needs the extra "sweep" (Dask, pyarrow).
+
+    swarm sweep study.toml
+
+    swarm sweep study.toml --scheduler tcp://127.0.0.1:8786 --out results
+    """
+    from launch_scripts.commands.sweep import sweep_study
+
+    if not sweep_study(study, scheduler, workers, out, as_json):
+        raise typer.Exit(1)
+
+
 app.add_typer(before.app)
 app.add_typer(chaos.app)
 app.add_typer(afterwards.app)

@@ -52,13 +52,16 @@ def plan(
     """
     from launch_scripts.check.settings import check_start
     from launch_scripts.deploy.hosts import load_hosts
+    from launch_scripts.deploy.kits import keepers_before
     from launch_scripts.deploy.plan import make_plan
     from launch_scripts.launcher.options import common_run_id, find_scenario, with_network
     from swarm.errors import ConfigError
 
     chosen = with_network(find_scenario(scenario), namespace=namespace)
     try:
-        made = make_plan(chosen, load_hosts(hosts), common_run_id(chosen))
+        run_id = common_run_id(chosen)
+        keepers = {} if out is None else keepers_before(out, run_id)
+        made = make_plan(chosen, load_hosts(hosts), run_id, keepers)
     except ConfigError as error:
         raise ConfigError(_of_file(str(error), hosts)) from error
     if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
@@ -86,14 +89,22 @@ def plan(
 def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
     from launch_scripts.deploy.containers.cluster import write_cluster
     from launch_scripts.deploy.containers.compose import compose_files
+    from launch_scripts.deploy.host_scenario import CERTIFICATES
     from launch_scripts.deploy.kits import write_kits
+    from launch_scripts.deploy.revocations import revoked_in
     from launch_scripts.deploy.systemd import systemd_files
 
     match kit:
         case "systemd":
             return write_kits(made, out, systemd_files, days, wheel)
         case "compose":
-            return write_kits(made, out, partial(compose_files, image=image), days, launcher=False)
+            return write_kits(
+                made,
+                out,
+                partial(compose_files, image=image, revoked=revoked_in(out / CERTIFICATES)),
+                days,
+                launcher=False,
+            )
         case "kubernetes":
             return [write_cluster(made, out, days, image)]
 

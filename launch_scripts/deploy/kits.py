@@ -10,20 +10,41 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import msgspec
+
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, called_of, hosts_of, issue
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
-from launch_scripts.deploy.plan import ROUTER, Plan, PlannedHost
+from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.deploy.shown_plan import as_json
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.access_control import common_name
+from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 
 Render = Callable[[Plan, PlannedHost], Mapping[str, str]]
 """Name -> text of the files that start a machine's processes. Names without an ending are scripts."""
 _PRIVATE, _OPEN, _SCRIPT = 0o600, 0o644, 0o755
+PLAN = "plan.json"
+
+
+class _ProcessBefore(msgspec.Struct):
+    role: str
+    id: str
+
+
+class _HostBefore(msgspec.Struct):
+    name: str
+    processes: tuple[_ProcessBefore, ...]
+
+
+class _Before(msgspec.Struct):
+    """What is read of an earlier plan."""
+
+    run_id: str
+    hosts: tuple[_HostBefore, ...]
 
 
 def write_kits(
@@ -36,16 +57,13 @@ def write_kits(
     processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be read or
     written.
     """
-    folder = out / CERTIFICATES
-    revoked = revoked_in(folder)
-    authority(folder)
-    _issued(folder, OPERATOR, (), days, revoked)
+    folder, revoked = out / CERTIFICATES, for_operators(out, days)
     written = []
     for host in plan.hosts:
         scenario, ground = host_scenario(plan, host)
         texts = {
             "scenario.toml": scenario_text(scenario, Path()),
-            "plan.json": json.dumps(as_json(plan), indent=1) + "\n",
+            PLAN: _shown(plan),
             **render(plan, host),
         }
         if revoked and host.of(ROUTER):
@@ -56,7 +74,45 @@ def write_kits(
         if wheel is not None:
             files[f"wheels/{wheel.name}"] = wheel
         written.append(_archive(out, host.name, texts, files))
+    keep_plan(plan, out)
     return written
+
+
+def for_operators(out: Path, days: int) -> tuple[str, ...]:
+    """Makes the authority and the certificate of operators in `out/certs`, if they lack. Returns the names that are
+    revoked there."""
+    folder = out / CERTIFICATES
+    revoked = revoked_in(folder)
+    authority(folder)
+    _issued(folder, OPERATOR, (), days, revoked)
+    return revoked
+
+
+def keep_plan(plan: Plan, out: Path) -> None:
+    """Writes the plan for `keepers_before`. Raises StoreError where it cannot."""
+    try:
+        (out / PLAN).write_text(_shown(plan), encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {out / PLAN}: {error.strerror or error}") from error
+
+
+def _shown(plan: Plan) -> str:
+    return json.dumps(as_json(plan), indent=1) + "\n"
+
+
+def keepers_before(out: Path, run_id: str) -> dict[str, str]:
+    """Keeper -> machine, in the plan of the same run whose archives were written to a folder before; empty if there
+    is none. Raises StoreError where it cannot be read."""
+    path = out / PLAN
+    if not path.exists():
+        return {}
+    try:
+        before = msgspec.json.decode(read_bytes(path, FileKind.RUN), type=_Before)
+    except msgspec.DecodeError as error:
+        raise StoreError(f"{path} is no plan of `swarm deploy plan`: {error}; write to another folder") from error
+    if before.run_id != run_id:
+        return {}
+    return {process.id: host.name for host in before.hosts for process in host.processes if process.role == KEEPER}
 
 
 def certificates_of(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:

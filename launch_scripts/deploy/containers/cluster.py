@@ -7,13 +7,11 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from launch_scripts.deploy.certificates import authority
 from launch_scripts.deploy.containers.container import SETTINGS, image_name
 from launch_scripts.deploy.containers.kubernetes import SECRETS, kubernetes_files
 from launch_scripts.deploy.host_scenario import CERTIFICATES, host_scenario, plugin_files
-from launch_scripts.deploy.kits import certificates_of, with_parts
+from launch_scripts.deploy.kits import certificates_of, for_operators, keep_plan, with_parts
 from launch_scripts.deploy.plan import Plan
-from launch_scripts.deploy.revocations import revoked_in
 from swarm.errors import StoreError
 
 RECIPE = "Containerfile"
@@ -32,8 +30,7 @@ def write_cluster(plan: Plan, out: Path, days: int, image: str = "") -> Path:
     A pod may run on any node, so the ground's files and plug-ins, if there are any, belong into the image: their
     folder has a recipe that adds them to `image`'s base. Raises StoreError where a file cannot be read or written.
     """
-    folder, revoked = out / CERTIFICATES, revoked_in(out / CERTIFICATES)
-    authority(folder)
+    folder, revoked = out / CERTIFICATES, for_operators(out, days)
     certificates: dict[str, Path] = {}
     for host in plan.hosts:
         certificates |= certificates_of(folder, host, days, revoked)
@@ -48,6 +45,7 @@ def write_cluster(plan: Plan, out: Path, days: int, image: str = "") -> Path:
         _write(cluster, texts, added)
     except OSError as error:
         raise StoreError(f"cannot write {cluster}: {error.filename}: {error.strerror or error}") from error
+    keep_plan(plan, out)
     return cluster
 
 

@@ -6,6 +6,7 @@ what ends; health is shown, and no engine of one machine acts on it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,13 +52,14 @@ ${{COMPOSE:-docker compose}} up --detach --remove-orphans
 """
 
 
-def compose_files(plan: Plan, host: PlannedHost, image: str = "") -> dict[str, str]:
+def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Sequence[str] = ()) -> dict[str, str]:
     """Name -> text: the compose file of a machine, its scenario as containers read it, the script that starts them.
 
-    image  of the roles; if empty, that of this version
+    image    of the roles; if empty, that of this version
+    revoked  names in certificates that its router denies everything, beside those of the scenario
     """
     routers = {f"tls/127.0.0.1:{plan.port}": f"tls/{router_name(host)}:{plan.port}"} if host.listen else {}
-    scenario = contained_scenario(plan, host, routers)
+    scenario = contained_scenario(plan, host, routers, revoked)
     about = f"Machine {host.name} of run {plan.run_id}; ./install starts it."
     return {
         COMPOSE_FILE: yaml_text([_compose(plan, host, image)], about),

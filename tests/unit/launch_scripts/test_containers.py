@@ -120,6 +120,7 @@ def test_manifests_come_with_their_keys_apart_and_a_recipe_that_adds_the_ground(
     assert f"kubectl apply -f {kit}" in done.output.replace("\n", "")
     assert stat.S_IMODE((kit / "secrets.yaml").stat().st_mode) == 0o600
     manifests = read_manifests(*(path.read_text() for path in kit.glob("*.yaml")))
+    assert (folder / "kits" / "certs" / "operator.0.key").is_file()
     images = {pod["spec"]["containers"][0]["image"] for pod in manifests.pods.values()}
     assert images == {"registry/small:1", "registry/small:1-all"}
     assert (kit / "ground" / "ground.tif").read_bytes() == (folder / "ground.tif").read_bytes()
