@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, called_of, hosts_of, issue
-from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, PLUGINS, host_scenario, parts_of
+from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
 from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
@@ -21,8 +21,6 @@ from launch_scripts.deploy.shown_plan import as_json
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.access_control import common_name
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.config.plugin_names import plugins_of
-from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 
@@ -49,37 +47,57 @@ class _Before(msgspec.Struct):
     hosts: tuple[_HostBefore, ...]
 
 
-def write_kits(plan: Plan, out: Path, render: Render, days: int, wheel: Path | None = None) -> list[Path]:
+def write_kits(
+    plan: Plan, out: Path, render: Render, days: int, wheel: Path | None = None, *, launcher: bool = True
+) -> list[Path]:
     """An archive for each machine, `out/NAME.tar.gz`, which unpacks into `swarm-NAME/`. Returns the archives.
 
     Certificates lie in `out/certs` with the authority's key, which leaves it for no archive. What is there already
-    is kept, so that a second plan replaces no key that needs none. Raises StoreError where a file cannot be read or
+    is kept, so that a second plan replaces no key that needs none. `launcher`: whether a launcher starts the
+    processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be read or
     written.
     """
-    folder = out / CERTIFICATES
-    revoked = revoked_in(folder)
-    authority(folder)
-    _issued(folder, OPERATOR, (), days, revoked)
-    shown = json.dumps(as_json(plan), indent=1) + "\n"
+    folder, revoked = out / CERTIFICATES, for_operators(out, days)
     written = []
     for host in plan.hosts:
         scenario, ground = host_scenario(plan, host)
         texts = {
             "scenario.toml": scenario_text(scenario, Path()),
-            PLAN: shown,
+            PLAN: _shown(plan),
             **render(plan, host),
         }
         if revoked and host.of(ROUTER):
             texts[f"{CERTIFICATES}/{REVOKED}"] = "".join(f"{name}\n" for name in revoked)
-        files = {**ground, **_plugin_files(plan.scenario), **_certificates(folder, host, days, revoked)}
+        files = {**ground, **plugin_files(plan.scenario), **certificates_of(folder, host, days, revoked)}
+        if launcher:
+            files |= _files_of(_issued(folder, host.operator, (), days, revoked), OPERATOR)
         if wheel is not None:
             files[f"wheels/{wheel.name}"] = wheel
         written.append(_archive(out, host.name, texts, files))
+    keep_plan(plan, out)
+    return written
+
+
+def for_operators(out: Path, days: int) -> tuple[str, ...]:
+    """Makes the authority and the certificate of operators in `out/certs`, if they lack. Returns the names that are
+    revoked there."""
+    folder = out / CERTIFICATES
+    revoked = revoked_in(folder)
+    authority(folder)
+    _issued(folder, OPERATOR, (), days, revoked)
+    return revoked
+
+
+def keep_plan(plan: Plan, out: Path) -> None:
+    """Writes the plan for `keepers_before`. Raises StoreError where it cannot."""
     try:
-        (out / PLAN).write_text(shown, encoding="utf-8")
+        (out / PLAN).write_text(_shown(plan), encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {out / PLAN}: {error.strerror or error}") from error
-    return written
+
+
+def _shown(plan: Plan) -> str:
+    return json.dumps(as_json(plan), indent=1) + "\n"
 
 
 def keepers_before(out: Path, run_id: str) -> dict[str, str]:
@@ -97,17 +115,23 @@ def keepers_before(out: Path, run_id: str) -> dict[str, str]:
     return {process.id: host.name for host in before.hosts for process in host.processes if process.role == KEEPER}
 
 
-def _certificates(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:
-    """Place in the archive -> file, of the certificates of a machine's processes. Its launcher's, whose name is the
-    machine's own, lies where `swarm up` looks for an operator's."""
+def certificates_of(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:
+    """Place in the archive -> file, of the certificates of a machine's processes. Those that lack are made."""
     found = {f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
-    named = [(process.certificate, process.certificate, process.role) for process in host.processes]
-    for name, place, role in (*named, (host.operator, OPERATOR, "")):
-        reached = (host.address, *THIS_MACHINE) if role == ROUTER else ()
-        certificate = _issued(folder, name, reached, days, revoked)
-        for suffix in (".pem", ".key"):
-            found[f"{CERTIFICATES}/{place}{suffix}"] = certificate.with_name(f"{name}{suffix}")
+    for process in host.processes:
+        reached = (host.address, router_name(host), *THIS_MACHINE) if process.role == ROUTER else ()
+        found |= _files_of(_issued(folder, process.certificate, reached, days, revoked), process.certificate)
     return found
+
+
+def router_name(host: PlannedHost) -> str:
+    """Under which containers reach the router of a machine; it stands in that router's certificate."""
+    return f"router-{host.name}"
+
+
+def _files_of(certificate: Path, name: str) -> dict[str, Path]:
+    """A certificate and its key, under the name by which a process looks for them."""
+    return {f"{CERTIFICATES}/{name}{suffix}": certificate.with_suffix(suffix) for suffix in (".pem", ".key")}
 
 
 def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked: tuple[str, ...]) -> Path:
@@ -117,18 +141,6 @@ def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked:
     if renew and hosts_of(path) >= set(hosts) and called_of(path) == called:
         return path
     return issue(folder, name, hosts, days, renew=renew, called=called)
-
-
-def _plugin_files(scenario: Scenario) -> dict[str, Path]:
-    """The modules of plug-ins that a scenario takes from its own folder, and those beside them."""
-    folder = Path(scenario.plugin_folder)
-    modules = {
-        named.name.partition(":")[0].partition(".")[0] for named in plugins_of(scenario) if ":" in named.name
-    }
-    if not any((folder / f"{module}.py").is_file() or (folder / module).is_dir() for module in modules):
-        return {}
-    packages = [path for module in modules for path in sorted((folder / module).rglob("*.py"))]
-    return {f"{PLUGINS}/{path.relative_to(folder)}": path for path in (*sorted(folder.glob("*.py")), *packages)}
 
 
 def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str, Path]) -> Path:
@@ -142,7 +154,7 @@ def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str,
                 data = text.encode()
                 mode = _SCRIPT if "." not in Path(place).name and "/" not in place else _OPEN
                 archive.addfile(_entry(name, place, len(data), mode), io.BytesIO(data))
-            for place, source in _with_parts(files):
+            for place, source in with_parts(files):
                 with source.open("rb") as content:
                     size = os.fstat(content.fileno()).st_size
                     mode = _PRIVATE if place.endswith(".key") else _OPEN
@@ -153,7 +165,7 @@ def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str,
     return path
 
 
-def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
+def with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
     """With what belongs to a file by its name, as .shp, .dbf and .prj."""
     for place, source in files.items():
         yield place, source

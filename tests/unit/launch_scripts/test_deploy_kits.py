@@ -67,7 +67,12 @@ def test_each_machine_has_the_keys_of_its_own_processes_and_no_other(tmp_path: P
             assert stat.S_IMODE((certs / f"{name}.key").stat().st_mode) == 0o600
         assert called_of(certs / "operator.0.pem") == f"operator.{host.name}"
         (router,) = host.of("router")
-        assert hosts_of(certs / f"{router.certificate}.pem") == {host.address, "localhost", "127.0.0.1"}
+        assert hosts_of(certs / f"{router.certificate}.pem") == {
+            host.address,
+            f"router-{host.name}",
+            "localhost",
+            "127.0.0.1",
+        }
         keys += [path.read_bytes() for path in certs.glob("*.key")]
     assert len(keys) == len(set(keys))
 
