@@ -157,6 +157,15 @@ def up(
             help="Take part in this run; by default a new one, or the one in the namespace.", rich_help_panel=PART
         ),
     ] = None,
+    take_over: Annotated[
+        bool,
+        typer.Option(
+            "--take-over",
+            help="Take over from the launcher that runs this part of the run here, as for an upgrade: it is ended "
+            "once successors are ready.",
+            rich_help_panel=PART,
+        ),
+    ] = False,
     namespace: Namespace = None,
 ) -> None:
     """Run a scenario: all of its processes on this machine, or some of them.
@@ -170,7 +179,16 @@ def up(
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
     _up(
-        scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, rank=rank, run_id=run_id
+        scenario,
+        run,
+        tls,
+        connect=connect,
+        listen=listen,
+        namespace=namespace,
+        only=only,
+        rank=rank,
+        run_id=run_id,
+        take_over=take_over,
     )
 
 
@@ -185,6 +203,7 @@ def _up(
     only: list[str] | None = None,
     rank: int | None = None,
     run_id: str | None = None,
+    take_over: bool = False,
 ) -> None:
     from launch_scripts.launcher.busy_line import busy_loading
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
@@ -236,6 +255,7 @@ def _up(
         metrics_port=run.metrics_port,
         began_s=_began_s(),
         record_inputs=run.record_inputs,
+        takes_over=take_over,
     )
     raise typer.Exit(run_swarm(chosen))
 

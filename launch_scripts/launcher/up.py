@@ -21,6 +21,7 @@ from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_targe
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.stop_signals import StopAsked
+from launch_scripts.launcher.take_over import TakeOver
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.warm_up import WarmUp
@@ -74,7 +75,7 @@ def run_swarm(options: UpOptions) -> int:
     for spec in table_of(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
-    if not options.joins:
+    if not options.joins and not options.takes_over:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
@@ -119,6 +120,10 @@ class _Run:
         self._web_port = 0
         """When the swarm was whole, on the run's clock."""
         self._recorder: Recorder | None = None
+        self._take_over: TakeOver | None = None
+        if options.takes_over:
+            self._take_over = TakeOver(run_dir, options.roles, self._terminal.say)
+            self._take_over.prepare(self._swarm.running)
         self._metrics = self._open_metrics()
 
     def _open_metrics(self) -> LauncherMetrics | None:
@@ -175,6 +180,8 @@ class _Run:
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
+                if self._take_over is not None:
+                    self._take_over.begin(bus)
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
@@ -247,13 +254,15 @@ class _Run:
 
     def _join(self, bus: Bus) -> None:
         """Refuses to share a namespace with another run, or to start a process that runs already."""
-        if not self._options.joins:
+        if not self._options.joins and self._take_over is None:
             return
         found = ask_run(bus)
         mine = self._setup_of(ProcessSpec(LAUNCHER, "0", "")).info(self._terrain.grid, self._terrain.digest)
         check_belongs(mine, found)
+        followed = () if self._take_over is None else self._take_over.predecessors
         for running in self._swarm.running:
-            check_vacant(found, running.spec.role, running.spec.id)
+            if running.spec.name not in followed:
+                check_vacant(found, running.spec.role, running.spec.id)
 
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
@@ -262,6 +271,8 @@ class _Run:
         ordered = self._ordered_planners()
         while not self._stop_asked:
             ordered.look(watcher.recorder.book, set(watcher.recorder.observed.up()), time.monotonic())
+            if self._take_over is not None:
+                self._take_over.look(time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -289,7 +300,7 @@ class _Run:
         return OrderedPlanners(self._scenario, self._swarm, ranks, whole, self._terminal.say)
 
     def _is_up(self, watcher: Watcher) -> bool:
-        if self._missing(watcher):
+        if self._missing(watcher) or (self._take_over is not None and not self._take_over.done):
             return False
         planners = "planner" in self._options.roles
         return not planners or watcher.routes_served or self._all_external
