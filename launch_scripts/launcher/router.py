@@ -59,6 +59,9 @@ class RouterService:
     def counters(self) -> Counters:
         return self._member.counters
 
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
+
     def start(self, now_ns: int) -> None:
         self._member.join()
 
@@ -119,7 +122,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
     try:
         peer = Peer(setup.role, setup.id, setup.incarnation)
         service = RouterService(peer, admission.bus, inbox.post, admission.reopened, restarts=setup.restarts)
-        process = Process(service, inbox, clock, tick_hz=2.0)
+        process = Process(service, inbox, clock, tick_hz=2.0, health=setup.health)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

@@ -19,6 +19,7 @@ from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.run_processes import has_ended, holding, processes
 from swarm.bus.bus import Bus, Event, Heard
 from swarm.errors import ConfigError
+from swarm.ranks import job_of
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat
 from swarm.wire.topics import LEAD, STATUS
@@ -36,21 +37,25 @@ _PATIENCE_S = 60.0
 class TakeOver:
     """What is waited for and what is done, turn by turn. Raises ConfigError where there is nobody to follow.
 
-    roles  those that are started here
-    say    tells people
+    running  the processes that are started here; those whose predecessors have to end before begin then
+    targets  of the scenario: planners of others were ordered, and are ordered again
+    say      tells people
     """
 
-    def __init__(self, run_dir: Path, roles: Collection[str], say: Callable[[str], None]) -> None:
+    def __init__(
+        self, run_dir: Path, running: list[Running], targets: Collection[str], say: Callable[[str], None]
+    ) -> None:
         self._run_dir = run_dir
+        self._running = running
         self._say = say
         self._launcher = _launcher_of(run_dir)
         self.predecessors = processes(run_dir)
         """Name -> pid of the processes that are followed."""
-        left = sorted({name.partition("-")[0] for name in self.predecessors} - set(roles))
-        if left:
+        left = set(self.predecessors) - {each.spec.name for each in running}
+        if left := {name for name in left if not _was_ordered(name, targets)}:
             raise ConfigError(
-                f"--take-over: the launcher in {run_dir} runs {', '.join(left)} too, which this one would end and "
-                "not start again: give it the same roles"
+                f"--take-over: the launcher in {run_dir} runs {', '.join(sorted(left))} too, which this one would "
+                "end and not start again: give it the same part"
             )
         self._ready: set[tuple[str, int]] = set()
         """(id, incarnation) of planners that can answer."""
@@ -59,11 +64,6 @@ class TakeOver:
         """Once they are, agents begin beside theirs."""
         self._asked = False
         """Whether the predecessor has been asked to end."""
-        self._running: list[Running] = []
-
-    def prepare(self, running: list[Running]) -> None:
-        """Let processes begin when their predecessors allow it."""
-        self._running = running
         for each in running:
             pid = self.predecessors.get(each.spec.name)
             if pid is None or each.spec.role == _BESIDE:
@@ -119,6 +119,12 @@ class TakeOver:
             return True
         pid = None if running.process is None else running.process.pid
         return pid is not None and pid in holding(self._run_dir / f"promises-{running.spec.id}.lock")
+
+
+def _was_ordered(name: str, targets: Collection[str]) -> bool:
+    """Whether a process is the planner of a target that an operator has added."""
+    role, _, id = name.partition("-")
+    return role == "planner" and job_of(id) not in targets
 
 
 def _launcher_of(run_dir: Path) -> int:

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from support.launchers import THREE, TWO, Machine, Routed, machines_of, shared_kernels
 from support.live_swarm import client
-from support.machines import THREE, TWO, Machine, Routed, machines_of, shared_kernels
 from support.neighbour import ROOT, neighbour_tree
 from support.processes import eventually
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -15,17 +16,21 @@ from support.effort import few
 
 from launch_scripts.launcher import take_over
 from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.run_processes import holding
 from launch_scripts.launcher.take_over import TakeOver
+from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.process_table import ProcessSpec
+from launch_scripts.report.latest_state import Observed
 from swarm.bus.bus import Event, Heard, Post
-from swarm.errors import ConfigError
+from swarm.config.scenario import Scenario
+from swarm.errors import BusError, ConfigError
+from swarm.grid import GridSpec
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat
 from swarm.wire.topics import LEAD, STATUS, Topic
 
 LAUNCHER = 100
-ROLES = ("router", "keeper", "planner", "targets", "agent")
 PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}
 STATUS_OF_T0 = PlannerStatus(
     target="t0", incarnation=8, stamp_ns=0, strategy="auto", target_cell=None, map_version=0, tree_age_ms=0.0,
@@ -65,11 +70,10 @@ class Machine:
         patch.setattr(take_over, "has_ended", lambda pid: pid not in self.alive)
         patch.setattr(take_over, "holding", self._holding)
         patch.setattr(take_over.os, "kill", lambda pid, number: self.asked.append((pid, number)))
-        self.over = TakeOver(Path("run"), ROLES, self.said.append)
         self.running = [
             Running(ProcessSpec(role, id, "m:f")) for role, _, id in (name.partition("-") for name in PREDECESSORS)
         ]
-        self.over.prepare(self.running)
+        self.over = TakeOver(Path("run"), self.running, ["t0", "t1"], self.said.append)
         self.ear = Ear()
         self.over.begin(self.ear)  # type: ignore[arg-type]
         self.turn()
@@ -153,11 +157,12 @@ def test_where_there_is_nobody_to_follow_or_a_role_would_be_lost_it_is_refused_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match=r"--take-over: no launcher of this user runs in .*; start without it"):
-        TakeOver(tmp_path, ROLES, print)
+        TakeOver(tmp_path, [], [], print)
     monkeypatch.setattr(take_over, "holding", lambda _: [LAUNCHER])
-    monkeypatch.setattr(take_over, "processes", lambda _: {"agent-a0": 6, "keeper-0": 2})
-    with pytest.raises(ConfigError, match="runs keeper too, which this one would end and not start again"):
-        TakeOver(tmp_path, ("agent",), print)
+    monkeypatch.setattr(take_over, "processes", lambda _: {"agent-a0": 6, "agent-a1": 7, "planner-added": 2})
+    part = [Running(ProcessSpec("agent", "a0", "m:f"))]
+    with pytest.raises(ConfigError, match="runs agent-a1 too, which this one would end and not start again"):
+        TakeOver(tmp_path, part, ["t0"], print)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -175,3 +180,19 @@ def test_who_has_a_file_open_is_found(tmp_path: Path) -> None:
             assert sorted(holding(path)) == sorted([os.getpid(), other.pid])
             other.communicate()
     assert holding(path) == []
+
+
+@pytest.mark.network
+def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_path: Path) -> None:
+    observed = Observed(GridSpec(4, 5, 30.0))
+    before = MachineSignals(UpOptions(Scenario(), tmp_path, metrics_port=0), "run-1", list)
+    options = UpOptions(Scenario(), tmp_path, metrics_port=int(before.url.split(":")[2].partition("/")[0]))
+    with pytest.raises(BusError, match="Address already in use"):
+        MachineSignals(options, "run-1", list)
+    after = MachineSignals(dataclasses.replace(options, takes_over=True), "run-1", list)
+    after.turned(observed, 0, [])
+    assert after.url == ""
+    before.close()
+    after.turned(observed, 0, [])
+    assert after.url == before.url
+    after.close()
