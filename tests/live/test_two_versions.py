@@ -65,7 +65,7 @@ def stop_first(machine: Machine, tree: Path) -> None:
 
 
 def test_two_versions_understand_each_other_and_one_takes_over_from_the_other(tmp_path: Path) -> None:
-    trees = {"base": older_tree(tmp_path), "field": ROOT}
+    trees = {"base": older_tree(tmp_path), "planners": ROOT}
     with machines_of(TWO, trees, tmp_path) as (machines, routed, network):
         check_understood(network, 7)
         take_over(machines["base"], ROOT)

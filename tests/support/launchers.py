@@ -39,7 +39,8 @@ class Part:
     rank: int | None = None
 
 
-TWO = {"base": Part(("router", "keeper", "planner", "targets")), "field": Part(("agent",))}
+TWO = {"base": Part(("router", "keeper", "targets", "agent")), "planners": Part(("planner",))}
+"""No kernel is compiled for the first, should its version have others."""
 THREE = {
     "base": Part(("router", "keeper")),
     "planners": Part(("planner", "targets"), 0),
