@@ -84,6 +84,12 @@ class Running:
     refused_s: list[float] = field(default_factory=list)
     """When it refused to run, within the last `REFUSALS_WITHIN_S`."""
     backoff: Backoff = field(default_factory=Backoff)
+    begins_when: Callable[[], bool] | None = None
+    """What its first start waits for; None once it has been started, or where it waits for nothing."""
+    takes_over: bool = False
+    """Whether its first start is beside a life that still runs here."""
+    incarnation: int = 0
+    """Of the life that was started last."""
     dismissed_s: float | None = None
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
@@ -144,9 +150,10 @@ class LocalSwarm:
         return [running.seen() for running in list(self.running)]
 
     def start(self, role: str | None = None) -> None:
-        """Starts the processes of a role, or all that have not been started."""
+        """Starts the processes of a role, or all that have not been started and wait for nothing."""
         for running in self.running:
-            if running.process is None and running.due_s is None and role in (None, running.spec.role):
+            idle = running.process is None and running.due_s is None and running.begins_when is None
+            if idle and role in (None, running.spec.role):
                 self._start(running)
 
     def add(self, spec: ProcessSpec) -> None:
@@ -188,6 +195,9 @@ class LocalSwarm:
                 continue
             if process is not None and process.sentinel in ended and process.exitcode is not None:
                 endings.append(self._ended(running, process))
+            elif running.begins_when is not None and running.begins_when():
+                running.begins_when = None
+                self._start(running)
             elif running.due_s is not None and time.monotonic() >= running.due_s:
                 try:
                     self._start(running, running.restarts + 1)
@@ -224,7 +234,7 @@ class LocalSwarm:
         and nobody's failure.
         """
         for running in self.running:
-            running.due_s = None
+            running.due_s = running.begins_when = None
         roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
         failures = []
         for role in roles:
@@ -239,7 +249,7 @@ class LocalSwarm:
     def kill(self) -> None:
         """Kills all processes."""
         for running in self.running:
-            running.due_s = None
+            running.due_s = running.begins_when = None
             if running.process is not None:
                 running.process.kill()
                 running.process.join(1.0)
@@ -255,7 +265,16 @@ class LocalSwarm:
         reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
         process = self._context.Process(
             target=run_child,
-            args=(spec.entry, replace(setup, restarts=restarts, anew=setup.anew and not restarts), reports),
+            args=(
+                spec.entry,
+                replace(
+                    setup,
+                    restarts=restarts,
+                    anew=setup.anew and not restarts,
+                    takes_over=running.takes_over and not restarts,
+                ),
+                reports,
+            ),
             name=spec.name,
             daemon=True,  # should the launcher itself fail, multiprocessing ends them
         )
@@ -263,6 +282,7 @@ class LocalSwarm:
             process.start()
         tell.close()
         running.process, running.pipe = process, listen
+        running.incarnation = setup.incarnation
         running.began_s, running.due_s, running.hung = time.monotonic(), None, False
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
