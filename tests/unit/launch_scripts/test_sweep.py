@@ -15,13 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
+from launch_scripts.bench.learning_runs import wrong_prior
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.trial import BrokenLaw, try_seed
 from launch_scripts.sweep import statistics
 from launch_scripts.sweep.plan import plan
 from launch_scripts.sweep.run import Sweep
 from launch_scripts.sweep.store import ResultStore
-from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study
+from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study, study_names, study_path
 from launch_scripts.sweep.summary import Summary
 from launch_scripts.sweep.trial import Result, Trial, numbers, run_trial
 from swarm.config.dotted import flat, with_settings
@@ -178,6 +179,35 @@ def test_a_file_that_a_scenario_names_counts_by_what_is_in_it(tmp_path):
         plan.__globals__["_file_digest"].cache_clear()
         found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
     assert found[0] == found[2] != found[1]
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_each_study_of_the_project_can_be_read_and_its_trials_run(name):
+    path = study_path(name)
+    study = load_study(path)
+    planned = plan(study, path.parent, name)
+    assert study.outcomes
+    for each in planned:
+        briefly = msgspec.structs.replace(each.trials[0], seconds=8.0 if study.faults else 1.0)
+        result = run_trial(briefly)
+        assert not result.broken or study.faults  # the quiet at the end of so short a run may be too short
+        told = [outcome for outcome in study.outcomes if outcome in result.figures]
+        assert told == list(study.outcomes), f"{name}: the report has {sorted(result.figures)}"
+
+
+def test_the_study_of_learning_is_that_of_the_benchmark():
+    path = study_path("learning")
+    found = {each.case.variant: each.scenario for each in plan(load_study(path), path.parent, "x")}
+    assert found == {"without": wrong_prior(False), "learning": wrong_prior(True)}
+
+
+def test_a_study_is_found_by_its_name_and_a_name_that_is_none_is_told_with_the_nearest(tmp_path):
+    assert study_path("laws").is_file()
+    assert study_path("some/laws.toml") == Path("some/laws.toml")
+    with pytest.raises(ConfigError, match="no study 'lows'; did you mean 'laws'"):
+        study_path("lows")
+    with pytest.raises(ConfigError, match=r"cannot read study nowhere\.toml: No such file"):
+        load_study(study_path("nowhere.toml"))
 
 
 # --- one trial ---------------------------------------------------------------------------------------------------
