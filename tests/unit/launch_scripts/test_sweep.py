@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
 from launch_scripts.bench.learning_runs import wrong_prior
+from launch_scripts.commands.sweep import sweep_study
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.trial import BrokenLaw, try_seed
 from launch_scripts.sweep import statistics
@@ -359,10 +360,41 @@ def test_a_world_is_run_again_by_its_name(tmp_path):
     assert failure.scenario == "wide"
 
 
+def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws_held(tmp_path, capsys):
+    path, out = write_study(tmp_path), tmp_path / "out"
+    sweep, _ = finished(path, out, {0: 1.0, 1: 2.0, 2: 6.0})
+    assert sweep_study(str(path), None, 1, out, as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert told["cases"][0]["outcomes"]["captures"]["values"] == {"0": 1.0, "1": 2.0, "2": 6.0}
+    sweep.store.add(result_of(sweep.planned[0].trials[1], (BrokenLaw("l", "it broke", 1.0),), captures=2.0))
+    sweep.store.flush()
+    assert not sweep_study(str(path), None, 1, out, as_json=False)
+    shown = capsys.readouterr()
+    assert "6 of 6 trials are kept from before" in shown.err
+    assert "sense_range_m = 120" in shown.out
+    assert "failed: swarm simulate" in shown.out
+    assert "1 of 6 trials broke a law" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "said"),
+    [
+        ("nonsense", None, "--scheduler: found 'nonsense', expected an address such as tcp://127.0.0.1:8786"),
+        ("tcp://127.0.0.1:8786", 2, "--workers goes without --scheduler"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(tmp_path, scheduler, workers, said):
+    with pytest.raises(ConfigError) as error:
+        sweep_study(str(write_study(tmp_path)), scheduler, workers, tmp_path / "out", as_json=False)
+    assert said in str(error.value)
+
+
 # --- intervals ---------------------------------------------------------------------------------------------------
 
 
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40))
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40) | st.lists(st.integers(0, 2), min_size=1, max_size=9)
+)
 def test_an_interval_holds_its_value_and_lies_among_the_data(values):
     for estimate, middle in ((statistics.mean(values), plain.fmean(values)),
                              (statistics.median(values), plain.median(values))):  # fmt: skip
