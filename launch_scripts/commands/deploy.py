@@ -10,11 +10,13 @@ import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.commands.deploy_plan import plan
+from launch_scripts.commands.deploy_size import size
 from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
 app = typer.Typer(help="A plan, certificates and configurations for several machines.", no_args_is_help=True)
 app.command("plan")(plan)
+app.command("size")(size)
 
 
 @app.command()
