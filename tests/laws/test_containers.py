@@ -238,8 +238,11 @@ def test_each_process_of_a_machine_is_one_service_that_may_do_nothing_but_its_wo
             assert given == {"ca.pem", f"{own}.pem", f"{own}.key"}
             assert given <= set(compose["secrets"])
             assert all("certs" not in volume.get("source", "") for volume in service["volumes"])
-            kinds = {volume["target"]: volume["type"] for volume in service["volumes"]}
-            assert kinds["/var/lib/swarm"] == ("volume" if each.lasting else "tmpfs")
+            written = [volume["target"] for volume in service["volumes"] if volume["type"] == "volume"]
+            in_memory = [mount.partition(":")[0] for mount in service["tmpfs"]]
+            assert sorted((*written, *in_memory)) == ["/tmp", "/var/lib/swarm"]
+            assert ("/var/lib/swarm" in written) == each.lasting
+            assert all(volume.get("read_only") for volume in service["volumes"] if volume["type"] == "bind")
             assert set(service.get("depends_on", {})) <= set(compose["services"])
         used = {
             name for service in compose["services"].values() for name in (s["source"] for s in service["secrets"])

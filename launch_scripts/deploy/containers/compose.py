@@ -93,7 +93,8 @@ def _service(plan: Plan, container: Container, image: str) -> dict[str, Any]:
         "read_only": True,
         "cap_drop": ["ALL"],
         "security_opt": ["no-new-privileges:true"],
-        "tmpfs": ["/tmp"],
+        # As options of a mount: engines disagree about how a mode is written as a number.
+        "tmpfs": ["/tmp", *([] if container.lasting else [f"{HOME}:mode=1777"])],
         "volumes": _volumes(plan, container),
         "secrets": [
             {"source": name, "target": f"{SETTINGS}/{CERTIFICATES}/{name}"} for name in container.certificate_files
@@ -125,11 +126,9 @@ def _volumes(plan: Plan, container: Container) -> list[dict[str, Any]]:
         given.append(PLUGINS)
     if host_scenario(plan, container.host)[1]:
         given.append(GROUND)
-    home: dict[str, Any] = {"type": "tmpfs", "target": HOME, "tmpfs": {"mode": 0o1777}}
-    if container.lasting:
-        home = {"type": "volume", "source": container.name, "target": HOME}
+    home = [{"type": "volume", "source": container.name, "target": HOME}] if container.lasting else []
     return [
-        home,
+        *home,
         *(
             {"type": "bind", "source": f"./{name}", "target": f"{SETTINGS}/{name}", "read_only": True}
             for name in given
