@@ -189,7 +189,7 @@ def _up(
     from launch_scripts.launcher.busy_line import busy_loading
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
-    # Beside the imports below and the terrain, which take as long.
+    # Beside the imports below and the terrain, which take as long. `entry` has done so where it could.
     start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
 
     with busy_loading(as_json=run.as_json, plain=run.plain):

@@ -7,8 +7,19 @@ import sys
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 
 
+_RUNS = ("demo", "up")
+"""Commands that start processes."""
+_SAYS_MORE = frozenset({"-h", "--help", "--only"})
+"""With these it is for the command to say which processes, if any."""
+
+
 def main() -> int:
     try:
+        if sys.argv[1:2] and sys.argv[1] in _RUNS and _SAYS_MORE.isdisjoint(sys.argv):
+            # It takes longest of all that a start waits for, so it begins before the command itself is loaded.
+            from launch_scripts.launcher.preload import ROLES_AND_KERNELS, start_forkserver
+
+            start_forkserver(ROLES_AND_KERNELS)
         from launch_scripts.cli import main as run
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in _OURS:

@@ -15,6 +15,9 @@ MODULES = (
     "shared_map.keeper.main",
     "vehicle_agent.main",
     "launch_scripts.world.main",
+    # What these import as they run, each for itself otherwise.
+    "encodings.idna",
+    "numpy.ma",
 )
 
 _PR_SET_PDEATHSIG = 1
