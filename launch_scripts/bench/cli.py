@@ -9,6 +9,7 @@ import typer
 
 from launch_scripts.bench.options import AsJson, Seed, names_of, numbers_of
 from launch_scripts.bench.planning import commands as planning
+from launch_scripts.bench.scaling import commands as scaling
 from launch_scripts.bench.show import progress_of, show
 from launch_scripts.bench.whole_swarm import commands as whole_swarm
 from swarm.errors import ConfigError
@@ -252,3 +253,4 @@ def search(
 
 
 app.add_typer(whole_swarm.app)
+app.add_typer(scaling.app)

@@ -84,7 +84,7 @@ def swarm(
     if write is not None:
         check(write)
     seconds = seconds or (10.0 if simulated else 30.0)
-    with _ending_in_order():
+    with ending_in_order():
         report = run_series(sizes, seconds, simulated, lambda text: typer.echo(text, err=True))
     show(report, as_json, tables)
     if write is not None and report["rows"]:
@@ -190,7 +190,7 @@ def crowd(
         raise ConfigError(f"--agents is {agents}, expected at most as many as --vehicles, {vehicles}")
     if 4 * vehicles > size * size:
         raise ConfigError(f"--vehicles is {vehicles}, expected at most a quarter of {size} x {size} cells")
-    with _ending_in_order(), progress_of("crowd") as progress:
+    with ending_in_order(), progress_of("crowd") as progress:
         report = run(
             chosen,
             some,
@@ -209,7 +209,7 @@ def crowd(
 
 
 @contextmanager
-def _ending_in_order() -> Iterator[None]:
+def ending_in_order() -> Iterator[None]:
     """Turn the first signal that asks for the end into an exception: it passes every `finally`, and with it the end
     of all processes. Further ones are ignored, as that end is bounded in time."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

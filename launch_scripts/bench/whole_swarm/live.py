@@ -41,6 +41,8 @@ _ANSWER_S = 10.0
 _ANSWERED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED, VehicleState.SEARCHING})
 """States of a vehicle which has a route, needs none, or was told that there is none."""
 _UP = "all processes are alive"
+_COUNTED = ("messages_out", "messages_in", "bytes_out", "bytes_in")
+"""What every bus counts."""
 
 Tell = Callable[[str], None]
 
@@ -287,11 +289,12 @@ class _Run:
             return [span for span in spans if span.role == role]
 
         agents_ms = histogram(of("agent"), "route_query_ms")
+        roles = sorted({span.role for span in spans})
         return {
             "ticks": {role: ticks(of(role)) for role in ("agent", "planner", "targets")},
-            **{
-                f"{name}_per_s": sum(span.per_s(name) for span in spans) if spans else None
-                for name in ("messages_out", "messages_in", "bytes_out", "bytes_in")
+            **{f"{name}_per_s": sum(span.per_s(name) for span in spans) if spans else None for name in _COUNTED},
+            "traffic": {
+                role: {name: sum(span.per_s(name) for span in of(role)) for name in _COUNTED} for role in roles
             },
             "agents_route_query_p50_ms": agents_ms.quantile(0.5),
             "agents_route_query_p99_ms": agents_ms.quantile(0.99),

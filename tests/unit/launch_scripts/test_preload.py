@@ -58,6 +58,7 @@ def test_what_one_process_or_none_needs_is_not_loaded_for_all() -> None:
         (["up", "jacksboro", "--port", "0"], True),
         (["demo"], True),
         (["up", "jacksboro", "--only", "agent"], False),
+        (["up", "jacksboro", "--only=router"], False),
         (["up", "--help"], False),
         (["demo", "-h"], False),
         (["status", "up"], False),
