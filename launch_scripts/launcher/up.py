@@ -173,8 +173,6 @@ class _Run:
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
-                if self._take_over is not None:
-                    self._take_over.begin(bus)
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
