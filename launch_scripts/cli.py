@@ -211,7 +211,7 @@ def _up(
     from launch_scripts.launcher.busy_line import busy_loading
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
-    # Beside the imports below and the terrain, which take as long.
+    # Beside the imports below and the terrain, which take as long. `entry` has done so where it could.
     named = {word.partition(".")[0] for word in only or ()}
     start_forkserver(ROLES_AND_KERNELS if not named or "planner" in named else ROLES_ONLY)
 
@@ -317,7 +317,14 @@ def simulate(
 
 @app.command(rich_help_panel=RUN)
 def sweep(
-    study: Annotated[Path, typer.Argument(metavar="STUDY", help="A .toml file: scenarios, settings and seeds.")],
+    study: Annotated[
+        str,
+        typer.Argument(
+            metavar="STUDY",
+            help="A .toml file with scenarios, settings and seeds, or a built-in name.",
+            autocompletion=complete.studies,
+        ),
+    ],
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="A cluster of Dask that is there, such as tcp://127.0.0.1:8786."),
