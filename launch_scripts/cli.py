@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import nullcontext
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +19,7 @@ from typer.exceptions import TyperException
 from launch_scripts.command_line import complete, usage
 from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
-from launch_scripts.commands import afterwards, before, chaos, mavlink, query, roles
+from launch_scripts.commands import afterwards, before, chaos, health, mavlink, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
     AsJson,
@@ -29,7 +30,6 @@ from launch_scripts.commands.shared_options import (
     Tls,
     spread,
 )
-from swarm.config.explain import choice
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.ranks import HIGHEST_RANK
 
@@ -137,7 +137,8 @@ def up(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            help="Start only this role; may be given several times.",
+            metavar="ROLE[.ID]",
+            help="Start only this role, or one process of it: planner, planner.t0.r1; may be given several times.",
             rich_help_panel=PART,
             autocompletion=complete.words("launch_scripts.process_table", "ROLES"),
         ),
@@ -165,6 +166,8 @@ def up(
 
     swarm up my.toml --only router --only keeper
 
+    swarm up my.toml --only router.1 --only planner.t3 --only planner.t0.r1 --only agent
+
     swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
@@ -190,14 +193,15 @@ def _up(
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long.
-    start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
+    named = {word.partition(".")[0] for word in only or ()}
+    start_forkserver(ROLES_AND_KERNELS if not named or "planner" in named else ROLES_ONLY)
 
-    with busy_loading(as_json=run.as_json, plain=run.plain):
+    with busy_loading(as_json=run.as_json, plain=run.plain) if run.log_format == "text" else nullcontext():
         import msgspec
 
         from launch_scripts.launcher import options
         from launch_scripts.launcher.up import run_swarm
-        from launch_scripts.launcher.up_options import UpOptions
+        from launch_scripts.launcher.up_options import UpOptions, chosen_processes
         from launch_scripts.process_table import ROLES
 
     scenario = options.find_scenario(name)
@@ -218,10 +222,9 @@ def _up(
         seed=scenario.seed if run.seed is None else run.seed,
         monitor=monitor,
     )
-    for role in only or ():
-        if role not in ROLES:
-            raise ConfigError(f"--only: no role {role!r}{choice(role, ROLES, ' the roles are ')}")
-    roles = tuple(role for role in ROLES if not only or role in only)
+    some = chosen_processes(scenario, only or (), rank)
+    one_by_one = any("." in word for word in only or ())
+    roles = tuple(role for role in ROLES if not named or role in named)
     if connect is not None:
         roles = tuple(role for role in roles if role != "router")
     chosen = UpOptions(
@@ -230,10 +233,13 @@ def _up(
         roles=roles,
         joins="router" not in roles,
         rank=rank,
+        table=tuple(spec for spec in some if spec.role in roles) if one_by_one else None,
         run_id=run_id,
         as_json=run.as_json,
         plain=run.plain,
         metrics_port=run.metrics_port,
+        signals_address=run.signals_address,
+        log_format=run.log_format,
         began_s=_began_s(),
         record_inputs=run.record_inputs,
     )
@@ -289,11 +295,44 @@ def simulate(
         raise typer.Exit(1)
 
 
+@app.command(rich_help_panel=RUN)
+def sweep(
+    study: Annotated[Path, typer.Argument(metavar="STUDY", help="A .toml file: scenarios, settings and seeds.")],
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A cluster of Dask that is there, such as tcp://127.0.0.1:8786."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, help="Processes of this machine; as many as it has cores if not given."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; sweeps/NAME of the study if not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
+
+    Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: started again,
+    also with other seeds or settings, it runs what is missing only. Exit code 1 if a law broke in any trial. Needs
+    pip install 'terrain-swarm[sweep]'.
+
+    swarm sweep study.toml
+
+    swarm sweep study.toml --scheduler tcp://127.0.0.1:8786 --out results
+    """
+    from launch_scripts.commands.sweep import sweep_study
+
+    if not sweep_study(study, scheduler, workers, out, as_json):
+        raise typer.Exit(1)
+
+
 app.add_typer(before.app)
 app.add_typer(chaos.app)
 app.add_typer(afterwards.app)
 app.add_typer(roles.app)
 app.add_typer(query.app)
+app.add_typer(health.app)
 app.add_typer(orders.app)
 app.add_typer(mavlink.app)
 

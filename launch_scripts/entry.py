@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import sys
 
+from launch_scripts.health.probe import fast
+
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 
 
 def main() -> int:
+    if sys.argv[1:2] == ["health"] and (code := fast(sys.argv[1:])) is not None:
+        return code
     try:
         from launch_scripts.cli import main as run
     except ModuleNotFoundError as error:

@@ -59,7 +59,9 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
             boundary.outside(prepared, PREPARED_COSTS),
         )
-        process = Process(boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id))
+        process = Process(
+            boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id), setup.health
+        )
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

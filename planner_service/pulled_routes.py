@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.step_climb import Climb, may_be_pulled
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.routes import RouteBatch
 
@@ -27,9 +27,8 @@ class Pulled:
 
 
 def pulls(config: PlannerConfig, climb: Climb | None) -> bool:
-    """Whether a planner pulls its routes: not where uphill is not downhill on the ground, as a climb has a price
-    for each step there, and a limit."""
-    return config.routes == "pulled" and (climb is None or climb.wind is not None)
+    """Whether a planner pulls its routes."""
+    return config.routes == "pulled" and may_be_pulled(climb)
 
 
 class Puller:
@@ -124,8 +123,7 @@ def _flight(climb: Climb) -> tuple[Floats, Floats, Floats, tuple[float, float]]:
     """What the kernel knows of a flight. Raises ValueError of what drives."""
     if climb.wind is None:
         raise ValueError("routes are not pulled where uphill is not downhill: a climb has a price per step")
-    heights = np.array(climb.elevation_m, np.float32, order="C").reshape(
-        -1
-    )  # kernels know what may be written only
+    # Copies, for kernels take only what may be written.
+    heights = np.array(climb.elevation_m, np.float32, order="C").reshape(-1)
     factors = np.array(climb.factors, np.float32)
     return heights, factors, np.array(climb.per_metre, np.float32), (climb.wind.south, climb.wind.east)

@@ -152,6 +152,8 @@ class PlannerService:
         """Tag -> what the worker is looking for, a step at a time; `_finding_strides` while it has a step."""
         self._finding_strides: str | None = None
         self.counters.count("marks_merged", 0)
+        self._member.needs("the shared map", lambda: self._sync.joined)
+        self._member.needs(f"a tree of {self._target}", lambda: self._planner.tree.ready or self._served_by_search)
         self._learned = LearnedGauges(self._cost_map.keys, self.counters)
 
     def _begin_class(self, name: str, now_ns: int) -> Planner:
@@ -165,6 +167,14 @@ class PlannerService:
             planner.set_pose(pose_of(seen), now_ns)
         log.info("target %s: a tree for the class %s", self._target, name)
         return planner
+
+    @property
+    def _served_by_search(self) -> bool:
+        """Whether there need not be a tree: the target is looked for, or was removed."""
+        return self._untracked or self._removed
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()

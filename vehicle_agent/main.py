@@ -40,7 +40,9 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         kept = boundary.outside(store, PROMISE_STORE)
         service = AgentService(setup, terrain, truth, boundary.bus(bus), inbox.post, kept)
         tick_hz = setup.scenario.vehicles.tick_hz
-        process = Process(boundary.service(service), inbox, MonotonicClock(), tick_hz, tick_phase(setup.id))
+        process = Process(
+            boundary.service(service), inbox, MonotonicClock(), tick_hz, tick_phase(setup.id), setup.health
+        )
         service.when_over = process.stop
         process.stop_on_signals()
         if stop_when is not None:

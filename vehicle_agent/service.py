@@ -191,6 +191,9 @@ class AgentService:
             self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings, self._agent.is_open)
         self._fleet = FleetReport(self._author, group, self._class)
         self._chasers = ChasersReport(self._author, self._class)
+        self._member.needs("the shared map", lambda: self._sync.joined)
+        self._member.needs("the orders of this run", lambda: self._obedience.known)
+        self._member.needs("places for its vehicles", lambda: self._has_places)
 
     @property
     def agent(self) -> Agent:
@@ -200,6 +203,16 @@ class AgentService:
     def over(self) -> bool:
         """Whether all vehicles of an agent that was added have left."""
         return self._entering is not None and self._entering.over and self._agent.holdings.gone
+
+    @property
+    def _has_places(self) -> bool:
+        """Whether all vehicles stand somewhere that have not left. Those that are added enter as there is space."""
+        if self._entering is not None:
+            return self._right_of_way.core.informed
+        return len(self._agent.vehicles.keys() | self._removed) == len(self._agent.plan.vehicle_ids)
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="planner")

@@ -132,15 +132,18 @@ def plugins(scenario: Scenario, roles: Collection[str] = ROLES) -> Iterator[Find
             yield from refused(named.key, find_plugin, named, scenario.plugin_folder)
 
 
-def check_start(scenario: Scenario, *, joins: bool) -> None:
+def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:
     """The cheap half of `swarm check`, before `swarm up` starts anything. Raises SwarmError with the first failure.
 
-    joins  the router is elsewhere, and a keeper hands out what is not here
+    joins       the router is elsewhere
+    has_ground  the terrain's files must be here; else a keeper hands out what is not
     """
     # Plug-ins, certificates of single processes and ports are looked at by whoever knows which roles start here.
     found = [*places_counted(scenario), *network(scenario, whole=False)]
+    if has_ground:
+        found += files_named(scenario)
     if not joins:
-        found += [*files_named(scenario), *meets(scenario)]
+        found += meets(scenario)
     for finding in found:
         error = TerrainError if finding.about.startswith("terrain") else ConfigError
         raise error(f"scenario {scenario.name}: {finding.sentence}")

@@ -1,4 +1,4 @@
-"""`swarm deploy`: certificates, and zenohd's configuration, for several machines."""
+"""`swarm deploy`: a plan of all machines, certificates, and zenohd's configuration, for several machines."""
 
 from __future__ import annotations
 
@@ -9,17 +9,14 @@ from typing import Annotated
 import typer
 
 from launch_scripts.command_line import complete
+from launch_scripts.commands.deploy_plan import plan
 from launch_scripts.commands.deploy_size import size
 from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
-_THIS_MACHINE = ("localhost", "127.0.0.1")
-"""Hosts in every router's certificate, for the processes beside it."""
-
-app = typer.Typer(help="Certificates and configurations for a swarm on several machines.", no_args_is_help=True)
-
-
-app.command()(size)
+app = typer.Typer(help="A plan, certificates and configurations for several machines.", no_args_is_help=True)
+app.command("plan")(plan)
+app.command("size")(size)
 
 
 @app.command()
@@ -55,7 +52,7 @@ def certs(
 
     Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
     """
-    from launch_scripts.deploy.certificates import issue
+    from launch_scripts.deploy.certificates import THIS_MACHINE, issue
     from launch_scripts.deploy.revocations import revoked_in
     from launch_scripts.launcher.options import find_scenario
     from launch_scripts.process_table import certificate_names
@@ -73,7 +70,7 @@ def certs(
             continue
         hosts = [host for host in given.get(name, "").split(",") if host]
         if bearer(name).role == ROUTER:
-            hosts += _THIS_MACHINE
+            hosts += THIS_MACHINE
         called = common_name(name, revoked)
         path = issue(folder, name, hosts, days, renew=renew and name in given, called=called)
         print(f"{path}, {path.with_suffix('.key')}: {called}, good for {days} days")

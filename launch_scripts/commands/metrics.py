@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from importlib.resources import files
 from typing import TYPE_CHECKING
@@ -14,14 +15,20 @@ if TYPE_CHECKING:
 _TURN_S = 0.1
 
 
-def serve_metrics(network: NetworkConfig, port: int) -> None:
-    """Serve until Ctrl-C. Raises BusError if the port is taken, or no router can be reached."""
+def serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
+    """Serve until Ctrl-C, on an address of this machine. Raises BusError if the port is taken, or there is no
+    router."""
+    from launch_scripts.health.verdict import Process
     from launch_scripts.metrics.endpoint import MetricsEndpoint
     from launch_scripts.metrics.exporter import Exporter
     from launch_scripts.metrics.families import families
     from swarm.bus.zenoh_bus import open_bus
+    from swarm.runtime.health import Health
+    from swarm.runtime.supervisor import supervisor_of
 
-    endpoint = MetricsEndpoint(port)
+    health = Health(supervisor=supervisor_of(os.environ))
+    health.begins(1.0 / _TURN_S)
+    endpoint = MetricsEndpoint(port, lambda: [Process("metrics", health.board.read())], address)
     try:
         with open_bus(network) as bus:
             exporter = Exporter(bus)
@@ -30,6 +37,7 @@ def serve_metrics(network: NetworkConfig, port: int) -> None:
             while True:
                 exporter.listen(time.monotonic_ns(), _TURN_S)
                 endpoint.answer(lambda: families(exporter.figures()))
+                health.turned([] if exporter.run is not None else ["a run"])
                 if exporter.run is not None and exporter.run.run_id != told:
                     told = exporter.run.run_id
                     typer.echo(f"run {told}, scenario {exporter.run.scenario}")

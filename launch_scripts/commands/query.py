@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from launch_scripts.command_line import complete, panels
-from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
+from launch_scripts.commands.shared_options import AsJson, PresetOption, SignalsAddress, Tls, spread
 from swarm.places import written
 
 if TYPE_CHECKING:
+    from launch_scripts.commands.running.status import Status
     from swarm.config.scenario import NetworkConfig
 
 app = typer.Typer()
@@ -204,7 +205,18 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """
     from rich.console import Console
 
-    from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
+    from launch_scripts.commands.running.status import print_status, status_fields
+
+    told = ask_status(where, tls)
+    if as_json:
+        typer.echo(json.dumps(status_fields(told), indent=2))
+    else:
+        print_status(told, Console(markup=False))
+
+
+def ask_status(where: Where, tls: Tls) -> Status:
+    """A running swarm as it is now. Raises BusError if nobody answers."""
+    from launch_scripts.commands.running.status import StatusWatch
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
     from swarm.errors import BusError
@@ -223,10 +235,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     if told is None:
         admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
         raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
-    if as_json:
-        typer.echo(json.dumps(status_fields(told), indent=2))
-    else:
-        print_status(told, Console(markup=False))
+    return told
 
 
 @app.command(rich_help_panel=panels.ASK)
@@ -259,7 +268,8 @@ def top(
 def metrics(
     where: Where,
     tls: Tls,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="On loopback; 0 picks one.")] = 9464,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Where it listens; 0 picks one.")] = 9464,
+    signals_address: SignalsAddress = "127.0.0.1",
     dashboard: Annotated[
         bool, typer.Option("--dashboard", help="Print a dashboard for Grafana, as JSON, and exit.")
     ] = False,
@@ -277,7 +287,7 @@ def metrics(
     if dashboard:
         typer.echo(command.dashboard())
     else:
-        command.serve_metrics(where.network(tls), port)
+        command.serve_metrics(where.network(tls), port, signals_address)
 
 
 _ROS = "The ROS side"

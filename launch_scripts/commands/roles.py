@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,10 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch_scripts.command_line import complete, panels
-from launch_scripts.commands.shared_options import Namespace, Rank, Runs, Tls, spread
+from launch_scripts.commands.shared_options import (
+    LogFormatOption,
+    Namespace,
+    Rank,
+    Runs,
+    SignalsAddress,
+    Tls,
+    spread,
+)
 from swarm.ranks import ranked_id
 
 if TYPE_CHECKING:
+    from swarm.runtime.health import Health
     from swarm.wire.messages.processes import RunInfo
 
 app = typer.Typer()
@@ -40,6 +50,12 @@ class Place:
     ] = None
     namespace: Namespace = None
     runs: Runs = Path("runs")
+    health_port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Answer probes on this port, at /healthz and /readyz; 0 picks one."),
+    ] = None
+    signals_address: SignalsAddress = "127.0.0.1"
+    log_format: LogFormatOption = "text"
 
 
 @dataclass(frozen=True)
@@ -66,6 +82,7 @@ def router(
     place: Place,
     tls: Tls,
     listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
+    id: Annotated[str, typer.Option("--id", help="Its name, where several routers pass on for each other.")] = "0",
 ) -> None:
     """Pass everybody's messages on: the process that all others connect to. --connect names another router.
 
@@ -73,7 +90,7 @@ def router(
 
     swarm router my.toml --listen tcp/127.0.0.1:7447
     """
-    run_role("router", "0", place, tls, listen=listen)
+    run_role("router", id, place, tls, listen=listen)
 
 
 @app.command(rich_help_panel=panels.ROLE)
@@ -174,7 +191,7 @@ def run_role(
     from launch_scripts.launcher import options
     from launch_scripts.launcher.child import load_entry
     from launch_scripts.launcher.lives import next_life
-    from launch_scripts.launcher.log_file import log_to
+    from launch_scripts.launcher.log_file import Speaker, log_to
     from launch_scripts.launcher.progress import progress
     from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.watcher import check_vacant
@@ -196,14 +213,16 @@ def run_role(
     ids = [spec.id for spec in processes_of(scenario, (role,))]
     if joins is not None:
         added_agent(scenario, id or "added0", joins.group, joins.count, joins.at)  # refused before anybody is asked
-    if role == "keeper" or (joins is not None and id):
+    if role in ("router", "keeper") or (joins is not None and id):
         _check_id(id)
     elif joins is not None and scenario.network.tls is not None:
         raise ConfigError("give a name with --id: the one in the certificate agent.GROUP.NAME")
     elif joins is None and id not in ids:
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     scenario = options.as_process(scenario, role, id if joins is None else f"{joins.group}.{id}")
-    log_to(None)
+    log_to(None, part.log_format, Speaker(role, id, (part.run_id if isinstance(part, Part) else None) or ""))
+    health = _told_health(f"{role}-{id}", part)
+    health.starts("its router")
     found: list[RunInfo] = []
     run_id = part.run_id if isinstance(part, Part) else None
     if role != "router":
@@ -220,13 +239,32 @@ def run_role(
     run_id = run_id or options.common_run_id(scenario)
     added = None if joins is None else added_agent(scenario, id, joins.group, joins.count, joins.at)
     run_dir = options.make_run_dir(part.runs, run_id)
+    log_to(None, part.log_format, Speaker(role, id, run_id))
+    health.starts("the ground of the run")
     if role != "router":
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
     life = next_life(run_dir, role, id)
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
-    setup = RoleSetup(scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added)
+    setup = RoleSetup(
+        scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health
+    )
     load_entry(ENTRIES[role])(setup, None, **role_options)
+
+
+def _told_health(name: str, place: Place) -> Health:
+    """What the role tells of itself: to its supervisor, and to probes if they are given a port."""
+    from launch_scripts.health.pages import PageServer, health_pages
+    from launch_scripts.health.verdict import Process
+    from swarm.runtime.health import Health
+    from swarm.runtime.supervisor import supervisor_of
+
+    health = Health(supervisor=supervisor_of(os.environ))
+    if place.health_port is not None:
+        pages = health_pages(lambda: [Process(name, health.board.read())])
+        served = PageServer("health port", place.health_port, pages, place.signals_address)
+        logging.getLogger(__name__).info("health at %s/healthz and /readyz", served.url)
+    return health
 
 
 def _free_id(found: list[RunInfo]) -> str:

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -43,6 +43,17 @@ PresetOption = Annotated[
         help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
         autocompletion=complete.words("swarm.config.values", "Preset"),
     ),
+]
+SignalsAddress = Annotated[
+    str,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Where the port of figures and health listens: 0.0.0.0 for probes from other machines.",
+    ),
+]
+LogFormatOption = Annotated[
+    Literal["text", "json"],
+    typer.Option(metavar="FORMAT", help="Logs as text, or as json: one object a line, for programs."),
 ]
 Rank = Annotated[
     int,
@@ -123,8 +134,12 @@ class RunOptions:
     ] = False
     metrics_port: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, help="Serve figures to Prometheus on this port of loopback; 0 picks one."),
+        typer.Option(
+            min=0, max=65535, help="Serve figures to Prometheus, and health to probes, on this port; 0 picks one."
+        ),
     ] = None
+    signals_address: SignalsAddress = "127.0.0.1"
+    log_format: LogFormatOption = "text"
     follow: Annotated[
         str | None,
         typer.Option(metavar="ID", help="The camera follows this vehicle or target, as a0-07."),

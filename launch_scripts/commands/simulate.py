@@ -98,7 +98,7 @@ def _line(verdict: Verdict, done: int, many: int) -> str:
         f"longest wait {verdict.longest_wait_s:.1f} s, routed after {routed}, {verdict.captures} captures, "
         f"{verdict.wall_s:.0f} s"
     )
-    return "\n".join([text, *(f"    {sentence}" for sentence in verdict.broken)])
+    return "\n".join([text, *(f"    {law}" for law in verdict.broken)])
 
 
 def _total(verdicts: Iterable[Verdict], wall_s: float) -> dict[str, Any]:
@@ -110,7 +110,12 @@ def _total(verdicts: Iterable[Verdict], wall_s: float) -> dict[str, Any]:
     return {
         "seeds": len(verdicts),
         "failing": [
-            {"world": each.world, "seed": each.seed, "broken": each.broken, "replay": each.replay}
+            {
+                "world": each.world,
+                "seed": each.seed,
+                "broken": [str(law) for law in each.broken],
+                "replay": each.replay,
+            }
             for each in verdicts
             if each.broken
         ],

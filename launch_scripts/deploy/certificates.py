@@ -20,6 +20,8 @@ from swarm.errors import ConfigError, StoreError
 from swarm.wire.fields import check_id
 
 CA = "ca"
+THIS_MACHINE = ("localhost", "127.0.0.1")
+"""Hosts in every router's certificate, for the processes beside it."""
 _CA_DAYS = 3650
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
@@ -136,6 +138,30 @@ def _read_authority(folder: Path) -> Authority:
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise StoreError(f"{folder / CA}.key is not the key of {folder / CA}.pem")
     return Authority(certificate, key)
+
+
+def hosts_of(path: Path) -> set[str]:
+    """The names and addresses in a certificate under which its bearer is reached. Raises StoreError where it cannot
+    be read."""
+    try:
+        names = _read(path).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return set()
+    addresses = map(str, names.get_values_for_type(x509.IPAddress))
+    return {*names.get_values_for_type(x509.DNSName), *addresses}
+
+
+def called_of(path: Path) -> str:
+    """The common name in a certificate. Raises StoreError where it cannot be read."""
+    (name,) = _read(path).subject.get_attributes_for_oid(NameOID.COMMON_NAME) or ("",)
+    return name if isinstance(name, str) else str(name.value)
+
+
+def _read(path: Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE))
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"{path} is no certificate in PEM: {error}") from error
 
 
 def check_signed(ca: Path, certificate: Path, key: Path) -> None:

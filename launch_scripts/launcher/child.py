@@ -11,14 +11,15 @@ import os
 import signal
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.log_file import log_to
+from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.process_table import NICENESS
 from swarm.errors import SwarmError
+from swarm.runtime.health import Board, Health
 from swarm.runtime.role import RoleSetup
 
 CRASHED = 70
@@ -36,9 +37,27 @@ class ExitReason:
     refused: bool
 
 
-def run_child(entry: str, setup: RoleSetup, log_path: Path, pipe: Connection) -> None:
+@dataclass(frozen=True, slots=True)
+class Reports:
+    """Where a process of the launcher tells what.
+
+    log_path     its log
+    log_format   of the log
+    health       memory of a `Board`, which the launcher reads
+    exit_reason  why it ended
+    """
+
+    log_path: Path
+    log_format: LogFormat
+    health: Any
+    exit_reason: Connection
+
+
+def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
     """Runs a role until it is told to stop. Ends the process with the role's exit code."""
-    _redirect(log_path)
+    _redirect(reports.log_path, reports.log_format, setup)
+    setup = replace(setup, health=Health(Board(reports.health)))
+    pipe = reports.exit_reason
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     _watch_launcher()
@@ -95,7 +114,7 @@ def _watch_launcher() -> None:
     threading.Thread(target=watch, name="launcher-watch", daemon=True).start()
 
 
-def _redirect(log_path: Path) -> None:
+def _redirect(log_path: Path, log_format: LogFormat, setup: RoleSetup) -> None:
     """Sends all output of this process, that of native libraries included, to its log file: once that can be
     opened, for a full disk must not keep a process from its start."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -105,7 +124,7 @@ def _redirect(log_path: Path) -> None:
     os.dup2(nowhere, 2)
     os.close(nowhere)
     faulthandler.enable()
-    log_to(log_path, takes_output=True)
+    log_to(log_path, log_format, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
 
 
 def _leave(code: int) -> None:

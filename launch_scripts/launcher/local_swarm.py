@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import logging
 import multiprocessing
 import os
@@ -15,11 +16,15 @@ from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from typing import Any
 
-from launch_scripts.launcher.child import ExitReason, run_child
+from launch_scripts.health.verdict import Process
+from launch_scripts.launcher.child import ExitReason, Reports, run_child
+from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.deadline import KILLED_BY
+from swarm.runtime.health import BOARD_BYTES, Board
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -80,10 +85,21 @@ class Running:
     backoff: Backoff = field(default_factory=Backoff)
     dismissed_s: float | None = None
     """Since when it has been asked to end for good; None if it has not."""
+    health: Any = None
+    """Memory of a `Board` that its lives write and the launcher reads; None before the first."""
 
     @property
     def alive(self) -> bool:
         return self.process is not None
+
+    def seen(self) -> Process:
+        """How it is. Called by any thread."""
+        if self.process is None or self.health is None:
+            again = self.due_s is not None
+            return Process(
+                self.spec.name, None, "it has ended and is started again" if again else "it does not run"
+            )
+        return Process(self.spec.name, Board(self.health).read())
 
 
 class LocalSwarm:
@@ -93,13 +109,18 @@ class LocalSwarm:
     """
 
     def __init__(
-        self, specs: list[ProcessSpec], setup_of: Callable[[ProcessSpec], RoleSetup], log_dir: Path
+        self,
+        specs: list[ProcessSpec],
+        setup_of: Callable[[ProcessSpec], RoleSetup],
+        log_dir: Path,
+        log_format: LogFormat = "text",
     ) -> None:
         self.running = [Running(spec) for spec in specs]
         self.cut_short: list[str] = []
         """Names of processes that were killed because the end was asked for twice."""
         self._setup_of = setup_of
         self._log_dir = log_dir
+        self._log_format = log_format
         self._context = multiprocessing.get_context("forkserver")
 
     @property
@@ -113,6 +134,10 @@ class LocalSwarm:
             alive, every = counts.get(running.spec.role, (0, 0))
             counts[running.spec.role] = (alive + running.alive, every + 1)
         return counts
+
+    def seen(self) -> list[Process]:
+        """How each process is. Called by any thread: it waits for nothing."""
+        return [running.seen() for running in list(self.running)]
 
     def start(self, role: str | None = None) -> None:
         """Starts the processes of a role, or all that have not been started."""
@@ -208,14 +233,13 @@ class LocalSwarm:
         listen, tell = self._context.Pipe(duplex=False)
         spec = running.spec
         setup = self._setup_of(spec)
+        if running.health is None:
+            running.health = self._context.RawArray(ctypes.c_ubyte, BOARD_BYTES)
+        running.health[:] = bytes(BOARD_BYTES)  # of the life before
+        reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
         process = self._context.Process(
             target=run_child,
-            args=(
-                spec.entry,
-                replace(setup, restarts=restarts, anew=setup.anew and not restarts),
-                self._log_dir / f"{spec.name}.log",
-                tell,
-            ),
+            args=(spec.entry, replace(setup, restarts=restarts, anew=setup.anew and not restarts), reports),
             name=spec.name,
             daemon=True,  # should the launcher itself fail, multiprocessing ends them
         )

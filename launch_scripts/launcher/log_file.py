@@ -1,13 +1,18 @@
-"""Logs of bounded size, with dates, which a full disk cannot harm."""
+"""Logs of bounded size, with dates, as text or JSON, which a full disk cannot harm."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
-from datetime import datetime
+from datetime import UTC, datetime
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
+from typing import Literal, NamedTuple
+
+LogFormat = Literal["text", "json"]
+LOG_FORMATS: tuple[LogFormat, ...] = ("text", "json")
 
 MAX_BYTES = 16 << 20
 """A log that is longer is renamed to NAME.1, in the place of the one before, and begun anew."""
@@ -21,6 +26,39 @@ class _Format(logging.Formatter):
 
 
 _FORMAT = _Format("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
+
+
+class Speaker(NamedTuple):
+    """Who writes a log."""
+
+    role: str
+    id: str
+    run: str
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line, in ASCII: no text of a file or of the network begins a line of its own, or is obeyed
+    by a terminal. Fields are `time` (RFC 3339, UTC), `level`, `role`, `id`, `run`, `logger`, `message`, and
+    `exception`, a traceback, where there is one."""
+
+    def __init__(self, speaker: Speaker | None = None) -> None:
+        super().__init__()
+        self._speaker = {} if speaker is None else speaker._asdict()
+
+    def format(self, record: logging.LogRecord) -> str:
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        told = {
+            "time": time.replace("+00:00", "Z"),
+            "level": record.levelname.lower(),
+            **self._speaker,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            told["exception"] = self.formatException(record.exc_info)
+        if record.stack_info:
+            told["stack"] = record.stack_info
+        return json.dumps(told)
 
 
 class LogFile(RotatingFileHandler):
@@ -58,8 +96,10 @@ class LogFile(RotatingFileHandler):
             super().handleError(record)
 
 
-def log_to(path: Path | None, *, takes_output: bool = False) -> None:
-    """Log to a file, or to standard error if there is none."""
+def log_to(
+    path: Path | None, format: LogFormat = "text", speaker: Speaker | None = None, *, takes_output: bool = False
+) -> None:
+    """Log to a file, or to standard error if there is none. `speaker`: who logs, where that is known."""
     handler = logging.StreamHandler(sys.stderr) if path is None else LogFile(path, takes_output=takes_output)
-    handler.setFormatter(_FORMAT)
+    handler.setFormatter(JsonLines(speaker) if format == "json" else _FORMAT)
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

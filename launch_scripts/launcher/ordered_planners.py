@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 import msgspec
 
 from launch_scripts.launcher.local_swarm import LocalSwarm
-from launch_scripts.process_table import planner_spec
+from launch_scripts.process_table import ProcessSpec, planner_spec
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
 from swarm.order_book import OrderBook
@@ -23,17 +23,25 @@ LEAVES_TO_OTHERS_S = 3.0
 class OrderedPlanners:
     """Brings the planners on this machine to what is ordered.
 
-    ranks  which of each target's planners to start here
+    ranks  which of an added target's planners to start here
+    own    processes that this launcher started: of the scenario's own targets it sees to their planners only
     whole  whether this launcher started the whole swarm: then no other will start them
     say    tells the user
     """
 
     def __init__(
-        self, scenario: Scenario, swarm: LocalSwarm, ranks: Collection[int], whole: bool, say: Callable[[str], None]
+        self,
+        scenario: Scenario,
+        swarm: LocalSwarm,
+        ranks: Collection[int],
+        own: Collection[ProcessSpec],
+        whole: bool,
+        say: Callable[[str], None],
     ) -> None:
         self._scenario = scenario
         self._swarm = swarm
         self._ranks = ranks
+        self._own = [spec.id for spec in own if spec.role == "planner"]
         self._wait_s = 0.0 if whole else LEAVES_TO_OTHERS_S
         self._say = say
         self._missing_s: dict[str, float] = {}
@@ -58,7 +66,7 @@ class OrderedPlanners:
             elif now_s - self._missing_s.setdefault(id, now_s) >= self._wait_s:
                 self._start(id)
         # One that the scenario has, and that was removed, is wanted again when its removal is taken back.
-        for id in sorted({ranked_id(id, rank) for id in targets if id in usual for rank in self._ranks} - here):
+        for id in sorted({id for id in self._own if job_of(id) in targets} - here):
             if any(order.subject == "target" and order.name == job_of(id) for order in book):
                 self._start(id)
 

@@ -23,6 +23,7 @@ from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ class RouterService:
         info = RunInfo(
             run_id=NO_RUN, role=peer.role, id=peer.id, incarnation=peer.incarnation, scenario="", terrain="",
             rows=0, cols=0, resolution_m=0.0, started_ns=peer.incarnation, restarts=restarts,
+            wire_version=WIRE_VERSION,
         )  # fmt: skip
         self._member = Member(info, bus, post)
         self._reopened = reopened
@@ -56,6 +58,9 @@ class RouterService:
     @property
     def counters(self) -> Counters:
         return self._member.counters
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()
@@ -117,7 +122,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
     try:
         peer = Peer(setup.role, setup.id, setup.incarnation)
         service = RouterService(peer, admission.bus, inbox.post, admission.reopened, restarts=setup.restarts)
-        process = Process(service, inbox, clock, tick_hz=2.0)
+        process = Process(service, inbox, clock, tick_hz=2.0, health=setup.health)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

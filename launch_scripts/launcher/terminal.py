@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 _PLAIN_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.25
 
+_LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
 REPORTED = {
     "seconds": "seconds",
     "startup_s": "start-up, s",
@@ -52,18 +53,25 @@ REPORTED = {
 
 
 class Terminal:
-    """Shows the progress of a run. With `as_json`, standard output stays free for the report."""
+    """Shows the progress of a run. With `as_json`, standard output stays free for the report.
 
-    def __init__(self, as_json: bool, plain: bool) -> None:
+    lines  format of the lines that programs read instead of people; None: people read them
+    """
+
+    def __init__(self, as_json: bool, plain: bool, lines: logging.Formatter | None = None) -> None:
         make_output_last()
         self._console = Console(stderr=as_json, highlight=False)
-        self._table = self._console.is_terminal and not plain
+        self._lines = lines
+        self._table = self._console.is_terminal and not plain and lines is None
         self._live: Live | None = None
         self._due_s = 0.0
 
     def say(self, text: str, style: str | None = None) -> None:
         """Prints one line, above the table if there is one, and logs it."""
-        log.info("%s", text)
+        level = _LEVELS.get(style or "", logging.INFO)
+        log.log(level, "%s", text)
+        if self._lines is not None:
+            text, style = self._lines.format(logging.LogRecord(__name__, level, "", 0, "%s", (text,), None)), None
         self.print(Text(text, style=style or ""))
 
     def print(self, what: Any) -> None:
@@ -103,7 +111,9 @@ class Terminal:
             self._live.update(table, refresh=True)
 
     def report(self, numbers: Mapping[str, Any]) -> None:
-        """Prints the numbers of a finished run."""
+        """Prints the numbers of a finished run, for people: programs find them in its report."""
+        if self._lines is not None:
+            return
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
             if name in REPORTED and value != {}:  # of what nobody has learned there is no line

@@ -9,13 +9,13 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from launch_scripts.check.ground import check_places
 from launch_scripts.check.settings import check_start
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
-from launch_scripts.launcher.log_file import log_to
+from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
+from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.options import as_process, make_run_dir
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
@@ -43,15 +43,13 @@ from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
+from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
 from swarm.order_book import OrderBook
 from swarm.plugins.find import check_plugins
 from swarm.ranks import job_of
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
-
-if TYPE_CHECKING:
-    from launch_scripts.metrics.of_launcher import LauncherMetrics
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +68,7 @@ class _RefusedError(SwarmError):
 
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
-    check_start(options.scenario, joins=options.joins)
+    check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
     for spec in table_of(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
@@ -78,7 +76,7 @@ def run_swarm(options: UpOptions) -> int:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
-    log_to(run_dir / "launcher.log")
+    log_to(run_dir / "launcher.log", options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:
@@ -107,10 +105,11 @@ class _Run:
         self._started_ns = started_ns or time.time_ns()
         self._book = OrderBook()
         """What operators have ordered, once somebody watches the swarm."""
-        self._terminal = Terminal(options.as_json, options.plain)
+        lines = JsonLines(Speaker(LAUNCHER, "0", run_id)) if options.log_format == "json" else None
+        self._terminal = Terminal(options.as_json, options.plain, lines)
         self._stop_asked = StopAsked()
         self._preparing = "preparing the terrain"
-        self._swarm = LocalSwarm(table_of(options), self._setup_of, run_dir)
+        self._swarm = LocalSwarm(table_of(options), self._setup_of, run_dir, options.log_format)
         self._disk = DiskWatch(run_dir)
         self.begun = False
         """Whether all that can be refused before a process starts has been accepted."""
@@ -119,16 +118,9 @@ class _Run:
         self._web_port = 0
         """When the swarm was whole, on the run's clock."""
         self._recorder: Recorder | None = None
-        self._metrics = self._open_metrics()
-
-    def _open_metrics(self) -> LauncherMetrics | None:
-        if self._options.metrics_port is None:
-            return None
-        from launch_scripts.metrics.of_launcher import LauncherMetrics  # takes time to import
-
-        metrics = LauncherMetrics(self._options.metrics_port, self._run_id, self._scenario.name)
-        self._terminal.say(f"metrics at {metrics.url}")
-        return metrics
+        self._signals = MachineSignals(options, run_id, self._swarm.seen)
+        if self._signals.url:
+            self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
@@ -139,8 +131,7 @@ class _Run:
             return self._run()
         finally:
             self._warm_up.close()
-            if self._metrics is not None:
-                self._metrics.close()
+            self._signals.close()
 
     def _run(self) -> int:
         with self._terminal.busy(lambda: self._preparing):
@@ -197,7 +188,7 @@ class _Run:
 
     def _prepared(self) -> tuple[Terrain, Floats]:
         """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
-        if self._options.joins and missing_files(self._scenario):
+        if self._options.asks_for_ground and missing_files(self._scenario):
             found = [info for info in find_members(self._scenario) if info.run_id]
             fetch_if_missing(
                 self._scenario, self._run_dir, found, roles=self._options.roles, progress=self._prepares
@@ -283,10 +274,10 @@ class _Run:
 
     def _ordered_planners(self) -> OrderedPlanners:
         options = self._options
-        standbys = range(self._scenario.standbys.planner + 1) if "planner" in options.roles else ()
-        ranks = [rank for rank in standbys if options.rank in (None, rank)]
-        whole = not options.joins and set(ROLES[1:]) <= set(options.roles)
-        return OrderedPlanners(self._scenario, self._swarm, ranks, whole, self._terminal.say)
+        whole = not options.joins and options.table is None and set(ROLES[1:]) <= set(options.roles)
+        return OrderedPlanners(
+            self._scenario, self._swarm, options.ranks_of_added, table_of(options), whole, self._terminal.say
+        )
 
     def _is_up(self, watcher: Watcher) -> bool:
         if self._missing(watcher):
@@ -304,8 +295,7 @@ class _Run:
         return [spec.name for spec in specs if not watcher.recorder.observed.was_up(spec.role, spec.id)]
 
     def _tell(self, watcher: Watcher) -> None:
-        if self._metrics is not None:
-            self._metrics.answer(watcher.recorder.observed, self._started_ns)
+        self._signals.turned(watcher.recorder.observed, self._started_ns, self._missing(watcher))
         if (sentence := self._disk.look(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         if (compiled := self._warm_up.news()) is not None:
@@ -325,9 +315,10 @@ class _Run:
         if self._up_at_s is None:
             up = facts.fact("processes_well").shown(state)
             return f"{self._scenario.name}: starting, {up} processes are up, {state.elapsed_s:.0f} s"
-        end_s = self._up_at_s + self._scenario.seconds
+        seconds = self._scenario.seconds
+        of = "" if seconds >= UNTIL_STOPPED_S else f" of {self._up_at_s + seconds:.0f}"
         live = f", live view {page_of(self._web_port)}" if self._web_port else ""
-        return f"{self._scenario.name}: {state.elapsed_s:.0f} of {end_s:.0f} s{live}"
+        return f"{self._scenario.name}: {state.elapsed_s:.0f}{of} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -341,6 +332,7 @@ class _Run:
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
+        self._signals.ends()
         self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")

@@ -28,8 +28,8 @@ from launch_scripts.mavlink.messages import (
     Way,
     Withdraw,
 )
-from launch_scripts.mavlink.waypoints import Point
 from swarm.client import ConfigError, Frame
+from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
 
 BEAT_NS = NS_PER_S
@@ -214,7 +214,8 @@ class Adapter:
         elif self._position is not None:
             # Where to it may have gone nobody knows.
             actions.append(Report(*self._place, None, self._speed(self._position)))
-        self._reported = None
+        # It is back with a place of its own: another vehicle may be the next to speak, and be somewhere else.
+        self._position = self._reported = None
         return actions
 
     def _why_gone(self, now_ns: int) -> str:

@@ -22,9 +22,9 @@ from launch_scripts.mavlink.messages import (
 )
 from launch_scripts.mavlink.missions import Missions
 from launch_scripts.mavlink.setpoints import Setpoints
-from launch_scripts.mavlink.waypoints import Point
 from launch_scripts.mavlink.wheel import Wheel
 from swarm.client import Frame
+from swarm.client.frame import Point
 
 _OURS = {ARM_DISARM: "be armed", DO_SET_MODE: "change its mode", MISSION_START: "start", NAV_TAKEOFF: "take off"}
 """Commands whose refusal a person wants to hear of."""

@@ -19,8 +19,9 @@ from launch_scripts.mavlink.messages import (
     Way,
 )
 from launch_scripts.mavlink.upload import State, Upload
-from launch_scripts.mavlink.waypoints import MOST_POINTS, Point, is_end_of, rest
+from launch_scripts.mavlink.waypoints import MOST_POINTS, is_end_of, rest
 from swarm.client import Frame
+from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
 
 _NEXT_NS = 3 * NS_PER_S

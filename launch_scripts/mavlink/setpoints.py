@@ -7,8 +7,9 @@ import math
 from launch_scripts.mavlink.autopilots import Kind
 from launch_scripts.mavlink.height import Height
 from launch_scripts.mavlink.messages import Position, Setpoint, Way
-from launch_scripts.mavlink.waypoints import Point, rest
+from launch_scripts.mavlink.waypoints import rest
 from swarm.client import Frame
+from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
 
 _STREAM_NS = NS_PER_S // 10

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
-Point = tuple[float, float]
+from swarm.client.frame import Point
+from swarm.client.route import along, between
+
 MOST_POINTS = 60
 """Of one mission: what lies behind is uploaded when half of it is driven. Uploads take a round trip an item."""
 _STRAIGHT = 1e-9
@@ -29,22 +30,10 @@ def rest(points: Sequence[Point], place: Point, lead_m: float) -> list[Point]:
     the turns behind that. Its end at least, unless the line is empty."""
     if len(points) < 2:
         return list(points)
-    nearest, at, share = math.inf, 0, 0.0
-    for number, (a, b) in enumerate(pairwise(points)):
-        along = _share(a, b, place)
-        distance = math.dist(_between(a, b, along), place)
-        if distance < nearest:
-            nearest, at, share = distance, number, along
-    while True:
-        a, b = points[at], points[at + 1]
-        step_m = math.dist(a, b)
-        left_m = step_m * (1 - share)
-        if lead_m < left_m:
-            first = _between(a, b, share + lead_m / step_m)
-            return turns([first, *points[at + 1 :]])
-        if at + 2 == len(points):
-            return [b]
-        lead_m, at, share = lead_m - left_m, at + 1, 0.0
+    at, share = along(points, place, lead_m)
+    if at + 2 == len(points) and share == 1.0:
+        return [points[-1]]
+    return turns([between(points[at], points[at + 1], share), *points[at + 1 :]])
 
 
 def is_end_of(points: Sequence[Point], whole: Sequence[Point]) -> bool:
@@ -59,13 +48,3 @@ def _straight(a: Point, b: Point, c: Point) -> bool:
     ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1]
     long = math.hypot(ux, uy) * math.hypot(vx, vy)
     return abs(ux * vy - uy * vx) <= _STRAIGHT * long and ux * vx + uy * vy > 0
-
-
-def _share(a: Point, b: Point, place: Point) -> float:
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    long = dx * dx + dy * dy
-    return min(1.0, max(0.0, ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / long)) if long else 0.0
-
-
-def _between(a: Point, b: Point, share: float) -> Point:
-    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])

@@ -1,4 +1,4 @@
-"""The door: bytes of a link become checked messages of one vehicle, and messages become bytes.
+"""Bytes of a link become checked messages of one vehicle, and messages become bytes.
 
 Whatever comes is hostile until it has passed here. Other vehicles and ground stations on the link are not heard.
 """

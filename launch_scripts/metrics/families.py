@@ -88,6 +88,7 @@ HELP = {
     "strangers": "Processes of another run, or with another terrain, that were heard",
     "cpu_s": "CPU that the process has used",
     "rss_bytes": "Memory that the process has in use, with what it shares",
+    "ready": "1 while the process has all that its role needs",
     "ended": "1 in the last figures of a process that ends as asked",
     "trackers_lost": "Times that a target's tracker fell silent",
 }

@@ -59,7 +59,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             zones=scenario_areas(setup.scenario, terrain.grid),
             layers=layers,
         )
-        process = Process(service, inbox, MonotonicClock(), FRAME_HZ)
+        process = Process(service, inbox, MonotonicClock(), FRAME_HZ, health=setup.health)
         sinks.tell_page(lambda: page_facts(setup, service, path))
         process.stop_on_signals()
         if stop_when is not None:

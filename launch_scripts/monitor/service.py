@@ -128,6 +128,10 @@ class MonitorService:
         """Processes which said in their last figures that they end as they were asked to."""
         self._last_sample_s = -1.0
         self._figures_due_ns = 0
+        self._member.needs("the shared map", lambda: self._sync.joined)
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns

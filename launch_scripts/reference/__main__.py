@@ -2,6 +2,8 @@
 
 python -m launch_scripts.reference            writes them
 python -m launch_scripts.reference --check    exit code 1 if a file is not what the code says
+
+Both refuse a change of the wire that builds before this one could not read.
 """
 
 from __future__ import annotations
@@ -11,10 +13,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from launch_scripts.reference import cli_page, cover_page, ros2_page, scenario_page, ways_page, wire_page
+from launch_scripts.reference import cli_page, cover_page, ros2_page, scenario_page, ways_page, wire_lock, wire_page
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
+    wire_lock.PATH: wire_lock.document,
     scenario_page.PATH: scenario_page.document,
     scenario_page.SCHEMA_PATH: scenario_page.schema,
     cli_page.PATH: cli_page.document,
@@ -36,7 +39,11 @@ def main() -> int:
         prog="python -m launch_scripts.reference", description="Write the generated pages of the reference."
     )
     parser.add_argument("--check", action="store_true", help="only tell whether the files are current")
-    if parser.parse_args().check:
+    check = parser.parse_args().check
+    if faults := wire_lock.faults():
+        print("\n".join(faults), file=sys.stderr)
+        return 1
+    if check:
         for path in stale():
             print(f"{path} is not current: run `python -m launch_scripts.reference`", file=sys.stderr)
         return 1 if stale() else 0

@@ -24,11 +24,11 @@ MIX = "mix"
 """Each seed in the world of `MIXED` that is its turn."""
 
 
-def parse_seeds(text: str) -> range:
-    """`A:B` is the seeds from A to B - 1. Raises ConfigError."""
+def parse_seeds(text: str, where: str = "--seeds") -> range:
+    """`A:B` is the seeds from A to B - 1. Raises ConfigError, which begins with `where`."""
     match = re.fullmatch(r"([0-9]{1,15}):([0-9]{1,15})", text)
     if match is None or int(match[1]) >= int(match[2]):
-        raise ConfigError(f"--seeds: {text!r} is not A:B with A < B, such as 0:100 for the seeds 0 to 99")
+        raise ConfigError(f"{where}: {text!r} is not A:B with A < B, such as 0:100 for the seeds 0 to 99")
     return range(int(match[1]), int(match[2]))
 
 

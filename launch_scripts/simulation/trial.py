@@ -34,10 +34,26 @@ LAST_WORDS_S = 6.0
 _SHOWN = 3
 
 
+class BrokenLaw(msgspec.Struct, frozen=True):
+    """A law that did not hold.
+
+    law       its name, of a few words
+    sentence  what happened
+    at_s      when; None: it is only seen at the end
+    """
+
+    law: str
+    sentence: str
+    at_s: float | None = None
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """What became of one seed.
 
-    broken          a sentence per law that did not hold
+    broken          each law that did not hold
     longest_wait_s  see `laws.Waits`
     entered         cells that vehicles entered; near_rovers: within two cells of one; met_rovers: onto one, which
                     had not been reported in time
@@ -48,7 +64,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     world: str
     seed: int
     seconds: float
-    broken: list[str]
+    broken: list[BrokenLaw]
     longest_wait_s: float = 0.0
     routed_after_s: float | None = None
     captures: int = 0
@@ -84,6 +100,13 @@ def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | N
 
     given  the scenario of that name, where it is none of `WORLDS`
     """
+    return try_simulation(name, seed, seconds, given)[0]
+
+
+def try_simulation(
+    name: str, seed: int, seconds: float = SECONDS, given: Scenario | None = None
+) -> tuple[Verdict, dict[str, Any]]:
+    """As `try_seed`, with the figures of the run's report."""
     scenario, terrain = world(name, seed) if given is None else _seeded(given, seed)
     plan = random_plan(seed, nodes_of(scenario), seconds, few_of_layer(scenario))
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
@@ -93,17 +116,16 @@ def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | N
         with collected_rarely():
             broken = trial.run(seconds)
     except Exception as error:
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"
-        broken = [f"a service raised at {simulation.now_s:.1f} s: {text}"]
-    return Verdict(
+        broken = [raised(error, simulation.now_s)]
+    report = simulation.report(seconds)
+    verdict = Verdict(
         world=name,
         seed=seed,
         seconds=seconds,
         broken=broken,
         longest_wait_s=trial.waits.longest_s,
         routed_after_s=trial.routed.after_s,
-        captures=simulation.report(seconds)["captures"] or 0,
+        captures=report["captures"] or 0,
         entered=trial.bodies.entered,
         near_rovers=trial.bodies.near,
         met_rovers=len(trial.bodies.met),
@@ -111,6 +133,14 @@ def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | N
         faults=_count(plan),
         wall_s=time.perf_counter() - began_s,
     )
+    return verdict, report
+
+
+def raised(error: Exception, now_s: float) -> BrokenLaw:
+    """That a service ended by an error."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"
+    return BrokenLaw("a service raised", f"a service raised at {now_s:.1f} s: {text}", now_s)
 
 
 class Trial:
@@ -121,10 +151,10 @@ class Trial:
         self.bodies = BodyLaw(simulation)
         self.laws, self.waits, self.routed = Laws(simulation), Waits(simulation), Routed(simulation)
 
-    def run(self, seconds: float) -> list[str]:
-        """Returns a sentence per law that broke. At the end the agents die, so that nothing new is said."""
+    def run(self, seconds: float) -> list[BrokenLaw]:
+        """Returns the laws that broke. At the end the agents die, so that nothing new is said."""
         simulation, laws = self.simulation, self.laws
-        broken: list[str] = []
+        broken: list[BrokenLaw] = []
         simulation.run_until(seconds - SETTLED_S)
         said = laws.said()
         simulation.run_until(seconds)
@@ -132,49 +162,55 @@ class Trial:
             for name, held in laws.held().items():
                 if lacks := missing(held, said):
                     first = f"{len(lacks)} sets that were said {SETTLED_S:g} s ago, such as {lacks[0]}"
-                    broken.append(f"{name} lacks {first}")
+                    broken.append(BrokenLaw("marks reach everybody", f"{name} lacks {first}"))
         for node in simulation.nodes.values():
             if node.spec.role == "agent":
                 node.crash()
         simulation.run_until(seconds + LAST_WORDS_S)
         for when_s, one, other, cell in laws.collisions[:_SHOWN]:
-            broken.append(f"collision at {when_s:.2f} s: {one} and {other} on cell {cell}")
+            text = f"collision at {when_s:.2f} s: {one} and {other} on cell {cell}"
+            broken.append(BrokenLaw("no collision", text, when_s))
         for when_s, vehicle, cell in laws.lethal[:_SHOWN]:
-            broken.append(f"lethal entry at {when_s:.2f} s: {vehicle} on cell {cell}")
+            text = f"lethal entry at {when_s:.2f} s: {vehicle} on cell {cell}"
+            broken.append(BrokenLaw("no lethal entry", text, when_s))
         for when_s, vehicle, body, cell in self.bodies.broken[:_SHOWN]:
-            broken.append(f"driven into body {body} at {when_s:.2f} s: {vehicle} on cell {cell}")
+            text = f"driven into body {body} at {when_s:.2f} s: {vehicle} on cell {cell}"
+            broken.append(BrokenLaw("bodies are avoided", text, when_s))
         if lost := missing(laws.stored(), laws.acknowledged):
-            broken.append(f"{len(lost)} acknowledged sets are lost, such as {lost[0]}")
+            text = f"{len(lost)} acknowledged sets are lost, such as {lost[0]}"
+            broken.append(BrokenLaw("acknowledged marks stay", text))
         return broken + self._replicas() + self._waited() + self._routes()
 
-    def _replicas(self) -> list[str]:
+    def _replicas(self) -> list[BrokenLaw]:
         prints: dict[object, list[str]] = {}
         for node in self.simulation.nodes.values():
             replica = replica_of(node)
             if node.service is not None and replica is not None:
                 prints.setdefault(replica.held.fingerprint(), []).append(node.name)
         apart = " | ".join(", ".join(names) for names in prints.values())
-        return [f"replicas differ: {apart}"] if len(prints) > 1 else []
+        return [BrokenLaw("replicas are equal", f"replicas differ: {apart}")] if len(prints) > 1 else []
 
-    def _waited(self) -> list[str]:
+    def _waited(self) -> list[BrokenLaw]:
         waits = self.waits
         if waits.longest is None or waits.longest_s <= LONGEST_WAIT_S:
             return []
         when_s, vehicle, cell = waits.longest
         text = f"{vehicle} waits {waits.longest_s:.1f} s on cell {cell} without a reason, until {when_s:.1f} s"
-        return [text]
+        return [BrokenLaw("no wait without a reason", text, when_s)]
 
-    def _routes(self) -> list[str]:
+    def _routes(self) -> list[BrokenLaw]:
         routed = self.routed
         if routed.whole_s is None:
-            return ["a process did not start again"]
+            return [BrokenLaw("processes start again", "a process did not start again")]
         late = routed.missing()
         if late:
-            return [f"{len(late)} vehicles have no route any more, such as {', '.join(late[:_SHOWN])}"]
+            text = f"{len(late)} vehicles have no route any more, such as {', '.join(late[:_SHOWN])}"
+            return [BrokenLaw("vehicles are routed again", text)]
         # A planner that has just begun listens for a while before it searches for a target that nobody tracks.
         listens_s = LISTEN_NS / NS_PER_S if self.simulation.scenario.untracked else 0.0
         if routed.after_s is not None and routed.after_s > ROUTED_WITHIN_S + listens_s:
-            return [f"the last vehicle has a route {routed.after_s:.1f} s after the last fault"]
+            text = f"the last vehicle has a route {routed.after_s:.1f} s after the last fault"
+            return [BrokenLaw("vehicles are routed again", text, routed.after_s)]
         return []
 
 

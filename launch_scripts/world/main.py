@@ -28,7 +28,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         recorded(setup, terrain.digest) as boundary,
     ):
         service = TargetsService(setup, terrain, truth, boundary.bus(bus), inbox.post)
-        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ)
+        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ, health=setup.health)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

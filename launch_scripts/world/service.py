@@ -60,6 +60,8 @@ class TargetsService:
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
         self._telling = Telling(terrain.grid.resolution_m)
         self._planners = Roster()
+        self._member.needs("the orders of this run", lambda: self._obedience.known)
+        self._member.needs("places of its targets", lambda: self._world.ready)
         self.counters = self._member.counters
         for name in ("captures", "collisions", "driven_into", "hit_by_bodies", "lethal_entries", "poses"):
             self.counters.count(name, 0)
@@ -71,6 +73,9 @@ class TargetsService:
     @property
     def rovers(self) -> Rovers:
         return self._world.rovers
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()

@@ -43,7 +43,7 @@ def run(
         inbox = Inbox()
         kept = boundary.outside(store, KEEPER_STORE)
         service = KeeperService(setup, terrain, boundary.bus(bus), inbox.post, kept)
-        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ)
+        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ, health=setup.health)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

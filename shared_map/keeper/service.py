@@ -90,9 +90,14 @@ class KeeperService:
         self._sightings_due_ns = 0
         self._noted_ns: int | None = None
         self._named: list[str] = []
+        self._member.needs("the shared map", lambda: self._sync.joined)
+        self._member.needs("a store that can be written", lambda: self._noted_ns is None)
         store.bind(terrain.digest, terrain.grid, list(self._numbers))
         for each in self.replica.merge(list(store.load()), measured=False).sets:
             self._keeper.restored(each)
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()

@@ -156,6 +156,12 @@ class Climb:
         return way, int(np.float32(min(max(at, -ENTRIES), ENTRIES) + ENTRIES) + _ROUND)
 
 
+def may_be_pulled(climb: Climb | None) -> bool:
+    """Whether routes may be pulled straight: not where uphill is not downhill on the ground, as a climb has a price
+    for each step there, and a limit."""
+    return climb is None or climb.wind is not None
+
+
 def climb_of(grid: GridSpec, elevation_m: Floats, cost: CostConfig) -> Climb | None:
     """The climb of a terrain; None if cost does not depend on direction."""
     if not cost.directional:

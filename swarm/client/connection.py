@@ -21,9 +21,11 @@ from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
 from swarm.wire.fields import check_id
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.targets import POSE_LEASE_S
+from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -283,7 +285,7 @@ def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo,
 
     answers  with the time at which each came, by our clock
 
-    Raises RunMismatchError if two runs have as many processes.
+    Raises RunMismatchError if two runs have as many processes, or the run's builds are no neighbours of this one.
     """
     with_grid = [(info, came_ns) for info, came_ns in answers if info.run_id and info.rows and info.cols]
     if not with_grid:
@@ -293,6 +295,12 @@ def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo,
         runs = " and ".join(sorted({run[0], others[0][0][0]}))
         raise RunMismatchError(f"two runs, or two descriptions of one, {runs}, are in namespace {where}: end one")
     of_run = [(info, came_ns) for info, came_ns in with_grid if _grid_of(info) == run]
+    [(wire, _)] = Counter(info.wire_version for info, _ in of_run).most_common(1)
+    if not are_neighbours(wire, WIRE_VERSION):
+        raise RunMismatchError(
+            f"the run in namespace {where} speaks wire version {wire}, this program {WIRE_VERSION}: only "
+            "neighbouring versions understand each other, so install the run's"
+        )
     ahead_ns = sorted(info.now_ns - came_ns for info, came_ns in of_run if info.now_ns)
     return of_run[0][0], ahead_ns[len(ahead_ns) // 2] if ahead_ns else 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -116,29 +117,36 @@ class Route:
             return x_m, y_m, 0.0
         if len(points) == 1:
             return *points[0], 0.0
-        place, (at, share) = (x_m, y_m), (0, 0.0)
-        nearest = math.inf
-        for number, (a, b) in enumerate(pairwise(points)):
-            along = _share(a, b, place)
-            distance = math.dist(_between(a, b, along), place)
-            if distance < nearest:
-                nearest, at, share = distance, number, along
-        while True:
-            a, b = points[at], points[at + 1]
-            step_m = math.dist(a, b)
-            left_m = step_m * (1 - share)
-            if distance_m < left_m or at + 2 == len(points):
-                share = min(1.0, share + distance_m / step_m)
-                return *_between(a, b, share), math.atan2(b[0] - a[0], b[1] - a[1])
-            distance_m, at, share = distance_m - left_m, at + 1, 0.0
+        at, share = along(points, (x_m, y_m), distance_m)
+        a, b = points[at], points[at + 1]
+        return *between(a, b, share), math.atan2(b[0] - a[0], b[1] - a[1])
+
+
+def along(points: Sequence[Point], place: Point, distance_m: float) -> tuple[int, float]:
+    """Where one is on a line of two points or more after driving `distance_m` from the point of it that is nearest
+    to a place: the number of the step, and how far along it, 0 ... 1. It is 1 at the end of the line."""
+    nearest, at, share = math.inf, 0, 0.0
+    for number, (a, b) in enumerate(pairwise(points)):
+        there = _share(a, b, place)
+        distance = math.dist(between(a, b, there), place)
+        if distance < nearest:
+            nearest, at, share = distance, number, there
+    while True:
+        step_m = math.dist(points[at], points[at + 1])
+        left_m = step_m * (1 - share)
+        if distance_m < left_m:
+            return at, share + distance_m / step_m
+        if at + 2 == len(points):
+            return at, 1.0
+        distance_m, at, share = distance_m - left_m, at + 1, 0.0
 
 
 def _share(a: Point, b: Point, place: Point) -> float:
     """How far along a step, 0 ... 1, the point is that is nearest to a place."""
     dx, dy = b[0] - a[0], b[1] - a[1]
-    along = ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / (dx * dx + dy * dy)
-    return min(1.0, max(0.0, along))
+    long = dx * dx + dy * dy
+    return min(1.0, max(0.0, ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / long)) if long else 0.0
 
 
-def _between(a: Point, b: Point, share: float) -> Point:
+def between(a: Point, b: Point, share: float) -> Point:
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])

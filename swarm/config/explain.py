@@ -32,12 +32,13 @@ _MEANT = dict.fromkeys(
 )
 
 
-def explain(reason: str, raw: dict[str, Any], root: type) -> str:
+def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario") -> str:
     """One sentence from msgspec's error message.
 
     reason  the message: "Expected `int`, got `str` - at `$.targets[0].count`"
     raw     what was read from the file
     root    the type that it was to become
+    whole   what the file is called
     """
     reason, path = located(reason)
     hint: Any = root
@@ -61,8 +62,8 @@ def explain(reason: str, raw: dict[str, Any], root: type) -> str:
     if missing := re.fullmatch(r"Object missing required field `(.*)`", reason):
         section = bare(hint)
         wanted = expected(_field_type(section, missing[1])) if hasattr(section, "__struct_fields__") else "a value"
-        return f"{name or 'scenario'}: missing required field `{missing[1]}`, {wanted}"
-    return _wrong(name or "scenario", value, hint)
+        return f"{name or whole}: missing required field `{missing[1]}`, {wanted}"
+    return _wrong(name or whole, value, hint)
 
 
 def _refused_item(values: dict[str, Any], hint: Any) -> tuple[str, Any]:

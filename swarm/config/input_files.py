@@ -28,6 +28,7 @@ class FileKind(Enum):
     """What a file is to us: its name in sentences, how many bytes are read at most, the error that refuses it."""
 
     SCENARIO = ("scenario", 1 << 19, ConfigError)
+    HOSTS = ("hosts", 1 << 19, ConfigError)
     CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
     SLOPE_TABLE = ("slope table", 1 << 18, ConfigError)
     LABELS = ("labels", 4 << 20, TerrainError)

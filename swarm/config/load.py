@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import msgspec
 
 from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
+from swarm.config.dotted import with_settings
 from swarm.config.explain import choice, explain, located, nearest
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, parse_toml, read_text
@@ -30,21 +31,37 @@ def load_scenario(path: Path) -> Scenario:
     return parse_scenario(read_text(path, FileKind.SCENARIO), str(path), base=path.parent)
 
 
-def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
-    """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
-    scenario, faults = read_scenario(text, source, base, most=1)
+def parse_scenario(
+    text: str,
+    source: str = "scenario",
+    base: Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Scenario:
+    """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given.
+
+    settings  as of `read_scenario`
+    """
+    scenario, faults = read_scenario(text, source, base, most=1, settings=settings)
     if scenario is None or faults:
         raise ConfigError(faults[0])
     return scenario
 
 
 def read_scenario(
-    text: str, source: str, base: Path | None = None, most: int = 50
+    text: str,
+    source: str,
+    base: Path | None = None,
+    most: int = 50,
+    settings: Mapping[str, Any] | None = None,
 ) -> tuple[Scenario | None, list[str]]:
     """The scenario of a text, and what is wrong with it: at most so many sentences. None where not all keys could
-    be read."""
+    be read.
+
+    settings  dotted key -> value, instead of what the text says (`swarm.config.dotted`)
+    """
     try:
-        raw = with_class_costs(with_preset(parse_toml(text, source, ConfigError)))
+        raw = with_settings(parse_toml(text, source, ConfigError), settings or {}, source)
+        raw = with_class_costs(with_preset(raw))
     except ConfigError as error:
         return None, [str(error)]
     faults: list[str] = []

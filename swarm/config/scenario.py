@@ -35,6 +35,9 @@ from swarm.config.values import (
     plugin_name,
 )
 
+UNTIL_STOPPED_S = 1e9
+"""A run whose `seconds` are as many ends when it is stopped."""
+
 
 class TargetConfig(Section, frozen=True, kw_only=True):
     """A target, or `count` alike. Ids are `name` for one, `name0, name1, ...` for several.

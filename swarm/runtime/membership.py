@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import msgspec
 
@@ -12,11 +12,12 @@ from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
 from swarm.runtime.alarms import Alarms
-from swarm.runtime.stats import MESSAGES_PER_S, RESTARTS, Counters, carried
+from swarm.runtime.stats import MESSAGES_PER_S, READY, RESTARTS, Counters, carried
 from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
+from swarm.wire.versions import are_neighbours
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +37,9 @@ class Member:
 
     A process asks all others for their run when it starts, whenever a link comes back and whenever a router
     appears, as behind it there may be others. Two processes belong together when run id, terrain digest and the
-    classes of vehicles, in their order, are the same; each is then confirmed. An unconfirmed process exits, with
-    RunMismatchError, if every answer differs. A confirmed one never exits because of an answer; it reports the
-    sender as a stranger: counts it, and names it once.
+    classes of vehicles, in their order, are the same, and their builds speak neighbouring wire versions; each is
+    then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs. A confirmed one
+    never exits because of an answer; it reports the sender as a stranger: counts it, and names it once.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
@@ -62,6 +63,11 @@ class Member:
         self._now_ns = 0  # of the last tick
         # Whether another process of this run has ever answered: from then on no answer ends this one.
         self._confirmed = info.run_id == NO_RUN
+        self._linked = True
+        """Whether the router is reached; a bus opens with its link."""
+        self._asked_all = self._confirmed
+        """Whether a round of answers has ended, in which no other run was alone."""
+        self._needs: list[tuple[str, Callable[[], bool]]] = []
         # What the round of answers that is coming in has told: the first that differs, in words.
         self._differs: RunMismatchError | None = None
         # Processes which were named already, and sentences that the next tick publishes.
@@ -71,6 +77,15 @@ class Member:
     @property
     def peer(self) -> Peer:
         return Peer(self.info.role, self.info.id, self.info.incarnation)
+
+    def needs(self, what: str, met: Callable[[], bool]) -> None:
+        """Name something without which the process does not do its job, and how to see whether it is there."""
+        self._needs.append((what, met))
+
+    def lacks(self) -> list[str]:
+        """What the process needs and is not there: link, run, and what was named by `needs`. Changes nothing."""
+        own = [("its router", self._linked), ("word of its run", self._asked_all)]
+        return [what for what, met in own if not met] + [what for what, met in self._needs if not met()]
 
     def join(self) -> None:
         """Serve our run, then ask for those of others, in this order: of two processes that start at once at least
@@ -100,13 +115,18 @@ class Member:
                 differs, self._differs = self._differs, None
                 if differs is not None and not self._confirmed:
                     raise differs
+                self._asked_all = True
                 return True
             case Appeared(peer=Peer(role=role)) if role == ROUTER:
                 self._post(LinkChanged(up=True, beyond=True))
                 return True
             case Disappeared(peer=Peer(role=role)) if role == ROUTER:
                 return True
-            case LinkChanged(up=True):
+            case LinkChanged(up=False, beyond=False) if self.info.role != ROUTER:
+                self._linked = False
+                return False
+            case LinkChanged(up=True, beyond=beyond):
+                self._linked = self._linked or not beyond
                 self._ask()
                 return False  # replicas compare what they hold when a link comes back
         return False
@@ -128,6 +148,7 @@ class Member:
         """Publish the counters now: the last time when the service stops."""
         counts = {**self.counters.counts, **self._bus.counts}
         self._measure(counts, now_ns)
+        self.counters.gauge(READY, float(not self.lacks()))
         stats = Stats(
             role=self.info.role,
             id=self.info.id,
@@ -233,6 +254,11 @@ def check_same_run(mine: RunInfo, other: RunInfo) -> None:
         raise RunMismatchError(
             f"{mine.role} {mine.id} belongs to run {mine.run_id}, but {who} in the same namespace belongs to run "
             f"{other.run_id} (scenario {other.scenario}): choose another network.namespace or join that run"
+        )
+    if not are_neighbours(mine.wire_version, other.wire_version):
+        raise RunMismatchError(
+            f"{mine.role} {mine.id} speaks wire version {mine.wire_version}, but {who} speaks "
+            f"{other.wire_version}: only neighbouring versions share a run, so upgrade by one at a time"
         )
     if other.terrain != mine.terrain:
         raise RunMismatchError(

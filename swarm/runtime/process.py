@@ -11,7 +11,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Protocol
 from zlib import crc32
@@ -19,6 +19,7 @@ from zlib import crc32
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.garbage import collected_rarely
+from swarm.runtime.health import Health
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.own_usage import OwnUsage
 from swarm.runtime.stats import ENDED, Counters
@@ -39,6 +40,10 @@ class Service(Protocol):
 
     @property
     def counters(self) -> Counters: ...
+
+    def lacks(self) -> Sequence[str]:
+        """What its role needs and is not there, one short text each; empty if it is ready. Changes nothing."""
+        ...
 
     def start(self, now_ns: int) -> None:
         """Subscribe, serve, raise the token. Called once, before all others."""
@@ -118,14 +123,24 @@ class Process:
     tick_hz  ticks a second; those that come too late are dropped and counted (`ticks_dropped`). `ticks_late` counts
              these and those that come later than half a period after they were due
     phase    where in the clock's periods all ticks but the first fall, from 0 to 1; if None, where that falls
+    health   what is told of the loop and of what the service lacks; None: nobody wants to know
     """
 
     def __init__(
-        self, service: Service, inbox: Inbox, clock: Clock, tick_hz: float, phase: float | None = None
+        self,
+        service: Service,
+        inbox: Inbox,
+        clock: Clock,
+        tick_hz: float,
+        phase: float | None = None,
+        health: Health | None = None,
     ) -> None:
         self._service = service
         self._inbox = inbox
         self._clock = clock
+        self._health = health
+        if health is not None:
+            health.begins(tick_hz)
         self._tick_ns = int(NS_PER_S / tick_hz)
         self._phase_ns = None if phase is None else int(phase * self._tick_ns)
         self._stopping = False
@@ -169,6 +184,8 @@ class Process:
             # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
                 signal.signal(number, signal.SIG_IGN)
+            if self._health is not None:
+                self._health.ends()
             self._inbox.close()
             counters.set_counts(self._inbox.counts)
             self._service.stop(self._clock.now_ns())
@@ -189,6 +206,8 @@ class Process:
                     phase_ns = None
                 usage.look(counters, now_ns)
                 self._service.tick(now_ns)
+                if self._health is not None:
+                    self._health.turned(self._service.lacks())
                 took_ns = self._clock.now_ns() - now_ns
                 events_until_ns = now_ns + 2 * took_ns
                 counters.observe("tick_ms", took_ns / 1e6)

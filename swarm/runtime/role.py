@@ -9,7 +9,9 @@ from swarm.config.agents import AddedAgent, crew_of
 from swarm.config.classes import class_numbers
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
+from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo, Stats
 
 
@@ -25,6 +27,7 @@ class RoleSetup:
     before       what its earlier lives have counted; None if that is not known
     anew         whether the run begins with it: nobody has seen an earlier life of it
     record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
+    health         what its loop tells of itself; None: nobody wants to know
     """
 
     scenario: Scenario
@@ -39,6 +42,7 @@ class RoleSetup:
     before: Stats | None = None
     record_inputs: bool = False
     anew: bool = False
+    health: Health | None = None
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """What this process answers when others ask which run it belongs to."""
@@ -60,6 +64,7 @@ class RoleSetup:
             crew=[f"{role}-{id}" for role, id in crew_of(self.scenario)][:MOST_IDS],
             restarts=self.restarts,
             classes=list(class_numbers(self.scenario)),
+            wire_version=WIRE_VERSION,
         )
 
     @property

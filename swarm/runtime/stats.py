@@ -34,6 +34,9 @@ RESTARTS = "restarts"
 MESSAGES_PER_S = "messages_per_s"
 """Gauge: messages that the process sent per second, over the last second or so."""
 
+READY = "ready"
+"""Gauge: 1 while the process has all that its role needs."""
+
 _BASE = 1.04
 _LOG_BASE = math.log(_BASE)
 

@@ -20,6 +20,8 @@ from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import faulty_sets
+from swarm.wire.versions import STEPS, as_read, as_written, read_schemas
+from swarm.wire.versions import schema_of_type as schema_of_type
 
 MAX_PAYLOAD_BYTES = 8 << 20
 """Longer payloads are rejected unread: 1.6 times the digest of a full replica, the longest message there is."""
@@ -51,6 +53,8 @@ _DECODERS: dict[type[Message], msgspec.msgpack.Decoder[Any]] = {}
 
 def encode(message: Message) -> bytes:
     """A message as MessagePack: a map of its fields in their order, its `schema` first."""
+    if STEPS and (older := as_written(message)) is not None:
+        return _ENCODER.encode(older)
     return _ENCODER.encode(message)
 
 
@@ -61,7 +65,7 @@ def decode(payload: bytes, message_type: type[M]) -> M:
 
 def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | N:
     """As `decode`, of a payload that is of type `other` if its schema says so, else of type `usual`."""
-    if other is not None and _unpacked(payload)["schema"] == schema_of_type(other):
+    if other is not None and _unpacked(payload)["schema"] in read_schemas(other):
         return decode(payload, other)
     return decode(payload, usual)
 
@@ -130,11 +134,6 @@ def prime(message_type: type[Message]) -> None:
     _DECODERS[message_type] = msgspec.msgpack.Decoder(message_type)
 
 
-def schema_of_type(message_type: type[Message]) -> str:
-    """The `schema` of a message type, such as "marks/2"."""
-    return str(message_type.__struct_config__.tag)
-
-
 def _unpacked(payload: bytes) -> dict[Any, Any]:
     """The fields in a payload, with a `schema` of any value. Raises ProtocolError."""
     if len(payload) > MAX_PAYLOAD_BYTES:
@@ -160,6 +159,7 @@ def _unpacked(payload: bytes) -> dict[Any, Any]:
 
 def _converted(fields: dict[Any, Any], message_type: type[M]) -> M:
     """The message of these fields, its types and ranges checked. Raises ProtocolError."""
+    fields = as_read(fields, message_type)
     try:
         return msgspec.convert(fields, message_type, builtin_types=_BYTES)
     except Exception as error:

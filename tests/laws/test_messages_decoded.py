@@ -67,7 +67,7 @@ def test_a_payload_of_another_type_is_refused(kind):
 def test_a_later_wire_version_is_refused_and_a_later_field_ignored():
     fields = msgpack.unpackb(encode(BY_TYPE[Note]))
     assert decode(msgpack.packb(fields | {"mood": "good"}), Note) == BY_TYPE[Note]
-    with pytest.raises(ProtocolError, match="note/9"):
+    with pytest.raises(ProtocolError, match=r"note is of version 9, but this build, of wire version \d+, reads 8$"):
         decode(msgpack.packb(fields | {"schema": "note/9"}), Note)
 
 

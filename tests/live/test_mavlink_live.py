@@ -132,6 +132,7 @@ def pair(tmp_path: Path, live: LiveSwarm, swarm: Swarm) -> Iterator[Pair]:
     yield pair
     for child in pair.children:
         child.kill()
+        sys.stdout.write(f"--- {child.output.name}\n{child.output.read_text()[-4000:]}\n")  # shown of a failure
 
 
 def test_a_vehicle_that_only_speaks_mavlink_is_avoided_and_gone_when_its_adapter_is_killed(

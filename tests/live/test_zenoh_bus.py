@@ -347,12 +347,16 @@ def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
         a.ask(RUN, Nothing(), Box(), tag="q")
         if what == "link":
             world.cut(b)
-        time.sleep(5.0)
-        process.stop()
 
-    threading.Thread(target=provoke, daemon=True).start()
-    with pytest.raises(ZeroDivisionError, match=f"a bug of ours, {what}"):
-        process.run()
+    provoking, too_long = threading.Thread(target=provoke), threading.Timer(20.0, process.stop)
+    provoking.start()
+    too_long.start()
+    try:
+        with pytest.raises(ZeroDivisionError, match=f"a bug of ours, {what}"):
+            process.run()
+    finally:
+        too_long.cancel()
+        provoking.join()  # a router that it kills later would be missing in the next test
     assert service.stopped
 
 

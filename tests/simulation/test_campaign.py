@@ -12,7 +12,7 @@ from launch_scripts.commands.simulate import simulate_seeds
 from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds, world_of
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial, Verdict, try_seed
+from launch_scripts.simulation.trial import BrokenLaw, Trial, Verdict, try_seed
 from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
 from swarm.errors import ConfigError
 
@@ -49,7 +49,7 @@ def test_garbage_is_collected_rarely_while_a_seed_runs_and_as_before_once_it_has
         raise RuntimeError("a service fails")
 
     monkeypatch.setattr(Trial, "run", run)
-    assert "a service fails" in try_seed("small", 1, 4).broken[0]
+    assert "a service fails" in str(try_seed("small", 1, 4).broken[0])
     assert meanwhile[0] >= 10 * before[0]
     assert gc.get_threshold() == before
 
@@ -66,7 +66,7 @@ def test_a_process_that_never_comes_back_breaks_a_law():
     trial = Trial(simulation)
     simulation.run_until(3)
     simulation.nodes["agent-a1"].crash()
-    assert "a process did not start again" in trial.run(10)
+    assert "a process did not start again" in map(str, trial.run(10))
 
 
 def test_each_law_has_its_sentence():
@@ -76,7 +76,9 @@ def test_each_law_has_its_sentence():
     trial.laws.lethal.append((2.0, "v", 4))
     trial.laws.acknowledged["nobody.a9.1", 0] = (1, 1)
     trial.waits.longest_s, trial.waits.longest = 11.0, (12.0, "v", 5)
-    assert trial.run(10) == [
+    broken = trial.run(10)
+    assert [law.at_s for law in broken] == [1.0, 2.0, None, 12.0]
+    assert [str(law) for law in broken] == [
         "collision at 1.00 s: v and w on cell 3",
         "lethal entry at 2.00 s: v on cell 4",
         "1 acknowledged sets are lost, such as ('nobody.a9.1', 0)",
@@ -90,7 +92,7 @@ def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
     assert printed["seeds"] == 1
     assert printed["failing"] == []
     assert printed["deliveries"] > 1000
-    broken = Verdict(world="small", seed=3, seconds=30.0, broken=["it broke"])
+    broken = Verdict(world="small", seed=3, seconds=30.0, broken=[BrokenLaw("a law", "it broke")])
     monkeypatch.setattr("launch_scripts.simulation.campaign.try_seed", lambda *_: broken)
     assert not simulate_seeds("small", "3:4", None, 1, as_json=False)
     out = capsys.readouterr().out

@@ -94,3 +94,31 @@ def fail_at_the_end(setup: RoleSetup, stop_when: StopWhen) -> None:
 
 def leave_early(setup: RoleSetup, stop_when: StopWhen) -> None:
     sys.exit(0)
+
+
+class Ticking:
+    """A service without any work, which is ready at once."""
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+
+    def lacks(self) -> list[str]:
+        return []
+
+    def start(self, now_ns: int) -> None:
+        pass
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        pass
+
+    def tick(self, now_ns: int) -> None:
+        pass
+
+    def stop(self, now_ns: int) -> None:
+        pass
+
+
+def tick(setup: RoleSetup, stop_when: StopWhen) -> None:
+    process = Process(Ticking(), Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
+    process.stop_on_signals()
+    process.run()

@@ -66,7 +66,6 @@ def main() -> None:
     port, lat_deg, lon_deg, seconds = int(sys.argv[1]), *map(float, sys.argv[2:5])
     vehicle = Vehicle(lat_deg, lon_deg)
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.AUTOPILOT))
-    mavsdk.add_any_connection(f"udpout://127.0.0.1:{port}")
     server = mavsdk.server_component()
     missions = MissionRawServer(server)
     missions.subscribe_incoming_mission(vehicle.hear_mission)
@@ -74,6 +73,8 @@ def main() -> None:
     actions.set_armable(True, True)
     actions.subscribe_arm_disarm(vehicle.hear_armed)
     telemetry = TelemetryServer(server)
+    # It is heard from here on: a mission that came before it was waited for would be accepted, and known to nobody.
+    mavsdk.add_any_connection(f"udpout://127.0.0.1:{port}")
     say("up")
     for turn in range(int(seconds * HZ)):
         vehicle.drive(SPEED_M_PER_S / HZ)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import pairwise
 
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.step_climb import Climb, may_be_pulled
 from swarm.right_of_way.holdings import Holdings
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.motion import Motion, Point
@@ -50,8 +50,7 @@ class Driver:
         self._passable = passable
         self._dynamics = dynamics
         self._cols = local_map.grid.cols
-        # On the ground no route is pulled where uphill is not downhill.
-        self._pulled = pulled and (local_map.climb is None or local_map.climb.wind is not None)
+        self._pulled = pulled and may_be_pulled(local_map.climb)
         self._left_s: dict[str, float] = {}
         self._rolling: set[str] = set()
         """Vehicles that did not stop when they came to the middle of the cell where they are."""

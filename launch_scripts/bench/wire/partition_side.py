@@ -13,6 +13,7 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,9 @@ class MapService:
         self._at = self._chance.integers(_SIDE_CELLS, size=2)
         self._write_due_ns = 0
         self.writing = False
+
+    def lacks(self) -> Sequence[str]:
+        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()
@@ -124,6 +128,9 @@ class _Telling:
     @property
     def counters(self) -> Counters:
         return self._service.counters
+
+    def lacks(self) -> Sequence[str]:
+        return self._service.lacks()
 
     def start(self, now_ns: int) -> None:
         self._service.start(now_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,7 @@ from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat, RunInfo, Stats
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.topics import RUN, STATS
+from swarm.wire.versions import are_neighbours
 
 _TAG, _GONE = "status-run", "status-gone"
 _ASK_S = 1.0
@@ -101,7 +103,9 @@ class StatusWatch:
             return None
         run = run_of_most(self._found)  # whoever answers with another is a stranger
         found = sorted(self._found, key=lambda info: (not info.run_id, info.role, info.id))
-        strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
+        of_run = [info for info in found if (info.run_id, info.terrain) == run]
+        [(wire, _)] = Counter(info.wire_version for info in of_run).most_common(1)
+        strangers = [info for info in found if info.run_id and not _belongs(info, run, wire)]
         members = [info for info in found if info not in strangers]
         frame = frame_of_members(members)
         model = RunModel(plan_of_members(members), _NO_GRID if frame is None else frame.grid)
@@ -134,6 +138,8 @@ def print_status(status: Status, console: Console) -> None:
         for line in facts.lines(state):
             console.print(line, highlight=False, soft_wrap=True)
     console.print(_processes(status))
+    if (spoken := _wire_versions(status)) is not None:
+        console.print(spoken, highlight=False, soft_wrap=True)
     for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
     if state.targets:
@@ -147,8 +153,25 @@ def print_status(status: Status, console: Console) -> None:
     for ordered in state.orders:
         console.print(f"ordered: {ordered}", style="yellow", highlight=False, soft_wrap=True)
     for info in status.strangers:
-        text = f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}"
+        text = (
+            f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}, "
+            f"wire version {info.wire_version}"
+        )
         console.print(text, style="yellow", highlight=False, soft_wrap=True)
+
+
+def _belongs(info: RunInfo, run: tuple[str, str], wire: int) -> bool:
+    return (info.run_id, info.terrain) == run and are_neighbours(info.wire_version, wire)
+
+
+def _wire_versions(status: Status) -> str | None:
+    """Which processes speak an older wire version than others, in words; None where all speak one."""
+    newest = max(info.wire_version for info in status.members)
+    older = [info for info in status.members if info.wire_version < newest]
+    if not older:
+        return None
+    names = ", ".join(f"{info.role}-{info.id}" for info in older)
+    return f"an upgrade is under way: wire version {newest}, but {older[0].wire_version} of {names}"
 
 
 def _processes(status: Status) -> Table:
@@ -182,6 +205,7 @@ def status_fields(status: Status) -> dict[str, Any]:
             "role": info.role,
             "id": info.id,
             "incarnation": info.incarnation,
+            "wire_version": info.wire_version,
             "leads": status.leads.get((info.role, info.id)),
             "counts": None if stats is None else stats.counts,
             "gauges": None if stats is None else stats.gauges,

@@ -42,7 +42,9 @@ def _name_of(url: str) -> str | None:
 class BoundedServer(socketserver.ThreadingTCPServer):
     """A thread for each connection, of which there are `MOST_CONNECTIONS` at most: who comes beyond is closed.
 
-    lasts_s  a connection is cut after so long, unless its handler calls `keep`
+    lasts_s       a connection is cut after so long, unless its handler calls `keep`
+    newest_first  who comes beyond is let in, and the oldest connection is cut for it: where requests are short, one
+                  who holds connections open keeps nobody else out
     """
 
     daemon_threads = True
@@ -51,12 +53,14 @@ class BoundedServer(socketserver.ThreadingTCPServer):
     # Of more that come at once the system forgets the first knock, and they knock again after a second, or seven.
     request_queue_size = 4 * MOST_CONNECTIONS
     lasts_s = 60.0
+    newest_first = False
 
-    def __init__(self, port: int, handler: type[socketserver.BaseRequestHandler]) -> None:
+    def __init__(self, port: int, handler: type[socketserver.BaseRequestHandler], address: str = LOOPBACK) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
         self._lock = threading.Lock()
         self._open: dict[socket.socket, float] = {}
         """Connection -> when it is cut, on the monotonic clock."""
-        super().__init__((LOOPBACK, port), handler)
+        super().__init__((address, port), handler)
 
     @property
     def port(self) -> int:
@@ -80,6 +84,12 @@ class BoundedServer(socketserver.ThreadingTCPServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         with self._lock:
             full = len(self._open) >= MOST_CONNECTIONS
+            if full and self.newest_first:
+                oldest = next(iter(self._open))
+                del self._open[oldest]
+                with contextlib.suppress(OSError):
+                    oldest.shutdown(socket.SHUT_RDWR)
+                full = False
             if not full:
                 self._open[request] = time.monotonic() + self.lasts_s
         if full:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from hashlib import blake2b
@@ -220,6 +220,9 @@ class _RecordedService:
     @property
     def counters(self) -> Counters:
         return self._counters
+
+    def lacks(self) -> Sequence[str]:
+        return self._service.lacks()
 
     def start(self, now_ns: int) -> None:
         with self._recording.call(Started(now_ns, self._counters.changed())):

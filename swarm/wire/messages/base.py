@@ -1,10 +1,14 @@
-"""The base of all messages and the wire version."""
+"""The base of all messages, and the wire version of this build."""
 
 from __future__ import annotations
 
 from swarm.wire.fields import Bounded
 
 WIRE_VERSION = 8
+"""The wire that this build speaks. It rises by one, once a release, where a message steps to a version that builds
+before it do not read, or where a key changes (`swarm.wire.versions`, decision 87). Two neighbours share a run."""
+_FIRST_VERSION = 8
+"""Of every message when each got a version of its own."""
 
 
 class Message(Bounded, frozen=True, kw_only=True, tag_field="schema"):
@@ -18,9 +22,9 @@ class Message(Bounded, frozen=True, kw_only=True, tag_field="schema"):
         """
 
 
-def schema_of(name: str) -> str:
-    """The tag of a message type: its name and the wire version."""
-    return f"{name}/{WIRE_VERSION}"
+def schema_of(name: str, version: int = _FIRST_VERSION) -> str:
+    """The tag of a message type: its name and its own version, such as "marks/8"."""
+    return f"{name}/{version}"
 
 
 class Nothing(Message, frozen=True, kw_only=True, tag=schema_of("nothing")):

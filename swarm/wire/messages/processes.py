@@ -39,6 +39,8 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     vehicles, crew              how many vehicles the scenario has, and which processes it needs, as `role-id`
     restarts                    how often the process was started again in this run
     classes                     the classes of vehicles beside "ground", in the order of their numbers
+    wire_version                of its build. This message is read by builds of all wire versions: it never steps to
+                                another version, so that each can say which the other speaks (decision 87)
     """
 
     run_id: Word
@@ -59,6 +61,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     crew: Annotated[list[Word], Meta(max_length=MOST_IDS)] = []
     restarts: Count = 0
     classes: Annotated[list[Id], IDS] = []
+    wire_version: Count = 8
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):

@@ -17,9 +17,10 @@ from support.processes import eventually, session_of
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.up import run_swarm
-from launch_scripts.launcher.up_options import UpOptions
+from launch_scripts.launcher.up_options import UpOptions, chosen_processes
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
+from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
 from swarm.errors import ConfigError
 from swarm.runtime.role import RoleSetup
@@ -102,6 +103,27 @@ def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path
     options = UpOptions(Scenario(name="x"), tmp_path, roles=("planner",), rank=1)
     with pytest.raises(ConfigError, match="scenario x has no planner of rank 1; see standbys"):
         run_swarm(options)
+
+
+def test_processes_are_chosen_by_role_and_id_and_start_in_order() -> None:
+    scenario = parse_scenario('name = "x"\n[[targets]]\ncount = 2\n[standbys]\nplanner = 1')
+    chosen = chosen_processes(scenario, ["agent", "planner.t1.r1", "router.3", "planner.t0", "planner.t0"], None)
+    names = ["router-3", "planner-t1.r1", "planner-t0", "agent-a0", "agent-a1", "agent-a2", "agent-a3"]
+    assert [spec.name for spec in chosen] == names
+
+
+@pytest.mark.parametrize(
+    ("word", "answer"),
+    [
+        ("planner.t9", "no planner 't9' in scenario x; it has t"),
+        ("agnet.a0", "did you mean 'agent'"),
+        ("keeper.a/b", "--only 'a/b' is not 1 to 64 of letters"),
+    ],
+)
+def test_a_process_that_there_is_not_is_refused_in_a_sentence(word: str, answer: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        chosen_processes(Scenario(name="x"), [word], None)
+    assert answer in str(raised.value)
 
 
 def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:

@@ -126,6 +126,20 @@ def test_what_a_vehicle_had_before_its_link_was_lost_is_not_relied_on() -> None:
     assert len(world.vehicle.missions) == 2
 
 
+def test_a_vehicle_that_is_back_is_where_it_says_and_not_where_the_one_before_was_last() -> None:
+    world = driving(MISSION)
+    world.speaks = False
+    for _ in range(7):
+        world.hear(world.vehicle.position())  # of one whose heartbeats are lost
+        world.run(0.5)
+    world.run(2.5)
+    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.told()
+    world.hear(world.vehicle.beat())
+    assert not [each for each in world.run(0.5) if isinstance(each, Follow | Report)]
+    world.hear(world.vehicle.position())
+    assert [each for each in world.run(0.5) if isinstance(each, Follow)] == [Follow("t0")]
+
+
 def test_one_that_flies_is_withdrawn_when_its_link_is_lost() -> None:
     world = driving(Wishes("t0", altitude_m=30.0), Autopilot(type=COPTER))
     world.speaks = False

@@ -1,4 +1,4 @@
-"""The door and the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
+"""What comes over the links of `swarm mavlink`: bytes become checked messages of one vehicle, and nothing else."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def _scraped(
 
 @pytest.fixture
 def endpoint() -> Iterator[MetricsEndpoint]:
-    made = MetricsEndpoint(0)
+    made = MetricsEndpoint(0, list)
     yield made
     made.close()
 
@@ -163,7 +163,7 @@ def test_other_paths_and_other_sites_get_nothing(endpoint: MetricsEndpoint, figu
 def test_a_taken_port_is_named(endpoint: MetricsEndpoint) -> None:
     port = int(endpoint.url.rpartition(":")[2].partition("/")[0])
     with pytest.raises(BusError, match=f"metrics port {port} cannot be opened"):
-        MetricsEndpoint(port)
+        MetricsEndpoint(port, list)
 
 
 _names = st.one_of(

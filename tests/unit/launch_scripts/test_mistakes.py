@@ -60,6 +60,17 @@ def port_taken(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
     return {}
 
 
+def one_machine(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    (folder / "hosts.toml").write_text('survive = 1\n[[hosts]]\nname = "a"\naddress = "10.0.0.1"\n')
+    return {}
+
+
+def two_machines(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    rows = (f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (1, 2))
+    (folder / "hosts.toml").write_text("".join(rows))
+    return {}
+
+
 def free_port(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
     return {"PORT": str(free_ports(1)[0])}
 
@@ -103,7 +114,17 @@ def latin_1(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
 
 GIVEN: dict[str, Callable[[Path, pytest.FixtureRequest], dict[str, str]]] = {
     each.__name__: each
-    for each in (port_taken, free_port, photo, hill, certificates_of_another, certificates_but_one, latin_1)
+    for each in (
+        port_taken,
+        one_machine,
+        two_machines,
+        free_port,
+        photo,
+        hill,
+        certificates_of_another,
+        certificates_but_one,
+        latin_1,
+    )
 }
 
 

@@ -42,7 +42,8 @@ def planners(
 ) -> tuple[OrderedPlanners, list[str]]:
     said: list[str] = []
     stands_for: Any = swarm
-    return OrderedPlanners(SCENARIO, stands_for, ranks, whole, said.append), said
+    own = [running.spec for running in swarm.running]
+    return OrderedPlanners(SCENARIO, stands_for, ranks, own, whole, said.append), said
 
 
 def book(*orders: tuple[str, int, bool]) -> OrderBook:
@@ -82,6 +83,15 @@ def test_a_target_of_the_scenario_that_is_removed_gets_its_planner_back_with_it(
     assert swarm.ids == ["t1", "t1.r1"]
     ordered.look(book(("t0", 2, False)), set(), 1.0)
     assert swarm.ids == USUAL
+
+
+def test_a_launcher_leaves_planners_of_the_scenario_that_it_did_not_start_to_others() -> None:
+    swarm = Swarm()
+    swarm.running = [running for running in swarm.running if running.spec.id in ("t0", "t1.r1")]
+    ordered, _ = planners(swarm)
+    ordered.look(book(("t0", 1, True), ("t1", 1, True)), set(), 0.0)
+    ordered.look(book(("t0", 2, False), ("t1", 2, False)), set(), 1.0)
+    assert swarm.ids == ["t0", "t1.r1"]
 
 
 def test_a_part_of_a_swarm_leaves_it_to_others_for_a_while() -> None:

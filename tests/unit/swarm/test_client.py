@@ -30,6 +30,7 @@ from swarm.client.observer import marked
 from swarm.client.own_marks import OwnMarks
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
+from swarm.wire.messages.base import WIRE_VERSION
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.processes import Note, RunInfo
@@ -367,6 +368,10 @@ def test_most_processes_say_which_run_it_is_and_what_time() -> None:
     assert agreed([(ours, 5)], "here") == (ours, 0), "who has no clock yet says nothing about ours"
     with pytest.raises(RunMismatchError, match=r"two runs, .* other and run, are in namespace here: end one"):
         agreed([at(ours, 0), at(other, 0)], "here")
+    newer = [msgspec.structs.replace(ours, wire_version=WIRE_VERSION + ahead) for ahead in (1, 2)]
+    assert agreed([at(newer[0], 0)], "here") is not None
+    with pytest.raises(RunMismatchError, match=rf"here speaks wire version {WIRE_VERSION + 2}, this program"):
+        agreed([at(newer[1], 0), at(newer[1], 0), at(ours, 0)], "here")
 
 
 @pytest.mark.parametrize(

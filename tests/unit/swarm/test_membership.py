@@ -59,6 +59,10 @@ def test_members_of_one_run_get_along():
             "planner t1 has terrain bbbb (8 x 5), but planner t0 has aaaa (4 x 5): terrain files or ",
         ),
         (
+            {"wire_version": 10},
+            "planner t1 speaks wire version 10, but planner t0 speaks 8: only neighbouring versions share a run",
+        ),
+        (
             {"classes": ["truck", "walker"]},
             "planner t1 has the classes of vehicles truck, walker, but planner t0 has none: marks name classes by",
         ),
@@ -74,6 +78,19 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
     assert str(stranger.failure).startswith(words)
     assert stranger.failure.exit_code == 5
     assert first.failure is None
+
+
+def test_builds_of_neighbouring_wire_versions_share_a_run():
+    world = SwarmModel()
+    nodes = [Node(world, id=f"t{wire}", wire_version=wire) for wire in (8, 9)]
+    for node in nodes:
+        node.member.join()
+        world.settle()
+    assert [node.failure for node in nodes] == [None] * 2
+
+
+def test_a_process_that_does_not_say_its_wire_version_speaks_the_last_one_before_any_said_it():
+    assert INFO.wire_version == 8
 
 
 def test_of_two_that_start_at_once_at_least_one_notices():

@@ -1,0 +1,95 @@
+"""`swarm deploy plan`: who runs on which machine, and an archive for each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument
+
+if TYPE_CHECKING:
+    from launch_scripts.deploy.plan import Plan
+
+
+def plan(
+    scenario: ScenarioArgument,
+    hosts: Annotated[Path, typer.Option(help="The machines, in TOML: see docs/deploy.md.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write an archive for each machine here, certificates included; if not given, only show."
+        ),
+    ] = None,
+    wheel: Annotated[
+        Path | None, typer.Option(help="Put this wheel of the swarm into the archives, to be installed from them.")
+    ] = None,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="Days until new certificates expire.")] = 365,
+    namespace: Namespace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which process runs on which machine, and make an archive for each: service, scenario, certificates.
+
+    swarm deploy plan my.toml --hosts hosts.toml --out kits
+
+    then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
+
+    Every process runs once; keepers, and planners and their standbys, on machines of their own. A second plan into
+    the same folder keeps the certificates.
+    """
+    from launch_scripts.check.settings import check_start
+    from launch_scripts.deploy.hosts import load_hosts
+    from launch_scripts.deploy.kits import write_kits
+    from launch_scripts.deploy.plan import make_plan
+    from launch_scripts.deploy.systemd import systemd_files
+    from launch_scripts.launcher.options import common_run_id, find_scenario, with_network
+    from swarm.errors import ConfigError
+
+    chosen = with_network(find_scenario(scenario), namespace=namespace)
+    try:
+        made = make_plan(chosen, load_hosts(hosts), common_run_id(chosen))
+    except ConfigError as error:
+        raise ConfigError(_of_file(str(error), hosts)) from error
+    if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
+        raise ConfigError(f"--wheel: found {wheel}, expected a file NAME.whl; `uv build --wheel` makes one")
+    check_start(chosen, joins=True, has_ground=True)
+    written = [] if out is None else write_kits(made, out, systemd_files, days, wheel)
+    if as_json:
+        from launch_scripts.deploy.shown_plan import as_json as fields
+
+        typer.echo(json.dumps({**fields(made), "archives": list(map(str, written))}, indent=2))
+        return
+    _show(made)
+    for host, archive in zip(made.hosts, written, strict=True) if written else ():
+        typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
+    if out is not None:
+        typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
+
+
+def _of_file(sentence: str, path: Path) -> str:
+    """A sentence that begins with the file."""
+    return sentence if sentence.startswith(str(path)) else f"{path}: {sentence}"
+
+
+def _show(made: Plan) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from launch_scripts.deploy.shown_plan import COLUMNS, rows
+
+    # One column a machine: names of processes are many and short, machines few.
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    machines = rows(made)
+    table.add_column("")
+    for machine in machines:
+        table.add_column(Text(machine[0]), overflow="fold")
+    for n, column in enumerate(COLUMNS[1:], 1):
+        table.add_row(Text(column, "dim"), *(Text(machine[n] or "-") for machine in machines))
+    console = Console(highlight=False)
+    console.print(table)
+    lost = made.survive
+    what = "no machine may be lost" if not lost else f"{lost} of {len(made.hosts)} machines may be lost at once"
+    console.print(f"run {made.run_id}: {len(made.processes)} processes; {what}", soft_wrap=True)

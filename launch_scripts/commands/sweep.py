@@ -1,0 +1,112 @@
+"""`swarm sweep`: a study over many processes or machines."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from swarm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from launch_scripts.sweep.run import Sweep
+    from launch_scripts.sweep.summary import Summary
+    from launch_scripts.sweep.trial import Result, Trial
+
+
+def check_installed() -> None:
+    """Raises ConfigError if what this needs is not installed."""
+    for package in ("distributed", "pyarrow"):
+        if find_spec(package) is None:
+            raise ConfigError(
+                f"swarm sweep needs {package}, which is not installed: pip install 'terrain-swarm[sweep]'"
+            )
+
+
+def sweep_study(path: Path, scheduler: str | None, workers: int | None, out: Path | None, as_json: bool) -> bool:
+    """Run what a study lacks, and print its summary. True if every trial has a result and no law broke."""
+    check_installed()
+    if scheduler is not None and workers is not None:
+        raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
+    from launch_scripts.sweep.cluster import cores
+    from launch_scripts.sweep.run import Sweep
+
+    sweep = Sweep(path, out)
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    kept = sweep.trials - len(sweep.missing)
+    if kept:
+        console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
+    try:
+        _run(sweep, console, workers or cores(), scheduler)
+    except KeyboardInterrupt:
+        there = sum(trial.key in sweep.store.results for trial in sweep.missing) + kept
+        with suppress(KeyboardInterrupt):
+            console.print(f"{there:,} of {sweep.trials:,} trials are kept in {sweep.folder}; start again to go on")
+        raise
+    summary = sweep.finish()
+    if as_json:
+        from launch_scripts.sweep.summary import as_json as told
+
+        print(json.dumps(told(summary), indent=2))
+    else:
+        _print(summary, sweep.folder)
+    return not summary.failing and not summary.missing
+
+
+def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None) -> None:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[failed]} broke a law"),
+    )
+    failed = 0
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(sweep.study.name, total=sweep.trials, failed=0)
+        bar.update(task, completed=sweep.trials - len(sweep.missing))
+
+        def told(trial: Trial, result: Result | None) -> None:
+            nonlocal failed
+            failed += bool(result is not None and result.broken)
+            for law in result.broken[:1] if result is not None else ():
+                console.print(f"{trial.world} seed {trial.seed} broke a law: {law}", markup=False)
+            if result is None:
+                console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
+            while sweep.warned:
+                console.print(sweep.warned.pop(0), markup=False)
+            bar.update(task, advance=1, failed=failed)
+
+        sweep.run(workers, scheduler, told)
+
+
+def _print(summary: Summary, folder: Path) -> None:
+    from launch_scripts.bench.tables import table
+    from launch_scripts.sweep.page import between, number
+    from launch_scripts.sweep.run import PAGE, RESULTS
+
+    console = Console(highlight=False)
+    several = len({case.scenario for case in summary.cases}) > 1
+    for name in summary.cases[0].outcomes:
+        shown = table(name, "<case", "n", "mean", "95 %", "to the first", "95 %")
+        for case in summary.cases:
+            outcome = case.outcomes[name]
+            shown.add_row(
+                f"{case.scenario}: {case.label}" if several else case.label,
+                str(len(outcome.values)),
+                number(outcome.mean),
+                between(outcome.mean),
+                number(outcome.difference, "+"),
+                between(outcome.difference, "+"),
+            )
+        console.print(shown)
+    for failure in summary.failing[:20]:
+        console.print(f"failed: {failure.replay}", soft_wrap=True, markup=False)
+    missing = f"; {summary.missing:,} have no result" if summary.missing else ""
+    console.print(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
+    console.print(f"summary: {folder / PAGE}, results: {folder / RESULTS}", soft_wrap=True)

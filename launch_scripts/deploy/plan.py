@@ -1,0 +1,210 @@
+"""Which process runs on which machine: the plan that units, containers and manifests are written from."""
+
+from __future__ import annotations
+
+import msgspec
+
+from launch_scripts.deploy.hosts import HostConfig, HostsConfig
+from launch_scripts.deploy.placement import ROUTER_CORES, Job, place
+from launch_scripts.process_table import EXPENDABLE, ROLES, certificate_name, certificate_names, processes_of
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import Scenario, StandbyConfig
+from swarm.errors import ConfigError
+from swarm.ranks import job_of
+
+_CORES = {"keeper": 0.04, "monitor": 0.17, "targets": 0.09}
+"""Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, in docs/scale-figures.md."""
+_CORES_PER_VEHICLE = 0.00066
+"""Of an agent; from the same table."""
+ROUTER, KEEPER = "router", "keeper"
+
+
+class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
+    """A process of a plan.
+
+    role         as in the table of processes
+    id           as it stands in keys: "0", "t3.r1", "a0"
+    certificate  name of its certificate and key: "agent.all.a0"
+    job          what it does alone or with standbys, which run on other machines: "planner.t3"
+    cores        that it is expected to use
+    """
+
+    role: str
+    id: str
+    certificate: str
+    job: str
+    cores: float
+
+    @property
+    def name(self) -> str:
+        """As in logs: "planner-t3.r1"."""
+        return f"{self.role}-{self.id}"
+
+    @property
+    def selector(self) -> str:
+        """What `swarm up --only` calls it: "planner.t3.r1"."""
+        return f"{self.role}.{self.id}"
+
+
+class PlannedHost(msgspec.Struct, frozen=True, kw_only=True):
+    """A machine of a plan.
+
+    cores      processor cores that the swarm may use
+    processes  that run there, in the order in which they start
+    listen     endpoints of its router; empty if it has none
+    connect    endpoints that its other processes try, in this order: its own router first
+    peers      endpoints of the routers that its router connects to; each two routers have one link
+    operator   common name in the certificate of its launcher, whose files are called operator.0
+    has_files  whether it gets the files of the terrain; others ask a keeper for the base map
+    """
+
+    name: str
+    address: str
+    cores: float
+    processes: tuple[PlannedProcess, ...]
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    peers: tuple[str, ...]
+    operator: str
+    has_files: bool
+
+    def of(self, role: str) -> tuple[PlannedProcess, ...]:
+        return tuple(each for each in self.processes if each.role == role)
+
+    @property
+    def load(self) -> float:
+        """Cores that its processes are expected to use."""
+        return sum(each.cores for each in self.processes)
+
+
+class Plan(msgspec.Struct, frozen=True, kw_only=True):
+    """Who runs where. All machines have one scenario but for its `[network]`.
+
+    run_id    of the run that all take part in, so that a restart goes on with its store
+    scenario  as it runs: with the standbys that the plan added, and all that routers admit
+    port      of every router
+    survive   how many machines may be lost at once
+    hosts     in the order of the file
+    """
+
+    run_id: str
+    scenario: Scenario
+    port: int
+    survive: int
+    hosts: tuple[PlannedHost, ...]
+
+    @property
+    def processes(self) -> list[tuple[PlannedHost, PlannedProcess]]:
+        return [(host, process) for host in self.hosts for process in host.processes]
+
+
+def make_plan(scenario: Scenario, hosts: HostsConfig, run_id: str) -> Plan:
+    """The plan of a scenario on these machines. Raises ConfigError where the machines do not suffice.
+
+    Every process runs once, a monitor if a machine may have one. Each machine that may has a router. Keepers, and
+    the processes of one job, run on machines of their own. Agents with consecutive ids run together, as their
+    vehicles start near each other. The same scenario and machines give the same plan.
+    """
+    scenario = _surviving(scenario, hosts.losses)
+    _check(scenario, hosts)
+    carried = {role for host in hosts.hosts for role in host.roles}
+    placed = place([job for job in _jobs(scenario, hosts.losses) if job.role in carried], hosts.hosts)
+    routers = [host for host in hosts.hosts if ROUTER in host.roles]
+    scenario = _admitting(scenario, hosts, len(routers))
+    planned = tuple(_host(scenario, hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
+    return Plan(run_id=run_id, scenario=scenario, port=hosts.port, survive=hosts.losses, hosts=planned)
+
+
+def _surviving(scenario: Scenario, losses: int) -> Scenario:
+    """The scenario with standbys enough to lose so many machines."""
+    standbys = scenario.standbys
+    more = StandbyConfig(planner=max(standbys.planner, losses), targets=max(standbys.targets, losses))
+    return msgspec.structs.replace(scenario, standbys=more)
+
+
+def _admitting(scenario: Scenario, hosts: HostsConfig, routers: int) -> Scenario:
+    """The scenario whose routers admit what it does not name itself: all keepers, routers and launchers."""
+    names = [
+        *(f"{ROUTER}.{n}" for n in range(routers)),
+        *(f"{KEEPER}.{n}" for n in range(hosts.losses + 1)),
+        *(f"operator.{host.name}" for host in hosts.hosts),
+    ]
+    admit = dict.fromkeys((*certificate_names(scenario), *names))
+    return msgspec.structs.replace(scenario, network=msgspec.structs.replace(scenario.network, admit=tuple(admit)))
+
+
+def _jobs(scenario: Scenario, losses: int) -> list[Job]:
+    """Every process but routers, of which each machine that may has one."""
+    vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
+    keepers = [Job(KEEPER, str(n), KEEPER, _CORES[KEEPER]) for n in range(losses + 1)]
+    others = []
+    for spec in processes_of(scenario, tuple(role for role in ROLES if role not in (ROUTER, KEEPER))):
+        match spec.role:
+            case "agent":
+                cores = vehicles[spec.id] * _CORES_PER_VEHICLE
+            case "planner":
+                cores = scenario.planner.cpu_budget
+            case _:
+                cores = _CORES[spec.role]
+        others.append(Job(spec.role, spec.id, f"{spec.role}.{job_of(spec.id)}", cores))
+    return [*keepers, *others]
+
+
+def _check(scenario: Scenario, hosts: HostsConfig) -> None:
+    """Raises ConfigError where too few machines carry a role."""
+    alone, standbys = len(hosts.hosts) == 1, scenario.standbys
+    if alone and hosts.losses:
+        raise ConfigError(f"survive: found {hosts.losses} with one machine, expected 0 or more machines")
+    # One machine carries a scenario's standbys, too: they cover for a process that hangs.
+    apart = {
+        KEEPER: (hosts.losses + 1, f"survive = {hosts.losses}"),
+        "planner": (standbys.planner + 1, f"{standbys.planner} standbys of each planner"),
+        "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
+    }
+    for role in ROLES:
+        if role in EXPENDABLE:
+            continue
+        names = [host.name for host in hosts.hosts if role in host.roles]
+        wanted, why = (1, "") if alone else apart.get(role, (1, ""))
+        if len(names) < wanted:
+            because = f", as {why} are kept on machines of their own" if wanted > 1 else ""
+            raise ConfigError(
+                f"hosts: {role!r} is among the roles of {len(names)} machines, expected at least {wanted}{because}"
+            )
+
+
+def _host(
+    scenario: Scenario, port: int, host: HostConfig, jobs: list[Job], routers: list[HostConfig]
+) -> PlannedHost:
+    """A machine with what it runs. Its processes use the routers of others while its own is away."""
+    is_router = host in routers
+    own = (
+        [Job(ROUTER, str(routers.index(host)), f"{ROUTER}.{routers.index(host)}", ROUTER_CORES)]
+        if is_router
+        else []
+    )
+    processes = tuple(
+        PlannedProcess(
+            role=job.role,
+            id=job.id,
+            certificate=certificate_name(scenario, job.role, job.id),
+            job=job.job,
+            cores=job.cores,
+        )
+        for role in ROLES
+        for job in [*own, *jobs]
+        if job.role == role
+    )
+    local = [f"tls/127.0.0.1:{port}"] if is_router else []
+    others = [each.endpoint(port) for each in routers if each is not host]
+    return PlannedHost(
+        name=host.name,
+        address=host.address,
+        cores=host.cores,
+        processes=processes,
+        listen=(f"tls/{'[::]' if ':' in host.address else '0.0.0.0'}:{port}",) if is_router else (),
+        connect=(*local, *others),
+        peers=tuple(each.endpoint(port) for each in routers[: routers.index(host)]) if is_router else (),
+        operator=f"operator.{host.name}",
+        has_files=any(each.role in (KEEPER, "targets") for each in processes),
+    )

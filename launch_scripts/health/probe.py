@@ -1,0 +1,105 @@
+"""Asks a page of health, for probes that run a command: `swarm health --url`.
+
+A probe is started every few seconds, so this imports nothing but what it takes, and `fast` answers before the
+command line is loaded.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import time
+import urllib.parse
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from swarm.errors import BusError, ConfigError, SwarmError
+
+NOT_READY = 1
+"""Exit code of a probe that was told so."""
+_TIMEOUT_S = 5.0
+_MOST_BYTES = 1 << 20
+_READY, _HEALTHY = "/readyz", "/healthz"
+_LONGEST = 300
+
+
+class Answer(NamedTuple):
+    """What was told. Nothing of `told` is to be trusted: it came from the network."""
+
+    ok: bool
+    told: dict[str, Any]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        missing = self.told.get("missing")
+        lines = [self.told.get("status"), *(missing if isinstance(missing, list) else [])]
+        return ["".join(c if c.isprintable() else "?" for c in str(line))[:_LONGEST] for line in lines]
+
+    def show(self, *, as_json: bool) -> int:
+        """Prints it. Returns the exit code."""
+        for line in [json.dumps(self.told, indent=2)] if as_json else self.lines():
+            print(line)
+        return 0 if self.ok else NOT_READY
+
+
+def ask(url: str, *, live: bool) -> Answer:
+    """Ask whether processes are ready, or with `live` whether they live. Raises BusError if nobody answers there,
+    ConfigError if that is no address."""
+    host, port, path = _place(url)
+    try:
+        with socket.create_connection((host, port), _TIMEOUT_S) as connection:
+            name = f"[{host}]" if ":" in host else host
+            words = f"GET {path or (_HEALTHY if live else _READY)} HTTP/1.0\r\nHost: {name}:{port}\r\n\r\n"
+            connection.sendall(words.encode("ascii"))
+            reply = _read(connection)
+    except TimeoutError as error:
+        raise BusError(f"{url} does not answer within {_TIMEOUT_S:g} s") from error
+    except OSError as error:
+        raise BusError(f"{url} cannot be reached: {error.strerror or error}") from error
+    head, _, body = reply.partition(b"\r\n\r\n")
+    status = head.split(b"\r\n", 1)[0].split(b" ")
+    code = status[1].decode("ascii", "replace") if len(status) > 1 and status[0].startswith(b"HTTP/") else "no HTTP"
+    try:
+        told = json.loads(body) if code in ("200", "503") else None
+    except (ValueError, RecursionError):
+        told = None
+    if not isinstance(told, dict) or "status" not in told:
+        raise BusError(f"{url} answers {code[:20]}: there is no page of health")
+    return Answer(code == "200", told)
+
+
+def _place(url: str) -> tuple[str, int, str]:
+    try:
+        parts = urllib.parse.urlsplit(url)
+        host, port = parts.hostname, parts.port
+        path = parts.path if parts.path != "/" else ""
+        if parts.scheme == "http" and host and port and (path + host).isascii() and " " not in path:
+            return host, port, path
+    except ValueError:
+        pass
+    raise ConfigError(f"--url {url[:_LONGEST]!r} is no address such as http://127.0.0.1:9464")
+
+
+def _read(connection: socket.socket) -> bytes:
+    until_s = time.monotonic() + _TIMEOUT_S
+    reply = b""
+    while len(reply) < _MOST_BYTES:
+        connection.settimeout(max(until_s - time.monotonic(), 0.001))
+        part = connection.recv(65536)
+        if not part:
+            break
+        reply += part
+    return reply
+
+
+def fast(words: Sequence[str]) -> int | None:
+    """The exit code of `swarm health --url URL [--live] [--json]`; None where that is not what the words say, which
+    is then the command line's to read."""
+    if len(words) < 3 or words[0] != "health" or words[1] != "--url" or not set(words[3:]) <= {"--live", "--json"}:
+        return None
+    try:
+        return ask(words[2], live="--live" in words).show(as_json="--json" in words)
+    except SwarmError as error:
+        print(f"swarm: {error}", file=sys.stderr)
+        return error.exit_code

@@ -1,0 +1,66 @@
+"""What a launcher tells other programs: figures and health by HTTP, if it is given a port, and how it is to the
+supervisor that started it, if there is one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from launch_scripts.health.verdict import Process
+from launch_scripts.launcher.up_options import UpOptions
+from swarm.runtime.health import Health
+from swarm.runtime.supervisor import supervisor_of
+
+if TYPE_CHECKING:
+    from launch_scripts.report.latest_state import Observed
+
+_TURNS_HZ = 2.0
+"""How often a launcher turns, at least."""
+_NAME = "launcher"
+
+
+class MachineSignals:
+    """Raises BusError if the port is taken.
+
+    seen  how the processes are that this launcher has started; called by any thread
+    """
+
+    def __init__(self, options: UpOptions, run_id: str, seen: Callable[[], Sequence[Process]]) -> None:
+        self._run = (run_id, options.scenario.name)
+        self._health = Health(supervisor=supervisor_of(os.environ))
+        self._health.starts("the start of its processes")
+        self._health.begins(_TURNS_HZ)
+        self.url = ""
+        """Of the figures; empty without a port."""
+        self._metrics = None
+        if options.metrics_port is not None:
+            from launch_scripts.metrics.endpoint import MetricsEndpoint  # takes time to import
+
+            board = self._health.board
+            self._metrics = MetricsEndpoint(
+                options.metrics_port,
+                lambda: [Process(_NAME, board.read()), *seen()],
+                options.signals_address,
+            )
+            self.url = self._metrics.url
+
+    def turned(self, observed: Observed, started_ns: int, missing: Sequence[str]) -> None:
+        """The launcher has turned: tells so, and answers who has asked for figures since the last time.
+
+        missing  names of processes that it has started and nobody has heard yet
+        """
+        self._health.turned([f"word of {name}" for name in missing])
+        if self._metrics is not None:
+            from launch_scripts.metrics.families import Figures, Run, families
+
+            run = Run(*self._run, started_ns)
+            self._metrics.answer(lambda: families(Figures(run, observed, observed.status, observed.up())))
+
+    def ends(self) -> None:
+        """The run ends from now on; figures are answered no more."""
+        self._health.ends()
+
+    def close(self) -> None:
+        if self._metrics is not None:
+            self._metrics.close()

@@ -1,0 +1,1 @@
+"""Studies: scenarios x settings x seeds through the simulation, over many processes or machines."""

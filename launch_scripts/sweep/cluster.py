@@ -1,0 +1,104 @@
+"""Trials on Dask's workers: a cluster of this machine, or one that is there."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import dask
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed.client import FutureCancelledError
+
+from launch_scripts.sweep.trial import Result, Trial, run_trial
+from swarm.errors import BusError
+
+AHEAD = 3
+"""Trials per worker that the scheduler has: those behind the running one spare a way there and back."""
+MOST_DEATHS = 3
+"""A trial whose worker has died more often than this is given up: it kills them itself."""
+_CONNECT_S = 10.0
+_SETTINGS: dict[str, Any] = {
+    # A profiler that looks at the simulation every 10 ms, and a watch on who holds the interpreter, cost as much as
+    # they show.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.scheduler.allowed-failures": MOST_DEATHS,
+}
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def local_client(workers: int) -> Iterator[Client]:
+    """A cluster of so many processes, all on loopback. One that dies is started again; all end with the block."""
+    with (
+        dask.config.set(_SETTINGS),
+        tempfile.TemporaryDirectory(prefix="swarm-sweep-") as folder,
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=0,  # a limit would kill what a plain loop lets run
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+            preload="launch_scripts.sweep.worker_process",
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@contextlib.contextmanager
+def client_of(address: str) -> Iterator[Client]:
+    """A cluster that is there. Raises BusError where no scheduler answers."""
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise BusError(f"--scheduler {address}: no scheduler of Dask answers within {_CONNECT_S:g} s") from error
+    with client:
+        yield client
+
+
+def run_trials(client: Client, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Result | None]]:
+    """The result of each trial, as they come; None of one that is given up (`MOST_DEATHS`). A worker that dies
+    loses nothing: what it had goes to another. Raises what a trial raises, and BusError if the scheduler
+    is gone."""
+    rest = iter(trials)
+    given: dict[str, Trial] = {}
+    done = as_completed(loop=client.loop)
+
+    def fill() -> None:
+        threads = sum(each["nthreads"] for each in client.scheduler_info()["workers"].values())
+        for trial in itertools.islice(rest, max(0, AHEAD * max(1, threads) - len(given))):
+            future = client.submit(run_trial, trial, key=trial.key, retries=0)
+            given[trial.key] = trial
+            done.add(future)
+
+    fill()
+    while given:
+        future = next(done)
+        trial = given.pop(str(future.key))
+        try:
+            result = future.result()
+        except KilledWorker:
+            result = None
+        except FutureCancelledError as error:
+            raise BusError(
+                "the scheduler of Dask is gone: results so far are kept, start again to go on"
+            ) from error
+        yield trial, result
+        del future  # so that the cluster forgets it
+        fill()

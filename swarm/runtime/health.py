@@ -1,0 +1,131 @@
+"""How a process is, as its own loop says at each tick, for whoever asks from another thread or process.
+
+The loop writes into a small piece of memory and waits for nobody; readers take no lock that it holds. So a process
+whose loop hangs, or that is stopped, is still read: what it wrote last grows old.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import msgspec
+
+from swarm.clock import NS_PER_S
+from swarm.runtime.supervisor import Supervisor
+
+HUNG_S, HUNG_PERIODS = 10.0, 20
+"""A loop that has not ticked for so long hangs: longer than a busy machine keeps a process from its tick."""
+SLOT_BYTES = 1024
+BOARD_BYTES = 2 * SLOT_BYTES
+_HEAD = struct.Struct("<IQQBH")
+"""Checksum of all behind it, when it was written, `limit_ns`, phase, length of what follows."""
+_CHECKED = 4
+_WRITE_NS = NS_PER_S // 10
+_LONGEST_NEED = 100
+
+
+class Phase(IntEnum):
+    """STARTS until the loop turns, which may take as long as its router is not there; ENDS once it is asked to."""
+
+    STARTS = 0
+    RUNS = 1
+    ENDS = 2
+
+
+class Vitals(NamedTuple):
+    """What a process has said of itself last.
+
+    stamp_ns  when, on the monotonic clock of the machine
+    limit_ns  if older, its loop hangs
+    lacks     what its role needs and is not there, one short text each; empty if it is ready
+    """
+
+    stamp_ns: int
+    limit_ns: int
+    phase: Phase
+    lacks: tuple[str, ...]
+
+    def hangs(self, now_ns: int) -> bool:
+        """Whether its loop has stood still for too long. That of a process which starts or ends does not turn."""
+        return self.phase is Phase.RUNS and now_ns - self.stamp_ns > self.limit_ns
+
+
+class Board:
+    """Memory of `BOARD_BYTES`, shared or not, into which one thread writes and which any other reads.
+
+    Two slots with checksums, written in turn: a reader takes the newer of those that are whole, so a writer that is
+    stopped or killed in the middle of one harms nothing.
+    """
+
+    def __init__(self, memory: Any = None) -> None:
+        """`memory`: a bytearray, or an array of bytes of ctypes; if not given, one of this process's own."""
+        self._memory = bytearray(BOARD_BYTES) if memory is None else memory
+        self._slot = 0
+
+    def write(self, vitals: Vitals) -> None:
+        """Called by one thread only."""
+        lacks = [need[:_LONGEST_NEED] for need in vitals.lacks]
+        while len(text := msgspec.json.encode(lacks)) > SLOT_BYTES - _HEAD.size:
+            lacks.pop()
+        record = _HEAD.pack(0, vitals.stamp_ns, vitals.limit_ns, vitals.phase, len(text)) + text
+        at = self._slot * SLOT_BYTES
+        self._memory[at : at + len(record)] = struct.pack("<I", crc32(record[_CHECKED:])) + record[_CHECKED:]
+        self._slot = 1 - self._slot
+
+    def read(self) -> Vitals | None:
+        """What was written last; None if nothing was. Called by any thread, of any process that has the memory."""
+        found = [_record(bytes(self._memory[at : at + SLOT_BYTES])) for at in (0, SLOT_BYTES)]
+        return max((each for each in found if each is not None), default=None)
+
+
+def _record(slot: bytes) -> Vitals | None:
+    checksum, stamp_ns, limit_ns, phase, length = _HEAD.unpack_from(slot)
+    if not stamp_ns or crc32(slot[_CHECKED : _HEAD.size + length]) != checksum:
+        return None
+    lacks = msgspec.json.decode(slot[_HEAD.size : _HEAD.size + length], type=tuple[str, ...])
+    return Vitals(stamp_ns, limit_ns, Phase(phase), lacks)
+
+
+class Health:
+    """What the loop of one process tells: on a board, and to the supervisor that started it."""
+
+    def __init__(self, board: Board | None = None, supervisor: Supervisor | None = None) -> None:
+        self.board = board or Board()
+        self._supervisor = supervisor or Supervisor(None)
+        self._told = Vitals(0, 0, Phase.STARTS, ())
+        self._limit_ns = 0
+        self.starts("its start")
+
+    def starts(self, what: str) -> None:
+        """The process is busy with what comes before its loop."""
+        self._write(Vitals(time.monotonic_ns(), 0, Phase.STARTS, (what,)))
+        self._supervisor.says(what)
+
+    def begins(self, tick_hz: float) -> None:
+        """The loop turns from now on, so often."""
+        self._limit_ns = int(max(HUNG_S, HUNG_PERIODS / tick_hz) * NS_PER_S)
+
+    def turned(self, lacks: Sequence[str]) -> None:
+        """The loop has ticked. `lacks`: as in `Vitals`."""
+        now_ns = time.monotonic_ns()
+        vitals = Vitals(now_ns, self._limit_ns, Phase.RUNS, tuple(lacks))
+        news = (vitals.phase, vitals.lacks) != (self._told.phase, self._told.lacks)
+        if news or now_ns - self._told.stamp_ns >= _WRITE_NS:
+            self._write(vitals)
+        if news:
+            self._supervisor.says(f"waits for {', '.join(lacks)}" if lacks else "ready")
+        self._supervisor.turned(now_ns)
+
+    def ends(self) -> None:
+        """The loop has ended; what comes now is the end of the process."""
+        self._write(Vitals(time.monotonic_ns(), 0, Phase.ENDS, ("it ends",)))
+        self._supervisor.ends()
+
+    def _write(self, vitals: Vitals) -> None:
+        self.board.write(vitals)
+        self._told = vitals

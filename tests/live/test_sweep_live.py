@@ -1,0 +1,112 @@
+"""`swarm sweep` on a cluster of this machine: nothing is lost by a worker or a sweep that is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.small_study import STUDY, write_study
+
+from launch_scripts.sweep import cluster
+from launch_scripts.sweep.cluster import client_of, local_client, run_trials
+from launch_scripts.sweep.plan import plan, trials_of
+from launch_scripts.sweep.run import RESULTS, Sweep
+from launch_scripts.sweep.store import ResultStore
+from launch_scripts.sweep.study import load_study
+from launch_scripts.sweep.trial import run_trial
+from swarm.errors import BusError
+
+pytestmark = [pytest.mark.network, pytest.mark.timeout(280)]
+COMMAND = (sys.executable, "-c", "import sys; from launch_scripts.entry import main; sys.exit(main())")
+
+
+def wait_until(happens: Callable[[], bool], within_s: float = 200.0) -> None:
+    until_s = time.monotonic() + within_s
+    while not happens():
+        assert time.monotonic() < until_s
+        time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: Path):
+    trials = list(trials_of(plan(load_study(write_study(tmp_path)), tmp_path, "x")))
+    found = {}
+    with local_client(2) as client:
+        assert client.scheduler_info()["address"].startswith("tcp://127.0.0.1:")
+        pids = sorted(client.run(os.getpid).values())
+        for trial, result in run_trials(client, trials):
+            assert result is not None
+            found[trial.key] = result.figures
+            if len(found) == 1:
+                os.kill(pids[0], signal.SIGKILL)
+    assert found.keys() == {trial.key for trial in trials}
+    assert found[trials[-1].key] == run_trial(trials[-1]).figures
+    assert not any(alive(pid) for pid in pids)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.thorough)])
+def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_path: Path, number: signal.Signals):
+    path, out = write_study(tmp_path, STUDY.replace('"0:3"', '"0:100"')), tmp_path / "out"
+    words = [*COMMAND, "sweep", str(path), "--workers", "1", "--out", str(out)]
+    running = subprocess.Popen(words, stderr=subprocess.PIPE, start_new_session=True, text=True)
+    try:
+        wait_until(lambda: any(out.glob("parts/*.parquet")) or running.poll() is not None)
+        if number == signal.SIGINT:
+            os.killpg(running.pid, number)  # as a terminal does
+        else:
+            running.send_signal(number)
+        _, said = running.communicate(timeout=200)
+    finally:
+        running.kill()
+    kept = ResultStore(out).results
+    assert 0 < len(kept) < 200
+    if number == signal.SIGINT:
+        assert running.returncode == 130
+        assert f"{len(kept)} of 200 trials are kept in" in said
+        assert "Traceback" not in said
+    else:
+        assert running.returncode == -number
+    wait_until(lambda: not _left(running.pid))
+    sweep = Sweep(path, out)
+    assert len(sweep.missing) == 200 - len(kept)
+    path.write_text(STUDY.replace('"0:3"', '"0:1"').replace("[60, 120]", "[60]"), encoding="utf-8")
+    assert subprocess.run(words, capture_output=True, check=True, timeout=200).returncode == 0
+    assert (out / RESULTS).is_file()
+
+
+def _left(session: int) -> list[int]:
+    """Processes of a session that are left."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == session and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def test_a_scheduler_that_is_there_is_used_and_one_that_is_not_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    [trial, *_] = trials_of(plan(load_study(write_study(tmp_path)), tmp_path, "x"))
+    with local_client(1) as there, client_of(there.scheduler_info()["address"]) as client:
+        [(_, result)] = run_trials(client, [trial])
+        assert result is not None
+        assert result.key == trial.key
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    with pytest.raises(BusError, match="no scheduler of Dask answers"), client_of("tcp://127.0.0.1:1"):
+        pass

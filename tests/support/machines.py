@@ -1,0 +1,101 @@
+"""Machines played by network namespaces on one bridge, each with an address of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from launch_scripts.bench.wire.partition import why_not
+
+__all__ = ["Machines", "machines", "why_not"]
+
+
+class Machines:
+    """The namespaces, what runs in them, and how it is ended.
+
+    addresses  name -> address
+    """
+
+    def __init__(self, addresses: Mapping[str, str]) -> None:
+        self.addresses = dict(addresses)
+        self._mark = f"{os.getpid() % 100_000}"
+        self._running: dict[str, list[subprocess.Popen[bytes]]] = {name: [] for name in addresses}
+
+    def space(self, name: str) -> str:
+        return f"swarm-{name}-{self._mark}"
+
+    def build(self) -> None:
+        switch = self.space("switch")
+        _ip("netns", "add", switch)
+        _ip("-n", switch, "link", "add", "bridge", "type", "bridge")
+        _ip("-n", switch, "link", "set", "bridge", "up")
+        for n, (name, address) in enumerate(self.addresses.items()):
+            space, end = self.space(name), f"e{n}-{self._mark}"
+            _ip("netns", "add", space)
+            _ip("-n", switch, "link", "add", f"p{n}", "type", "veth", "peer", "name", end)
+            _ip("-n", switch, "link", "set", end, "netns", space)
+            _ip("-n", switch, "link", "set", f"p{n}", "master", "bridge", "up")
+            _ip("-n", space, "addr", "add", f"{address}/24", "dev", end)
+            _ip("-n", space, "link", "set", "lo", "up")
+            _ip("-n", space, "link", "set", end, "up")
+
+    def start(
+        self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str] | None = None
+    ) -> subprocess.Popen[bytes]:
+        """A command on a machine, in a session of its own."""
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                ["ip", "netns", "exec", self.space(name), *command],
+                stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True,
+                env={**os.environ, **(environment or {})},
+            )  # fmt: skip
+        self._running[name].append(process)
+        return process
+
+    def call(self, name: str, command: Sequence[str], within_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+        """A command on a machine, to its end."""
+        return subprocess.run(
+            ["ip", "netns", "exec", self.space(name), *command],
+            capture_output=True, text=True, timeout=within_s, check=False,
+        )  # fmt: skip
+
+    def lose(self, name: str) -> None:
+        """The machine loses its power: first its cable, so that nobody hears its processes end."""
+        _ip("-n", self.space("switch"), "link", "set", f"p{list(self.addresses).index(name)}", "down")
+        self._kill(name)
+
+    def _kill(self, name: str) -> None:
+        """Kills whatever runs in a machine's namespace, by what the kernel says is in it."""
+        found = subprocess.run(
+            ["ip", "netns", "pids", self.space(name)], capture_output=True, text=True, check=False
+        )
+        for pid in map(int, found.stdout.split()):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        for process in self._running[name]:
+            process.wait(10)
+
+    def close(self) -> None:
+        for name in self.addresses:
+            self._kill(name)
+        for name in (*self.addresses, "switch"):
+            subprocess.run(["ip", "netns", "del", self.space(name)], capture_output=True, check=False)
+
+
+@contextlib.contextmanager
+def machines(addresses: Mapping[str, str]) -> Iterator[Machines]:
+    made = Machines(addresses)
+    try:
+        made.build()
+        yield made
+    finally:
+        made.close()
+
+
+def _ip(*arguments: str) -> None:
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"ip {' '.join(arguments)}: {done.stderr.strip()}"

@@ -1,0 +1,48 @@
+"""The version before this one: `tests/live/neighbour_version.txt` names its commit, git has its tree."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import tarfile
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NAMED_IN = ROOT / "tests" / "live" / "neighbour_version.txt"
+"""Changed when a version is tagged, with the specimens of its messages (`tests/support/wire_specimens.py`)."""
+
+
+def neighbour_commit() -> str:
+    """The commit of the version before."""
+    return NAMED_IN.read_text(encoding="ascii").strip()
+
+
+@cache
+def _archive(commit: str) -> bytes | None:
+    command = ["git", "-C", str(ROOT), "archive", "--format=tar", commit]
+    try:
+        made = subprocess.run(command, capture_output=True, timeout=60, check=False)
+    except OSError:
+        return None
+    return made.stdout if made.returncode == 0 else None
+
+
+def neighbour_tree(folder: Path) -> Path:
+    """The files of the version before, below `folder`. Skips the test where git has not got them."""
+    commit = neighbour_commit()
+    archive = _archive(commit)
+    if archive is None:
+        pytest.skip(f"git has no commit {commit[:8]} here: the version before this one cannot be run")
+    tree = folder / f"tree-{commit[:8]}"
+    with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+        files.extractall(tree, filter="data")
+    return tree
+
+
+def environment_of(tree: Path) -> dict[str, str]:
+    """In which the interpreter of this test imports our packages from `tree`, whatever is installed."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join((str(tree), str(tree / "tests")))}

@@ -1,0 +1,42 @@
+"""A study of short trials: a hill with ten vehicles, as a scenario in a file of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SCENARIO = """
+name = "hill"
+seconds = 3
+time_scale = 10
+[terrain]
+source = "synthetic"
+rows = 32
+cols = 32
+resolution_m = 30
+[terrain.hidden]
+rubble_fields = 3
+[[targets]]
+count = 2
+speed_m_per_s = 3
+[[groups]]
+vehicles = 6
+[vehicles]
+per_agent = 3
+sense_range_m = 120
+capture_range_m = 60
+"""
+STUDY = """
+scenarios = ["hill.toml"]
+seeds = "0:3"
+outcomes = ["captures", "marks", "by_group.all.distance_m"]
+[parameters]
+vehicles.sense_range_m = [60, 120]
+"""
+
+
+def write_study(folder: Path, text: str = STUDY) -> Path:
+    """The file of a study, beside its scenario."""
+    (folder / "hill.toml").write_text(SCENARIO, encoding="utf-8")
+    path = folder / "study.toml"
+    path.write_text(text, encoding="utf-8")
+    return path

@@ -1,0 +1,212 @@
+"""The archives of `swarm deploy plan`: each machine gets what is its own, and what starts it is sound."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from launch_scripts.deploy.certificates import called_of, check_signed, hosts_of
+from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
+from launch_scripts.deploy.kits import write_kits
+from launch_scripts.deploy.plan import Plan, make_plan
+from launch_scripts.deploy.revocations import revoke
+from launch_scripts.deploy.systemd import UNIT, systemd_files, unit_text
+from launch_scripts.launcher.up_options import chosen_processes
+from swarm.config.load import load_scenario, parse_scenario
+
+SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'
+ON_GROUND = (
+    SCENARIO + '[terrain]\nsource = "hill.asc"\n[[cost.zones]]\nkind = "forbidden"\nfile = "parks/hill.shp"\n'
+)
+EXPOSURE = 13
+"""Tenths, in the words of `systemd-analyze security`; what is left is the network, kernels that are compiled, and
+`ioprio_set`."""
+
+
+def hosts(*addresses: str) -> HostsConfig:
+    rows = (f'[[hosts]]\nname = "m{n}"\naddress = "{address}"\n' for n, address in enumerate(addresses))
+    return parse_hosts("".join(rows))
+
+
+THREE = hosts("10.0.0.1", "10.0.0.2", "10.0.0.3")
+
+
+def planned(text: str = SCENARIO, machines: HostsConfig = THREE, base: Path | None = None) -> Plan:
+    return make_plan(parse_scenario(text, base=base), machines, "small-1")
+
+
+def unpacked(plan: Plan, out: Path) -> list[Path]:
+    """Writes archives and unpacks them; the folder of each machine."""
+    archives = write_kits(plan, out, systemd_files, 7)
+    for archive in archives:
+        assert stat.S_IMODE(archive.stat().st_mode) == 0o600
+        with tarfile.open(archive) as file:
+            file.extractall(out / "unpacked", filter="data")
+    return [out / "unpacked" / f"swarm-{host.name}" for host in plan.hosts]
+
+
+def test_each_machine_has_the_keys_of_its_own_processes_and_no_other(tmp_path: Path) -> None:
+    plan = planned()
+    folders = unpacked(plan, tmp_path)
+    keys: list[bytes] = []
+    for host, folder in zip(plan.hosts, folders, strict=True):
+        certs = folder / "certs"
+        names = {process.certificate for process in host.processes} | {"operator.0"}
+        assert {path.stem for path in certs.glob("*.key")} == names
+        assert {path.stem for path in certs.glob("*.pem")} == {*names, "ca"}
+        for name in names:
+            check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
+            assert stat.S_IMODE((certs / f"{name}.key").stat().st_mode) == 0o600
+        assert called_of(certs / "operator.0.pem") == f"operator.{host.name}"
+        (router,) = host.of("router")
+        assert hosts_of(certs / f"{router.certificate}.pem") == {host.address, "localhost", "127.0.0.1"}
+        keys += [path.read_bytes() for path in certs.glob("*.key")]
+    assert len(keys) == len(set(keys))
+
+
+def test_a_second_plan_keeps_keys_that_need_not_be_others(tmp_path: Path) -> None:
+    certs = tmp_path / "certs"
+
+    def keys() -> dict[str, bytes]:
+        return {path.stem: path.read_bytes() for path in certs.glob("*.key")}
+
+    write_kits(planned(), tmp_path, systemd_files, 7)
+    before = keys()
+    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.9", "10.0.0.3")), tmp_path, systemd_files, 7)
+    assert {name for name, key in keys().items() if key != before[name]} == {"router.1"}
+    before = keys()
+    revoke(certs, ["agent.all.a0"])
+    (first, *_) = unpacked(planned(), tmp_path)
+    assert {name for name, key in keys().items() if key != before[name]} == {"router.1", "agent.all.a0"}
+    assert called_of(certs / "agent.all.a0.pem") == "agent.all.a0~2"
+    assert (first / "certs" / "revoked").read_text() == "agent.all.a0\n"
+
+
+def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_its_own_processes(
+    tmp_path: Path,
+) -> None:
+    plan = planned()
+    for host, folder in zip(plan.hosts, unpacked(plan, tmp_path), strict=True):
+        scenario = load_scenario(folder / "scenario.toml")
+        assert scenario.network.listen == host.listen
+        assert scenario.network.connect == host.connect
+        assert scenario.network.peers == host.peers
+        assert scenario.network.admit == plan.scenario.network.admit
+        assert scenario.standbys == plan.scenario.standbys
+        assert (scenario.targets, scenario.groups) == (plan.scenario.targets, plan.scenario.groups)
+        words = re.findall(r"--only (\S+)", (folder / "run").read_text())
+        assert words == re.findall(r"--only (\S+)", (folder / UNIT).read_text())
+        started = [(spec.role, spec.id) for spec in chosen_processes(scenario, words, None)]
+        assert started == [(process.role, process.id) for process in host.processes]
+
+
+def test_files_of_the_terrain_go_to_keepers_and_the_targets_process_with_all_that_belongs_to_them(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "parks").mkdir()
+    for name in ("hill.asc", "hill.prj", "hill.toml", "parks/hill.shp", "parks/hill.dbf"):
+        (tmp_path / name).write_text(name)
+    plan = planned(ON_GROUND, base=tmp_path)
+    folders = unpacked(plan, tmp_path / "kits")
+    having = [host.has_files for host in plan.hosts]
+    assert sorted(having) == [False, True, True]
+    for has, folder in zip(having, folders, strict=True):
+        found = {str(path.relative_to(folder)): path.read_text() for path in folder.rglob("hill.*")}
+        files = {"hill.asc", "hill.prj", "parks/hill.shp", "parks/hill.dbf"}
+        assert set(found.values()) == (files if has else set())
+        scenario = load_scenario(folder / "scenario.toml")
+        named = [scenario.terrain.source, scenario.cost.zones[0].file]
+        assert [Path(str(name)).is_file() for name in named] == [has, has]
+
+
+def test_modules_of_plug_ins_lie_beside_the_scenario(tmp_path: Path) -> None:
+    (tmp_path / "zigzag.py").write_text("import helper\n")
+    (tmp_path / "helper.py").write_text("")
+    text = SCENARIO.replace("count = 2", 'count = 2\nwalk = "zigzag:Walk"')
+    for folder in unpacked(planned(text, base=tmp_path), tmp_path / "kits"):
+        assert sorted(path.name for path in (folder / "plugins").iterdir()) == ["helper.py", "zigzag.py"]
+        assert load_scenario(folder / "scenario.toml").plugin_folder == str(folder / "plugins")
+
+
+def test_install_puts_files_where_the_unit_looks_for_them_and_takes_over_a_new_plan(tmp_path: Path) -> None:
+    root, plan = tmp_path / "root", planned()
+    for _ in range(2):
+        folder = unpacked(plan, tmp_path)[0]
+        home = root / "etc/swarm"
+        if home.exists():
+            (home / "certs" / "agent.all.old.key").write_text("of an earlier plan")
+            (home / "certs" / "revoked").write_text("agent.all.a9\n")
+        done = subprocess.run(
+            [str(folder / "install")], env={"PATH": "/usr/bin:/bin", "DESTDIR": str(root)}, capture_output=True,
+            text=True, check=False, timeout=30,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, "")
+        revoke(tmp_path / "certs", ["agent.all.a3"])
+    assert {path.name for path in (home / "certs").iterdir()} == {
+        *(path.name for path in (folder / "certs").iterdir()), "revoked",
+    }  # fmt: skip
+    assert set((home / "certs" / "revoked").read_text().split()) == {"agent.all.a3", "agent.all.a9"}
+    assert not any(stat.S_IMODE(path.stat().st_mode) & 0o007 for path in (home, *home.rglob("*")))
+    unit = (root / "etc/systemd/system" / UNIT).read_text()
+    assert f"ExecStart=/opt/swarm/bin/swarm up /{home.relative_to(root)}/scenario.toml" in unit
+
+
+@pytest.mark.parametrize("script", ["install", "run"])
+def test_scripts_are_scripts_of_a_posix_shell(script: str, tmp_path: Path) -> None:
+    plan = planned()
+    path = tmp_path / script
+    path.write_text(systemd_files(plan, plan.hosts[0])[script])
+    assert subprocess.run(["sh", "-n", path], check=False).returncode == 0
+    dash = shutil.which("dash")
+    assert dash is None or subprocess.run([dash, "-n", path], check=False).returncode == 0
+
+
+def analyze(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`systemd-analyze` on the unit of a machine, with a program that is there in place of the swarm's."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("there is no systemd-analyze (package systemd)")
+    plan = planned()
+    path = tmp_path / UNIT
+    path.write_text(unit_text(plan, plan.hosts[0]).replace("/opt/swarm/bin/swarm", sys.executable))
+    return subprocess.run(
+        ["systemd-analyze", *arguments, str(path)], capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+    done = analyze(tmp_path, "verify", "--man=no")
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+def test_systemd_finds_a_fault_that_is_made(tmp_path: Path) -> None:
+    """So that the test above can fail."""
+    plan = planned()
+    text = unit_text(plan, plan.hosts[0]).replace("Restart=always", "Restart=sometimes")
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("there is no systemd-analyze (package systemd)")
+    path = tmp_path / UNIT
+    path.write_text(text)
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(path)], capture_output=True, text=True, check=False
+    )
+    assert "sometimes" in done.stderr
+
+
+def test_the_service_is_shut_off_from_the_rest_of_the_machine(tmp_path: Path) -> None:
+    done = analyze(tmp_path, "security", "--offline=true", "--no-pager", f"--threshold={EXPOSURE}")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_plan_is_the_same_from_its_archive(tmp_path: Path) -> None:
+    plan = planned()
+    texts = {(folder / "plan.json").read_text() for folder in unpacked(plan, tmp_path)}
+    (text,) = texts
+    assert msgspec.json.decode(msgspec.json.encode(plan.hosts)) == msgspec.json.decode(text)["hosts"]

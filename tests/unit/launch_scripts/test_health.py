@@ -1,0 +1,270 @@
+"""Probes are answered from what processes said last: while a loop hangs, whatever else is asked, and in one
+sentence each."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.processes import eventually
+
+from launch_scripts.health.pages import PageServer, health_pages
+from launch_scripts.health.probe import ask, fast
+from launch_scripts.health.verdict import HEALTHY, READY, Process, verdict
+from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher.warm_up import WarmUp
+from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS
+from launch_scripts.process_table import ProcessSpec
+from swarm.config.scenario import Scenario
+from swarm.errors import BusError, ConfigError
+from swarm.runtime.health import Health, Phase, Vitals
+from swarm.runtime.role import RoleSetup
+
+_NOW_NS = 100_000_000_000
+
+processes = st.builds(
+    Process,
+    st.text(max_size=8),
+    st.none()
+    | st.builds(
+        Vitals,
+        st.integers(1, _NOW_NS),
+        st.integers(0, _NOW_NS),
+        st.sampled_from(Phase),
+        st.lists(st.text(max_size=9), max_size=3).map(tuple),
+    ),
+    st.none() | st.text(max_size=9),
+)
+
+
+@given(st.lists(processes, max_size=5))
+def test_a_machine_is_well_exactly_if_each_of_its_processes_is(seen: list[Process]) -> None:
+    lives, ready = verdict(HEALTHY, seen, _NOW_NS), verdict(READY, seen, _NOW_NS)
+    assert lives.ok == all(verdict(HEALTHY, [each], _NOW_NS).ok for each in seen)
+    assert ready.ok == all(verdict(READY, [each], _NOW_NS).ok for each in seen)
+    assert lives.ok or not ready.ok, "what hangs is not ready"
+    for found in (lives, ready):
+        assert found.body.isascii()
+        told = json.loads(found.body)
+        assert told["status"] in ("healthy", "not healthy", "ready", "not ready")
+        assert (not told["missing"]) is found.ok
+        assert [each["name"] for each in told["processes"]] == [each.name for each in seen]
+
+
+def test_what_is_wrong_is_said_in_words() -> None:
+    hung = Process("planner-t0", Vitals(_NOW_NS - 30_000_000_000, 10_000_000_000, Phase.RUNS, ()))
+    seen = [hung, Process("agent-a0", None), Process("keeper-0", None, "it has ended and is started again")]
+    assert verdict(HEALTHY, seen, _NOW_NS).missing == ("planner-t0: its loop hangs for 30 s",)
+    assert verdict(READY, seen, _NOW_NS).missing == (
+        "planner-t0: its loop hangs for 30 s",
+        "agent-a0: its start",
+        "keeper-0: it has ended and is started again",
+    )
+
+
+@pytest.fixture
+def health() -> Health:
+    made = Health()
+    made.begins(10)
+    return made
+
+
+@pytest.fixture
+def server(health: Health) -> Iterator[PageServer]:
+    made = PageServer("health port", 0, health_pages(lambda: [Process("agent-a0", health.board.read())]))
+    yield made
+    made.close()
+
+
+def place(server: PageServer) -> tuple[str, int]:
+    host, _, port = server.url.removeprefix("http://").rpartition(":")
+    return host, int(port)
+
+
+def test_a_probe_is_told_what_is_missing_and_exits_by_it(
+    server: PageServer, health: Health, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["health", "--url", server.url]
+    assert fast(words) == 1
+    assert capsys.readouterr().out == "not ready\nagent-a0: its start\n"
+    assert fast([*words, "--live"]) == 0
+    health.turned(["places for its vehicles"])
+    assert fast(words) == 1
+    health.turned([])
+    assert fast([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.partition("vehicles\n")[2])["status"] == "ready"
+    assert ask(f"{server.url}/healthz", live=False).told["status"] == "healthy", "a path is asked as it is"
+
+
+def test_a_probe_says_what_it_could_not_reach(server: PageServer, capsys: pytest.CaptureFixture[str]) -> None:
+    server.close()
+    assert fast(["health", "--url", server.url]) == 4
+    assert capsys.readouterr().err == f"swarm: {server.url} cannot be reached: Connection refused\n"
+    for wrong in ("127.0.0.1:9464", "https://127.0.0.1:1", "http://x:99999", "http://[", "", "http://h:1/ä"):
+        with pytest.raises(ConfigError, match="is no address such as"):
+            ask(wrong, live=False)
+    assert fast(["health", "--connect", "tcp/127.0.0.1:7447"]) is None, "that is the command line's"
+    assert fast(["health", "--url", server.url, "--run", "x"]) is None
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        b"",
+        b"SSH-2.0-x\r\n\r\n",
+        b"HTTP/1.0 404 Not Found\r\n\r\n{}",
+        b"HTTP/1.0 200 OK\r\n\r\n[]",
+        b"HTTP/1.0 200 OK\r\n\r\n{",
+        b"HTTP/1.0 \xff\xff\r\n\r\n",
+        b"HTTP/1.0 200 OK\r\n\r\n" + b"[" * 100_000,
+    ],
+)
+def test_whoever_answers_something_else_is_not_taken_for_a_page_of_health(reply: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def serve() -> None:
+            connection, _ = listening.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(reply)
+
+        visitor = threading.Thread(target=serve)
+        visitor.start()
+        with pytest.raises(BusError, match=r"there is no page of health|cannot be reached"):
+            ask(f"http://127.0.0.1:{listening.getsockname()[1]}", live=False)
+        visitor.join(10)
+
+
+def test_nothing_that_a_stranger_answers_is_obeyed_by_a_terminal() -> None:
+    from launch_scripts.health.probe import Answer
+
+    lines = Answer(False, {"status": "\x1b[2J", "missing": ["a\nb", {"x": "\x9b"}]}).lines()
+    assert all(line.isprintable() for line in lines)
+
+
+@pytest.mark.parametrize(
+    "request_bytes",
+    [
+        b"\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"GET /healthz HTTP/9.9\r\n\r\n",
+        b"POST /healthz HTTP/1.0\r\nHost: localhost\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\nHost: example.org\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
+        b"GET /../../etc/passwd HTTP/1.0\r\nHost: localhost\r\n\r\n",
+        b"GET /" + b"x" * 70_000 + b" HTTP/1.0\r\n\r\n",
+        b"GET /healthz HTTP/1.0\r\n" + b"A: b\r\n" * 5000 + b"\r\n",
+        b"GET /healthz HTTP/1.0\r\nA" + b"b" * 200_000 + b"\r\n\r\n",
+        bytes(range(256)) * 40,
+    ],
+)
+def test_a_hostile_request_is_refused_and_the_next_probe_is_answered(
+    server: PageServer, request_bytes: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_connection(place(server), 10) as visitor:
+        answer = b""
+        with contextlib.suppress(OSError):  # it may be cut
+            visitor.sendall(request_bytes)
+            visitor.shutdown(socket.SHUT_WR)
+            while part := visitor.recv(4096):
+                answer += part
+    assert b" 200 " not in answer.partition(b"\r\n")[0]
+    assert ask(server.url, live=True).ok
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_one_who_holds_all_connections_open_keeps_no_probe_out(server: PageServer) -> None:
+    held = [socket.create_connection(place(server), 10) for _ in range(2 * MOST_CONNECTIONS)]
+    try:
+        for each in held:
+            with contextlib.suppress(OSError):  # it may have been cut already
+                each.sendall(b"GET /healthz HTT")
+        for _ in range(5):
+            assert ask(server.url, live=True).ok
+    finally:
+        for each in held:
+            each.close()
+
+
+def test_only_an_address_beyond_this_machine_serves_others_by_name(health: Health) -> None:
+    pages = health_pages(lambda: [Process("agent-a0", health.board.read())])
+    for address, code in (("127.0.0.1", 403), ("0.0.0.0", 200)):
+        server = PageServer("health port", 0, pages, address)
+        connection = http.client.HTTPConnection("127.0.0.1", place(server)[1], timeout=10)
+        connection.request("GET", "/healthz", headers={"Host": "pod-7.example.org:9464"})
+        assert connection.getresponse().status == code
+        connection.close()
+        server.close()
+
+
+def test_a_port_or_address_that_cannot_be_had_is_named(server: PageServer) -> None:
+    with pytest.raises(BusError, match=f"health port {place(server)[1]} cannot be opened: Address already in use"):
+        PageServer("health port", place(server)[1], {})
+    with pytest.raises(BusError, match=r"health port 0 at 192\.0\.2\.1 cannot be opened"):
+        PageServer("health port", 0, {}, "192.0.2.1")
+
+
+def test_a_probe_loads_no_command_line() -> None:
+    """A probe is started every few seconds, on machines that are busy."""
+    what = (
+        "import sys; sys.argv = ['swarm', 'health', '--url', 'http://127.0.0.1:1'];"
+        "from launch_scripts.entry import main; code = main();"
+        "print(code, *sorted({name.partition('.')[0] for name in sys.modules}))"
+    )
+    told = subprocess.run([sys.executable, "-c", what], capture_output=True, text=True, timeout=60, check=True)
+    code, *loaded = told.stdout.split()
+    assert code == "4"
+    heavy = {"typer", "click", "rich", "numpy", "msgspec", "zenoh", "asyncio", "http", "email", "ssl", "numba"}
+    assert not heavy & set(loaded)
+
+
+@pytest.mark.network
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_launcher_sees_a_process_that_is_stopped_and_one_that_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warm_up = WarmUp(None)
+    warm_up.begin()
+    eventually(lambda: warm_up.done(0.05), 20)
+
+    def setup_of(spec: ProcessSpec) -> RoleSetup:
+        return RoleSetup(Scenario(), "run-1", spec.role, spec.id, time.time_ns(), 0, tmp_path)
+
+    swarm = LocalSwarm([ProcessSpec("planner", "t0", "support.dummy_roles:tick")], setup_of, tmp_path)
+    try:
+        assert verdict(READY, swarm.seen(), time.monotonic_ns()).missing == ("planner-t0: it does not run",)
+        swarm.start()
+        eventually(lambda: verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "ready")
+        [running] = swarm.running
+        assert running.process is not None
+        pid = running.process.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+
+        def later_ns() -> int:
+            return time.monotonic_ns() + 11_000_000_000
+
+        eventually(lambda: not verdict(HEALTHY, swarm.seen(), later_ns()).ok, 20, "that it hangs")
+        os.kill(pid, signal.SIGCONT)
+        eventually(lambda: verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "ready again")
+        os.kill(pid, signal.SIGKILL)
+        eventually(lambda: swarm.poll() or not verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "its end")
+        assert verdict(HEALTHY, swarm.seen(), time.monotonic_ns()).ok, "the launcher starts it again"
+        eventually(
+            lambda: swarm.poll() or verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "its next life"
+        )
+    finally:
+        swarm.kill()

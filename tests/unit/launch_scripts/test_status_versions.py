@@ -1,0 +1,55 @@
+"""`swarm status` says which processes speak an older wire version, and names those that are too far apart."""
+
+from __future__ import annotations
+
+import io
+
+import msgspec
+from rich.console import Console
+from support.client_rig import run_info
+from support.swarm_model import SwarmModel
+
+from launch_scripts.commands.running.status import Status, StatusWatch, print_status, status_fields
+from swarm.bus.bus import AskEnded, Replied
+from swarm.grid import GridSpec
+from swarm.wire.topics import RUN
+
+INFO = run_info(GridSpec(4, 5, 90.0))
+
+
+def status_of(**wire_versions: int) -> Status:
+    """What is told once agents with these wire versions have answered."""
+    watch = StatusWatch(SwarmModel().bus("status"), lambda _: None)
+    for id, wire in wire_versions.items():
+        info = msgspec.structs.replace(INFO, role="agent", id=id, wire_version=wire)
+        watch.take(Replied("status-run", RUN, {}, info), 0)
+    watch.take(AskEnded("status-run", RUN, len(wire_versions), None), 0)
+    status = watch.status(0)
+    assert status is not None
+    return status
+
+
+def printed(status: Status) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    print_status(status, console)
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return text
+
+
+def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version() -> None:
+    status = status_of(a0=8, a1=9, a2=9)
+    assert "an upgrade is under way: wire version 9, but 8 of agent-a0" in printed(status)
+    assert {each["id"]: each["wire_version"] for each in status_fields(status)["processes"]} == {
+        "a0": 8, "a1": 9, "a2": 9,
+    }  # fmt: skip
+
+
+def test_where_all_speak_one_version_nothing_is_said_of_it() -> None:
+    assert "wire version" not in printed(status_of(a0=9, a1=9))
+
+
+def test_a_process_whose_version_is_no_neighbour_of_the_run_s_is_a_stranger() -> None:
+    status = status_of(a0=10, a1=8, a2=8)
+    assert [info.id for info in status.strangers] == ["a0"]
+    assert "stranger agent-a0 answers for run run, terrain" in printed(status)
+    assert "wire version 10" in printed(status)

@@ -1,0 +1,366 @@
+"""`swarm sweep` without a cluster: what a study means, what a trial does, what is kept and told."""
+
+from __future__ import annotations
+
+import json
+import statistics as plain
+from pathlib import Path
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.small_study import STUDY, write_study
+
+from launch_scripts.simulation.simulate import simulate
+from launch_scripts.simulation.trial import BrokenLaw, try_seed
+from launch_scripts.sweep import statistics
+from launch_scripts.sweep.plan import plan
+from launch_scripts.sweep.run import Sweep
+from launch_scripts.sweep.store import ResultStore
+from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study
+from launch_scripts.sweep.summary import Summary
+from launch_scripts.sweep.trial import Result, Trial, numbers, run_trial
+from swarm.config.dotted import flat, with_settings
+from swarm.config.load import load_scenario, parse_scenario
+from swarm.errors import ConfigError, StoreError
+
+
+def result_of(trial: Trial, broken: tuple[BrokenLaw, ...] = (), **figures: float) -> Result:
+    return Result(key=trial.key, figures=figures, broken=list(broken), wall_s=2.0, cpu_s=1.0)
+
+
+def finished(path: Path, out: Path, captures: dict[int, float]) -> tuple[Sweep, Summary]:
+    """A sweep with results that were made up: captures of each seed, and as many more as the case's number."""
+    sweep = Sweep(path, out)
+    for number, each in enumerate(sweep.planned):
+        for trial in each.trials:
+            sweep.store.add(result_of(trial, captures=captures[trial.seed] + number, marks=5.0))
+    sweep.store.flush()
+    return sweep, sweep.finish()
+
+
+# --- settings by dotted keys -----------------------------------------------------------------------------------
+
+_TABLES = st.recursive(
+    st.integers() | st.text(max_size=3) | st.lists(st.integers(), max_size=2),
+    lambda inner: st.dictionaries(st.text("abc", min_size=1, max_size=2), inner, min_size=1, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.text("abc", min_size=1, max_size=2), _TABLES, max_size=3))
+def test_what_is_set_key_by_key_into_nothing_is_the_table_itself(table):
+    assert with_settings({}, dict(flat(table)), "x") == table
+
+
+def test_a_setting_takes_the_place_of_what_the_file_says_and_the_file_stays_as_it_was():
+    raw = {"groups": [{"vehicles": 2}, {"vehicles": 3}], "map": {"learning": True}}
+    changed = with_settings(raw, {"groups.*.vehicles": 7, "groups.1.name": "b", "map.digest_s": 2.0}, "x")
+    assert changed == {
+        "groups": [{"vehicles": 7}, {"vehicles": 7, "name": "b"}],
+        "map": {"learning": True, "digest_s": 2.0},
+    }
+    assert raw == {"groups": [{"vehicles": 2}, {"vehicles": 3}], "map": {"learning": True}}
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("groups.2.vehicles", "x: groups.2.vehicles: found '2' in a list, expected a number from 0 to 0 or '*'"),
+        ("groups.vehicles", "found 'vehicles' in a list"),
+        ("groups.-1.vehicles", "found '-1' in a list"),
+        ("name.first", "x: name.first: found 'n' above 'first', expected a table"),
+        ("empty.0", "expected nothing, as it is empty, or '*'"),
+    ],
+)
+def test_a_key_that_leads_nowhere_is_refused_with_what_was_found(key, said):
+    with pytest.raises(ConfigError) as error:
+        with_settings({"groups": [{"vehicles": 1}], "name": "n", "empty": []}, {key: 1}, "x")
+    assert said in str(error.value)
+
+
+def test_a_preset_as_a_setting_brings_its_own_settings():
+    text = '[cost]\npreset = "hiker"'
+    wheeled = parse_scenario(text, settings={"cost.preset": "wheeled"})
+    assert wheeled.cost == parse_scenario('[cost]\npreset = "wheeled"').cost
+
+
+# --- what a study means ------------------------------------------------------------------------------------------
+
+
+def test_every_scenario_is_combined_with_every_variant_and_all_parameters():
+    study = parse_study("""
+scenarios = ["a", "b"]
+[parameters]
+map.learning = [false, true]
+planner.routes = ["grid", "pulled"]
+[variants.one]
+[variants.two]
+vehicles.per_agent = 3
+""")
+    cases = cases_of(study)
+    assert len(cases) == 2 * 2 * 4
+    assert cases[0].label == "one, learning = false, routes = grid"
+    assert cases[-1].settings == {"vehicles.per_agent": 3, "map.learning": True, "planner.routes": "pulled"}
+    assert len({(case.scenario, case.label) for case in cases}) == len(cases)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "study: missing required field `scenarios`, a list"),
+        ('scenarios = ["a"]\nsede = 1', "unknown key sede; did you mean 'seeds'?"),
+        ('scenarios = ["a"]\nseeds = "5"', "seeds: '5' is not A:B with A < B"),
+        ('scenarios = ["a"]\nseeds = 5', "seeds: found 5, expected text in quotes"),
+        ('scenarios = ["a", "a"]', "scenarios: found 'a' twice"),
+        ('scenarios = ["a"]\n[parameters]\nmap.learning = true', "map.learning: found true, expected a list"),
+        ('scenarios = ["a"]\n[parameters]\nseconds = []', "seconds: found [], expected a list of values"),
+        ('scenarios = ["a"]\n[parameters]\nseconds = [3, 3]', "parameters.seconds: found 3 twice"),
+        (
+            'scenarios = ["a"]\n[parameters]\nseconds = [3]\n[variants.x]\nseconds = 4',
+            "variants.x.seconds: it is one of the parameters, too",
+        ),
+        ('scenarios = ["a"]\nseeds = "0:1000001"', "it has 1,000,001 trials, expected at most 1,000,000"),
+        ('scenarios = ["doors"]', "'doors' is a small world, which goes with faults = true"),
+        ('scenarios = ["mix"]\nfaults = true\n[parameters]\nseconds = [3]', "takes no parameters"),
+    ],
+)
+def test_a_study_that_cannot_be_is_refused_with_the_key_and_what_was_expected(text, said):
+    with pytest.raises(ConfigError) as error:
+        parse_study(text, "s.toml")
+    assert str(error.value).startswith("s.toml: ")
+    assert said in str(error.value)
+
+
+def test_one_and_true_are_two_values():
+    assert len(cases_of(parse_study('scenarios = ["a"]\n[parameters]\nx = [1, true, 1.0]'))) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('scenarios = ["nowhere"]', "no scenario 'nowhere'"),
+        (f"{STUDY}map.lerning = [true]", "unknown key map.lerning; did you mean 'learning'?"),
+        (f"{STUDY}planner.routes = ['grid', 'straight']", "planner.routes: found 'straight'"),
+    ],
+)
+def test_a_setting_that_no_scenario_has_is_refused_before_anything_runs(tmp_path, text, said):
+    with pytest.raises(ConfigError) as error:
+        Sweep(write_study(tmp_path, text), tmp_path / "out")
+    assert said in str(error.value)
+
+
+def test_a_key_of_a_result_follows_from_what_decides_it_and_from_nothing_else(tmp_path):
+    def keys(text: str = STUDY) -> set[str]:
+        path = write_study(tmp_path, text)
+        return {trial.key for each in plan(load_study(path), tmp_path, "x") for trial in each.trials}
+
+    first = keys()
+    assert len(first) == 6
+    assert keys(f'name = "other"\nabout = "?"{STUDY}'.replace("captures", "lost")) == first
+    assert keys(STUDY.replace('"0:3"', '"0:5"')) > first
+    assert keys(STUDY.replace("[60, 120]", "[120, 60, 90]")) > first
+    assert not keys(f"seconds = 2{STUDY}") & first
+    assert not keys(f"faults = true{STUDY}") & first
+
+
+def test_a_file_that_a_scenario_names_counts_by_what_is_in_it(tmp_path):
+    ground = tmp_path / "ground.npz"
+    text = STUDY + "[variants.own]\nterrain.source = 'ground.npz'"
+    path = write_study(tmp_path, text)
+    found = []
+    for height_m in (0.0, 1.0, 0.0):
+        np.savez(ground, elevation_m=np.full((8, 8), height_m))
+        plan.__globals__["_file_digest"].cache_clear()
+        found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
+    assert found[0] == found[2] != found[1]
+
+
+# --- one trial ---------------------------------------------------------------------------------------------------
+
+
+def test_a_trial_is_the_simulation_of_its_seed_and_every_number_of_its_report(tmp_path):
+    [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
+    trial = case.trials[1]
+    result = run_trial(trial)
+    report = simulate(case.scenario, 1, 3.0).report
+    assert result.key == trial.key
+    assert result.figures["marks"] == report["marks"]
+    assert result.figures["by_group.all.distance_m"] == report["by_group"]["all"]["distance_m"]
+    assert result.figures["vehicles_driven.0"] == report["vehicles_driven"][0]
+    assert not any(name.startswith("by_vehicle") for name in result.figures)
+    assert result.broken == []
+    assert msgspec.structs.replace(run_trial(trial), wall_s=0, cpu_s=0) == msgspec.structs.replace(
+        result, wall_s=0, cpu_s=0
+    )
+
+
+def test_a_trial_with_faults_is_that_of_swarm_simulate_seeds():
+    [trial] = plan(Study(scenarios=("small",), seeds="3:4", seconds=6.0, faults=True), Path(), "x")[0].trials
+    result = run_trial(trial)
+    verdict = try_seed("small", 3, 6.0)
+    assert result.broken == verdict.broken
+    assert result.figures["longest_wait_s"] == verdict.longest_wait_s
+    assert result.figures["faults.crashes"] == verdict.faults["crashes"]
+
+
+def test_a_service_that_raises_is_a_broken_law_and_other_code_is_refused(tmp_path, monkeypatch):
+    [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
+
+    def fails(*args: object, **named: object) -> None:
+        raise RuntimeError("it fell over")
+
+    monkeypatch.setattr("launch_scripts.simulation.simulate.simulate", fails)
+    [law] = run_trial(case.trials[0]).broken
+    assert law.law == "a service raised"
+    assert "it fell over" in law.sentence
+    with pytest.raises(ConfigError, match=r"a worker has version .* of the code, expected other"):
+        run_trial(msgspec.structs.replace(case.trials[0], version="other"))
+
+
+def test_figures_that_must_be_zero_are_laws(tmp_path, monkeypatch):
+    [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
+
+    report = {"collisions": 2, "lethal_entries": 0, "marks": None, "alarms": ["x"], "simulated": True}
+    done = SimpleNamespace(report=report)
+    monkeypatch.setattr("launch_scripts.simulation.simulate.simulate", lambda *_, **__: done)
+    result = run_trial(case.trials[0])
+    assert result.broken == [BrokenLaw("no collision", "2 collisions")]
+    assert result.figures == {"collisions": 2.0, "lethal_entries": 0.0}
+
+
+def test_numbers_of_a_report_are_named_by_their_place():
+    report = {"a": 1, "b": {"c": 2.5, "d": None}, "e": [3, {"f": 4}], "g": "text", "h": True}
+    assert dict(numbers(report)) == {"a": 1.0, "b.c": 2.5, "e.0": 3.0, "e.1.f": 4.0}
+
+
+# --- what is kept ------------------------------------------------------------------------------------------------
+
+
+def test_results_are_read_again_as_they_were_and_of_two_with_one_key_one_is_left(tmp_path):
+    store = ResultStore(tmp_path)
+    first = Result(key="a", figures={"x": 1.0}, broken=[BrokenLaw("l", "s", 2.0)], wall_s=1.0, cpu_s=0.5)
+    second = Result(key="b", figures={"y.z": 2.0}, broken=[BrokenLaw("l", "s")], wall_s=1.0, cpu_s=0.5)
+    for each in (first, second, second):
+        store.add(each)
+        store.flush()
+    assert ResultStore(tmp_path).results == {"a": first, "b": second}
+
+
+def test_many_parts_become_one(tmp_path):
+    store = ResultStore(tmp_path)
+    for n in range(70):
+        store.add(Result(key=f"{n}", figures={f"f{n % 3}": float(n)}, broken=[], wall_s=1.0, cpu_s=0.5))
+        store.flush()
+    again = ResultStore(tmp_path)
+    assert len(list(store.folder.glob("*.parquet"))) == 1
+    assert again.results == store.results
+    assert ResultStore(tmp_path).results == store.results
+
+
+def test_a_part_that_is_damaged_is_named_and_half_a_file_is_none(tmp_path):
+    store = ResultStore(tmp_path)
+    (store.folder / "1.parquet.part").write_bytes(b"half")
+    assert ResultStore(tmp_path).results == {}
+    (store.folder / "2.parquet").write_bytes(b"PAR1 no")
+    with pytest.raises(StoreError, match=r"2\.parquet is damaged; remove it"):
+        ResultStore(tmp_path)
+
+
+def test_what_is_there_is_not_run_again_whatever_else_changes_in_the_study(tmp_path):
+    path, out = write_study(tmp_path), tmp_path / "out"
+    finished(path, out, {0: 1.0, 1: 2.0, 2: 3.0})
+    assert Sweep(path, out).missing == []
+    path.write_text(STUDY.replace('"0:3"', '"1:5"').replace("[60, 120]", "[120, 90]"), encoding="utf-8")
+    sweep = Sweep(path, out)
+    assert sweep.trials == 8
+    assert sorted(trial.seed for trial in sweep.missing) == [1, 2, 3, 3, 4, 4]
+
+
+# --- what is told ------------------------------------------------------------------------------------------------
+
+
+def test_the_folder_of_a_study_holds_its_results_its_summary_and_its_pictures(tmp_path):
+    out = tmp_path / "out"
+    _, summary = finished(write_study(tmp_path), out, {0: 1.0, 1: 2.0, 2: 6.0})
+    table = pq.read_table(out / "results.parquet").to_pylist()
+    assert [(row["set.vehicles.sense_range_m"], row["seed"], row["figure.captures"]) for row in table] == [
+        ("60", 0, 1.0), ("60", 1, 2.0), ("60", 2, 6.0), ("120", 0, 2.0), ("120", 1, 3.0), ("120", 2, 7.0),
+    ]  # fmt: skip
+    first, second = summary.cases
+    assert first.label == "sense_range_m = 60"
+    assert first.outcomes["captures"].mean.value == 3.0
+    assert first.outcomes["captures"].difference is None
+    assert second.outcomes["captures"].difference == statistics.Estimate(1.0, 1.0, 1.0)
+    page = (out / "summary.md").read_text(encoding="utf-8")
+    assert "| hill.toml | sense_range_m = 120 | 3 | 4 | " in page
+    assert "![captures](captures.png)" in page
+    assert (out / "captures.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["trials"] == 6
+
+
+def test_a_trial_that_broke_a_law_is_told_with_the_command_that_runs_it_again(tmp_path):
+    out = tmp_path / "out"
+    path = write_study(tmp_path)
+    sweep = Sweep(path, out)
+    trial = sweep.planned[1].trials[2]
+    sweep.store.add(result_of(trial, (BrokenLaw("no collision", "2 | collisions", 1.5),), captures=1.0))
+    summary = sweep.finish()
+    [failure] = summary.failing
+    assert summary.missing == 5
+    [_, _, scenario, *options] = failure.replay.split()
+    assert options == ["--seed", "2"]
+    assert load_scenario(Path(scenario)) == sweep.planned[1].scenario
+    assert "| 2 \\| collisions |" in (out / "summary.md").read_text(encoding="utf-8")
+    [row] = pq.read_table(out / "results.parquet").to_pylist()
+    assert (row["law"], row["law_at_s"], row["sentence"]) == ("no collision", 1.5, "2 | collisions")
+
+
+def test_a_world_is_run_again_by_its_name(tmp_path):
+    path = write_study(tmp_path, 'scenarios = ["mix"]\nfaults = true\nseeds = "7:8"\nseconds = 5')
+    sweep = Sweep(path, tmp_path / "out")
+    sweep.store.add(result_of(sweep.missing[0], (BrokenLaw("l", "s"),)))
+    [failure] = sweep.finish().failing
+    assert failure.replay == "swarm simulate wide --seeds 7:8 --seconds 5"
+    assert failure.scenario == "wide"
+
+
+# --- intervals ---------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40))
+def test_an_interval_holds_its_value_and_lies_among_the_data(values):
+    for estimate, middle in ((statistics.mean(values), plain.fmean(values)),
+                             (statistics.median(values), plain.median(values))):  # fmt: skip
+        assert estimate.value == pytest.approx(middle, rel=1e-9, abs=1e-6)
+        if estimate.low is not None:
+            least, most = min(values), max(values)
+            assert least - 1e-6 <= estimate.low <= estimate.high <= most + 1e-6
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    chance = np.random.default_rng(1)
+    found = {"mean": 0, "median": 0, "share": 0}
+    for _ in range(100):
+        data = chance.exponential(1.0, 30)
+        for name, truth, estimate in (
+            ("mean", 1.0, statistics.mean(data)),
+            ("median", np.log(2), statistics.median(data)),
+            ("share", 0.1, statistics.share(int(chance.binomial(100, 0.1)), 100)),
+        ):
+            found[name] += estimate.low <= truth <= estimate.high
+    # Bootstraps of 30 skewed values hold a little less than 95 %. Fixed draws: these numbers never change.
+    assert min(found.values()) >= 88
+
+
+def test_intervals_of_many_values_are_students_and_of_few_there_are_none():
+    many = np.random.default_rng(2).normal(5.0, 2.0, 4000)
+    found = statistics.mean(many)
+    assert found.high - found.low == pytest.approx(2 * 1.96 * 2.0 / np.sqrt(4000), rel=0.05)
+    assert statistics.mean([1.0, 2.0]).low is None
+    assert statistics.median([1.0, 2.0, 3.0, 4.0, 5.0]).low is None
+    assert statistics.median([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).low == 1.0

@@ -1,0 +1,109 @@
+"""The lock of the wire: what may change under the same version does, all else is refused with a sentence."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from launch_scripts.reference import __main__ as reference
+from launch_scripts.reference import wire_lock
+from launch_scripts.reference.wire_lock import broken, lock
+
+Change = Callable[[Any], object]
+
+
+def fields(now: Any, name: str = "fleet", struct: str = "Fleet") -> list[list[str]]:
+    return now["messages"][name]["structs"][struct]
+
+
+def stepped(
+    now: Any, name: str = "fleet", *, reads: tuple[int, ...] = (8, 9), writes: int = 8, wire: int = 9
+) -> None:
+    """A message takes a step, with another type of a field."""
+    fields(now, name, {"fleet": "Fleet", "run": "RunInfo"}[name])[0][1] = "text"
+    now["messages"][name] |= {"reads": list(reads), "writes": writes}
+    now["wire_version"] = wire
+
+
+ALLOWED: dict[str, Change] = {
+    "nothing": lambda now: None,
+    "a field is added": lambda now: fields(now).append(["colour", "id", "`None`"]),
+    "a field of a part is added": lambda now: fields(now, "standing", "Stand").append(["colour", "id", "`None`"]),
+    "a message and its key are added": lambda now: (
+        now["messages"].update(new=copy.deepcopy(now["messages"]["fleet"])),
+        now["keys"].update(new=copy.deepcopy(now["keys"]["fleet"])),
+    ),
+    "the wire version rises": lambda now: now.update(wire_version=9),
+    "a message takes a step": stepped,
+    "a key changes with the wire version": lambda now: (
+        now.update(wire_version=9),
+        now["keys"]["fleet"].update(key="fleets/{author}"),
+    ),
+}  # fmt: skip
+
+REFUSED: dict[str, tuple[Change, str]] = {
+    "a field goes": (lambda now: fields(now).pop(), "Fleet.vehicle_class was .* and is gone: fleet needs a step"),
+    "bounds change": (
+        lambda now: fields(now)[3].__setitem__(1, "int 0 ... 7"),
+        r"Fleet.seq was seq \| int 0 ... 2\^62 - 1 \| refused and is seq \| int 0 ... 7 \| refused: fleet needs",
+    ),
+    "a default changes": (lambda now: fields(now)[-1].__setitem__(2, "`'air'`"), "Fleet.vehicle_class was"),
+    "a field has another name": (lambda now: fields(now)[0].__setitem__(0, "writer"), "Fleet.author was"),
+    "a field is put in between": (lambda now: fields(now).insert(1, ["x", "id", "`None`"]), "Fleet.group was"),
+    "an added field has no default": (
+        lambda now: fields(now).append(["colour", "id", "refused"]), "Fleet.colour is added without a default",
+    ),
+    "a part loses a field": (lambda now: fields(now, "standing", "Stand").pop(), "Stand.age_ms was"),
+    "a key changes": (
+        lambda now: now["keys"]["fleet"].update(key="fleets/{author}"), "topic fleet has changed: the wire version",
+    ),
+    "a key goes": (lambda now: now["keys"].pop("fleet"), "topic fleet has changed"),
+    "a message goes": (lambda now: now["messages"].pop("fleet"), "the message fleet is gone"),
+    "the wire version falls": (lambda now: now.update(wire_version=7), "was 8 and is 7: it rises by one"),
+    "the wire version skips one": (lambda now: now.update(wire_version=10), "was 8 and is 10: it rises by one"),
+    "a token's key changes": (lambda now: now.update(token="here/{id}"), "it never changes"),
+    "a step without the wire version": (lambda now: stepped(now, wire=8), "the wire version has to rise"),
+    "a step that is written at once": (
+        lambda now: stepped(now, writes=9), "fleet is written in version 9, which the build before does not read",
+    ),
+    "a step that forgets the version before": (
+        lambda now: stepped(now, reads=(9,)), "fleet of version 8, which the build before writes, is no longer",
+    ),
+    "what introduces a build takes a step": (lambda now: stepped(now, "run"), "run has taken a step: it never"),
+}  # fmt: skip
+
+
+def sentences(change: Change) -> list[str]:
+    now = copy.deepcopy(lock())
+    change(now)
+    return list(broken(lock(), now))
+
+
+@pytest.mark.parametrize("change", ALLOWED)
+def test_what_neighbours_understand_is_allowed(change: str) -> None:
+    assert sentences(ALLOWED[change]) == []
+
+
+@pytest.mark.parametrize("change", REFUSED)
+def test_what_they_would_not_is_refused_with_a_sentence(change: str) -> None:
+    changed, words = REFUSED[change]
+    assert any(re.search(words, sentence) for sentence in sentences(changed)), sentences(changed)
+
+
+def test_the_reference_is_not_written_over_a_change_that_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "wire.lock"
+    path.write_text(wire_lock.document().replace('["author", ', '["writer", ', 1))
+    monkeypatch.setattr(wire_lock, "PATH", path)
+    monkeypatch.setattr(reference, "PAGES", {path: wire_lock.document})
+    before = path.read_text()
+    for arguments in ([], ["--check"]):
+        monkeypatch.setattr("sys.argv", ["reference", *arguments])
+        assert reference.main() == 1
+    assert path.read_text() == before
+    assert "needs a step to its next version" in capsys.readouterr().err

@@ -1,0 +1,304 @@
+"""What a loop says of itself is read whole at any moment, grows old when it hangs, and reaches a supervisor."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.bus.bus import AskEnded, Event, LinkChanged
+from swarm.bus.memory_bus import MemoryNetwork
+from swarm.bus.memory_links import PerfectLinks
+from swarm.bus.scheduler import Scheduler
+from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
+from swarm.runtime import health as health_module
+from swarm.runtime.health import BOARD_BYTES, SLOT_BYTES, Board, Health, Phase, Vitals
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.membership import Member
+from swarm.runtime.process import Process
+from swarm.runtime.stats import READY, Counters
+from swarm.runtime.supervisor import Supervisor, supervisor_of
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import RUN
+
+
+class Memory:
+    """Counts the bytes that a writer may still write, and drops those beyond: it was killed there."""
+
+    def __init__(self) -> None:
+        self.bytes = bytearray(BOARD_BYTES)
+        self.left = 1 << 30
+
+    def __getitem__(self, at: slice) -> bytes:
+        return bytes(self.bytes[at])
+
+    def __setitem__(self, at: slice, content: bytes) -> None:
+        taken = content[: self.left]
+        self.bytes[at.start : at.start + len(taken)] = taken
+        self.left -= len(taken)
+
+
+vitals = st.builds(
+    Vitals,
+    st.integers(1, 1 << 62),
+    st.integers(0, 1 << 62),
+    st.sampled_from(Phase),
+    st.lists(st.text(max_size=30), max_size=5).map(tuple),
+)
+
+
+@given(told=st.lists(vitals, min_size=1, max_size=6), last=vitals, cut=st.integers(0, SLOT_BYTES))
+def test_a_reader_sees_a_whole_record_wherever_the_writer_was_killed(
+    told: list[Vitals], last: Vitals, cut: int
+) -> None:
+    memory = Memory()
+    board = Board(memory)
+    rising = [each._replace(stamp_ns=n + 1) for n, each in enumerate([*told, last])]
+    for each in rising[:-1]:
+        board.write(each)
+        assert Board(memory).read() == each
+    memory.left = cut
+    board.write(rising[-1])
+    assert Board(memory).read() in rising[-2:]
+
+
+@given(st.lists(st.text(max_size=400), max_size=60))
+def test_what_is_lacking_always_fits(lacks: list[str]) -> None:
+    board = Board()
+    board.write(Vitals(1, 2, Phase.RUNS, tuple(lacks)))
+    found = board.read()
+    assert found is not None
+    assert all(short == whole[: len(short)] for short, whole in zip(found.lacks, lacks, strict=False))
+    assert bool(found.lacks) == bool(lacks), "one need at least is told, so that nobody seems ready"
+
+
+def test_nothing_was_written_where_there_are_zeros_or_rubbish() -> None:
+    assert Board(bytearray(BOARD_BYTES)).read() is None
+    assert Board(bytearray(os.urandom(BOARD_BYTES))).read() is None
+
+
+class Sleepy:
+    """A service whose tick hangs once it is told to."""
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self.hang, self.wake = threading.Event(), threading.Event()
+        self.needs: list[str] = ["a bed"]
+
+    def lacks(self) -> list[str]:
+        return self.needs
+
+    def start(self, now_ns: int) -> None: ...
+
+    def handle(self, event: Event, now_ns: int) -> None: ...
+
+    def tick(self, now_ns: int) -> None:
+        if self.hang.is_set():
+            self.wake.wait(60)
+
+    def stop(self, now_ns: int) -> None: ...
+
+
+def until(board: Board, holds) -> Vitals:
+    """What is on a board once something holds of it."""
+    deadline_s = time.monotonic() + 30
+    while (found := board.read()) is None or not holds(found):
+        assert time.monotonic() < deadline_s, found
+        time.sleep(0.01)
+    return found
+
+
+def test_a_loop_that_hangs_is_seen_from_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health_module, "HUNG_S", 0.5)
+    service, health = Sleepy(), Health()
+    assert health.board.read().phase is Phase.STARTS
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50, health=health)
+    thread = threading.Thread(target=process.run)
+    thread.start()
+    try:
+        found = until(health.board, lambda each: each.phase is Phase.RUNS)
+        assert found.lacks == ("a bed",)
+        service.needs = []
+        until(health.board, lambda each: not each.lacks)
+        service.hang.set()
+        until(health.board, lambda each: each.hangs(time.monotonic_ns()))
+        service.hang.clear()
+        service.wake.set()
+        until(health.board, lambda each: not each.hangs(time.monotonic_ns()))
+    finally:
+        service.wake.set()
+        process.stop()
+        thread.join(30)
+    assert health.board.read().phase is Phase.ENDS
+    assert not health.board.read().hangs(1 << 62), "what ends does not turn, and does not hang"
+
+
+def test_the_limit_is_never_shorter_than_many_periods() -> None:
+    health = Health()
+    health.begins(tick_hz=0.5)
+    health.turned(())
+    assert health.board.read().limit_ns == 40 * NS_PER_S
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[socket.socket]:
+    """The socket of a service manager."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(10)
+        yield listening
+
+
+def told(manager: socket.socket) -> list[str]:
+    return manager.recv(4096).decode().split("\n")
+
+
+def test_systemd_is_told_when_a_loop_is_up_turns_and_ends(manager: socket.socket) -> None:
+    limit_us = 400_000
+    environment = {
+        "NOTIFY_SOCKET": manager.getsockname(),
+        "WATCHDOG_USEC": str(limit_us),
+        "WATCHDOG_PID": str(os.getpid()),
+    }
+    service, health = Sleepy(), Health(supervisor=supervisor_of(environment))
+    assert told(manager) == ["STATUS=its start"]
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50, health=health)
+    thread = threading.Thread(target=process.run)
+    thread.start()
+    try:
+        assert told(manager) == ["STATUS=waits for a bed"]
+        assert told(manager) == ["READY=1", "WATCHDOG=1"]
+        for _ in range(3):
+            assert told(manager) == ["WATCHDOG=1"]
+        service.needs = []
+        while (words := told(manager)) == ["WATCHDOG=1"]:
+            pass
+        assert words == ["STATUS=ready"]
+        service.hang.set()
+        manager.settimeout(3 * limit_us / 1e6)
+        assert pings(manager) < 5, "some may be on their way, then there are none"
+    finally:
+        service.hang.clear()
+        service.wake.set()
+        process.stop()
+        thread.join(30)
+    manager.settimeout(10)
+    while (words := told(manager)) == ["WATCHDOG=1"]:
+        pass
+    assert words == ["STOPPING=1"]
+
+
+def test_a_manager_that_reads_nothing_holds_nobody_up_and_hears_of_the_start_later(manager: socket.socket) -> None:
+    supervisor = Supervisor(manager.getsockname(), limit_ns=4)
+    fill(manager)
+    began_s = time.monotonic()
+    for now_ns in range(1, 1000):
+        supervisor.turned(now_ns)
+    assert time.monotonic() - began_s < 5
+    while manager.recv(100) == b"x" and select_ready(manager):
+        pass
+    supervisor.turned(2000)
+    assert told(manager)[0] == "READY=1"
+
+
+def pings(manager: socket.socket) -> int:
+    """How many come before there is silence for as long as the socket waits; 5 if there is none."""
+    for count in range(5):
+        try:
+            told(manager)
+        except TimeoutError:
+            return count
+    return 5
+
+
+def fill(manager: socket.socket) -> None:
+    """Send as many datagrams as there is space for."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as filler:
+        filler.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                filler.sendto(b"x", manager.getsockname())
+
+
+def select_ready(manager: socket.socket) -> bool:
+    """Whether more can be read."""
+    return bool(select.select([manager], [], [], 0)[0])
+
+
+def test_a_name_in_the_abstract_namespace_is_a_manager_too() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        name = f"terrain-swarm-test-{os.getpid()}"
+        listening.bind(f"\0{name}")
+        listening.settimeout(10)
+        supervisor_of({"NOTIFY_SOCKET": f"@{name}"}).turned(1)
+        assert listening.recv(100) == b"READY=1"
+
+
+@given(st.text(max_size=300))
+def test_no_text_makes_a_word_of_its_own(text: str) -> None:
+    reading, writing = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with reading, writing:
+        supervisor = Supervisor(None)
+        supervisor._address = "@nowhere"
+
+        class Sent:
+            def sendto(self, content: bytes, address: str) -> None:
+                writing.send(content)
+
+        supervisor._socket = Sent()
+        supervisor.says(text)
+        assert reading.recv(4096).count(b"\n") == 0
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {},
+        {"NOTIFY_SOCKET": ""},
+        {"NOTIFY_SOCKET": "vsock:2:1"},
+        {"NOTIFY_SOCKET": "/nowhere/at/all", "WATCHDOG_USEC": "x"},
+        {"NOTIFY_SOCKET": "/nowhere/at/all", "WATCHDOG_USEC": "1", "WATCHDOG_PID": "1"},
+    ],
+)
+def test_a_process_without_a_manager_goes_on(environment: dict[str, str]) -> None:
+    supervisor = supervisor_of(environment)
+    supervisor.says("x")
+    supervisor.turned(1)
+    supervisor.ends()
+
+
+def test_a_process_is_ready_once_its_link_is_up_its_run_is_known_and_its_needs_are_met() -> None:
+    scheduler = Scheduler(ManualClock(1))
+    network = MemoryNetwork(scheduler, PerfectLinks())
+    bus = network.bus("agent-a0")
+    info = RunInfo(
+        run_id="r", role="agent", id="a0", incarnation=1, scenario="s", terrain="x",
+        rows=8, cols=8, resolution_m=1.0, started_ns=1,
+    )  # fmt: skip
+    member = Member(info, bus, lambda event: None)
+    fed: list[bool] = []
+    member.needs("food", lambda: bool(fed))
+    assert member.lacks() == ["word of its run", "food"]
+    member.handle(AskEnded("run-check", RUN, 0, None))
+    assert member.lacks() == ["food"], "whoever is alone in its namespace begins the run"
+    fed.append(True)
+    assert member.lacks() == []
+    member.handle(LinkChanged(up=False, beyond=True))
+    assert member.lacks() == [], "a link between routers is not ours"
+    member.handle(LinkChanged(up=False))
+    member.handle(LinkChanged(up=True, beyond=True))
+    assert member.lacks() == ["its router"]
+    member.publish_stats(1)
+    assert member.counters.gauges[READY] == 0.0
+    member.handle(LinkChanged(up=True))
+    member.publish_stats(2)
+    assert member.counters.gauges[READY] == 1.0
