@@ -25,7 +25,9 @@ _ROAM_CELLS = 4
 REASSIGN_S = 5.0
 """`vehicles.reassign_s`."""
 _AFTER_CAPTURE_S = 0.5
-"""What `vehicle_agent/assignment.py` waits after a capture, so that several become one request."""
+_APART_S = 1 / 50
+"""What `vehicle_agent/assignment.py` waits after a capture, so that several become one request; and after a request,
+for each target."""
 _CAPTURES_PER_TARGET_S = 0.05
 """At the density of `thousand`: 30 a minute of 10 targets."""
 _SEED = 1
@@ -81,7 +83,7 @@ def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines:
         shared=shared,
         hearers=hearers,
         chases=size.agents * size.targets * -math.expm1(-per_agent / size.targets),
-        asks=size.agents * _asks_per_s(_captures_per_s(size)),
+        asks=size.agents * _asks_per_s(_captures_per_s(size), size.targets),
     )
 
 
@@ -92,13 +94,16 @@ def _captures_per_s(size: Size) -> float:
     return _CAPTURES_PER_TARGET_S * size.targets * math.sqrt(CELLS_PER_VEHICLE) / apart
 
 
-def _asks_per_s(captures_per_s: float) -> float:
-    """Requests of one agent. It asks every `vehicles.reassign_s`, or half a second after a target was captured,
-    whichever is first: the mean of that, of captures which are independent of each other."""
+def _asks_per_s(captures_per_s: float, targets: int) -> float:
+    """Requests of one agent. It asks every `vehicles.reassign_s`; or half a second after a target was captured, and
+    a 50th of a second for each target after it asked last; whichever is first: the mean of that, of captures which
+    are independent of each other."""
+    rests_s = min(max(targets * _APART_S, _AFTER_CAPTURE_S), REASSIGN_S)
     if not captures_per_s:
         return 1 / REASSIGN_S
-    waits_s = -math.expm1(-captures_per_s * (REASSIGN_S - _AFTER_CAPTURE_S)) / captures_per_s
-    return 1 / (_AFTER_CAPTURE_S + waits_s)
+    none_yet = math.exp(-captures_per_s * (rests_s - _AFTER_CAPTURE_S))
+    none_at_all = math.exp(-captures_per_s * (REASSIGN_S - _AFTER_CAPTURE_S))
+    return 1 / (rests_s + (none_yet - none_at_all) / captures_per_s)
 
 
 @functools.lru_cache(1024)
