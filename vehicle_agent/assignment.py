@@ -22,8 +22,8 @@ from vehicle_agent.matching import HYSTERESIS, need_first, spread
 _RETRY_NS = NS_PER_S // 2
 _STRANDED_RETRY_NS = 3 * NS_PER_S
 _JUMPS_APART_NS = NS_PER_S // 50
-"""For each target: so long after a request a jump of a target may cause the next. With many targets one always jumps,
-and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
+"""For each target: so long after a request a jump of a target may cause the next. With many targets one always
+jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
 _LEASE_PERIODS = 3
 """An agent of the group that has told no costs for so many periods is gone."""
 

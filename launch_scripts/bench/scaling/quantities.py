@@ -26,8 +26,8 @@ REASSIGN_S = 5.0
 """`vehicles.reassign_s`."""
 _AFTER_CAPTURE_S = 0.5
 _APART_S = 1 / 50
-"""What `vehicle_agent/assignment.py` waits after a capture, so that several become one request; and after a request,
-for each target."""
+"""What `vehicle_agent/assignment.py` waits after a capture, so that several become one request; and after a
+request, for each target."""
 _CAPTURES_PER_TARGET_S = 0.05
 """At the density of `thousand`: 30 a minute of 10 targets."""
 _SEED = 1
@@ -44,7 +44,8 @@ class Quantities:
     rate          ticks a second
     plots         regions that the map has; each is a plot of right of way
     shared        pairs of an agent and a region in which it has vehicles
-    hearers       agents that hold the region of a vehicle, on average over vehicles: those who hear its marks
+    hearers       agents that hold the region of a vehicle, on average; they hear its marks
+    near          share of all regions that an agent holds, on average
     chases        pairs of an agent and a target which one of its vehicles chases, where each takes any target
     asks          requests a second, of all agents, for what their vehicles need to every target
     """
@@ -61,13 +62,14 @@ class Quantities:
     plots: float
     shared: float
     hearers: float
+    near: float
     chases: float
     asks: float
 
 
 def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines: int = 1) -> Quantities:
     """The numbers of a swarm of one size, with so many standbys of each planner."""
-    shared, hearers = _spread(size.vehicles, size.agents, size.side)
+    shared, hearers, near = _spread(size.vehicles, size.agents, size.side)
     per_agent = size.vehicles / size.agents
     return Quantities(
         vehicles=size.vehicles,
@@ -82,6 +84,7 @@ def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines:
         plots=math.ceil(size.side / REGION_CELLS) ** 2,
         shared=shared,
         hearers=hearers,
+        near=near,
         chases=size.agents * size.targets * -math.expm1(-per_agent / size.targets),
         asks=size.agents * _asks_per_s(_captures_per_s(size), size.targets),
     )
@@ -107,16 +110,17 @@ def _asks_per_s(captures_per_s: float, targets: int) -> float:
 
 
 @functools.lru_cache(1024)
-def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float]:
-    """`shared` and `hearers` of `Quantities`, of vehicles anywhere on an empty square map."""
+def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float, float]:
+    """`shared`, `hearers` and `near` of `Quantities`, of vehicles anywhere on an empty square map."""
     rng = np.random.default_rng(_SEED)
     rows, cols = rng.integers(0, side, (2, vehicles))
     order = np.argsort(_morton(rows, cols), kind="stable")
     rows, cols = rows[order], cols[order]
     agent = np.arange(vehicles) * agents // vehicles
     driven = _regions_within(_ROAM_CELLS, rows, cols, agent, side)
-    held = _regions_within(INTEREST_CELLS, rows, cols, agent, side).sum(0)
-    return float(driven.sum()), float(held[rows // REGION_CELLS, cols // REGION_CELLS].mean())
+    held = _regions_within(INTEREST_CELLS, rows, cols, agent, side)
+    hearers = held.sum(0)[rows // REGION_CELLS, cols // REGION_CELLS].mean()
+    return float(driven.sum()), float(hearers), float(held.mean())
 
 
 def _regions_within(

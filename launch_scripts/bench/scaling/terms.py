@@ -301,3 +301,41 @@ WORK: tuple[Work, ...] = (
         "watches its processes, records what all say",
     ),
 )
+
+
+Change = Mapping[tuple[str, str, str], Callable[[Quantities], float]]
+"""(topic, role that sends, role that hears or PUT) -> by what the copies that the role hears, or what is put, would
+be multiplied if the protocol were changed."""
+NO_CHANGE: Change = {}
+PUT = "put"
+
+
+def _near(q: Quantities) -> float:
+    return q.near
+
+
+def _one_of(q: Quantities) -> float:
+    return 1 / max(q.launchers, 1)
+
+
+CHANGES: Mapping[str, Change] = {
+    "as it is": NO_CHANGE,
+    "one launcher records, the others look after their own": {
+        (sent.topic, sent.source, "launcher"): _one_of
+        for sent in SENT
+        if sent.to.get("launcher") and sent.topic in ("fleet", "followed", "marks", "stats", "status", "pose")
+    },
+    "agents ask for the costs of targets near": {
+        ("cost", "agent", "planner"): _near,
+        ("cost", "planner", PUT): _near,
+    },
+    "planners hold what is near": {
+        ("marks", "agent", "planner"): _near,
+        ("digest", "agent", "planner"): _near,
+        ("digest", "keeper", "planner"): _near,
+    },
+    "digests go to agents near": {("digest", "agent", "agent"): _near, ("digest", "keeper", "agent"): _near},
+    "agents hear the targets near": {("pose", "targets", "agent"): _near},
+}
+"""What could be changed -> what that would save, where near is as large as what an agent holds."""
+ALL_CHANGES: Change = {key: by for change in CHANGES.values() for key, by in change.items()}
