@@ -314,8 +314,8 @@ def sweep(
     """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
 
     Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: started again,
-    also with other seeds or settings, it runs what is missing only. Exit code 1 if a law broke in any trial. Needs
-    pip install 'terrain-swarm[sweep]'.
+    also with other seeds or settings, it runs what is missing only. Exit code 1 if a law broke in any trial.
+    It needs the extra "sweep" (Dask, pyarrow).
 
     swarm sweep study.toml
 

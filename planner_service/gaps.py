@@ -84,8 +84,7 @@ class GapStatistics:
         self._counters.observe_all("gap_excess", gaps - 1.0)
 
     def _count_broken(self, many: int) -> None:
-        if many:
-            self._counters.count("broken_certificates", many)
+        self._counters.count("broken_certificates", many)
 
     def _held(self, tree: TargetTree, followers: Sequence[Follower], pace: NDArray[np.float32]) -> None:
         rests = [(follower.cell, self._rest(follower, pace)) for follower in followers]

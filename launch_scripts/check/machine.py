@@ -22,7 +22,7 @@ from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import SwarmError
 
 PACKAGE = "terrain-swarm"
-_EXTRAS = ("all", "vectors")
+_EXTRAS = ("all", "roles", "vectors")
 """What the command needs beside what is always there."""
 _ENOUGH_BYTES = 1 << 30
 _ENOUGH_DISK_BYTES = 1 << 30
@@ -75,15 +75,21 @@ def _packages(about: str, runs: Path) -> Finding:
 
 def _kernels(about: str, runs: Path) -> Finding:
     from planner_service.kernel_build import all_kernels
-    from planner_service.kernels.compile import cache_folder, is_on_disk
+    from planner_service.kernels.compile import cache_folder, code_folder, is_on_disk
 
-    folder = cache_folder()
+    folder = code_folder()
     if folder is None:
         return failure(
             about, "compiled planners can be kept nowhere, so every start compiles: set NUMBA_CACHE_DIR to a folder"
         )
     kernels = list(all_kernels())
     cold = sum(not is_on_disk(kernel) for kernel in kernels)
+    if cold and cache_folder() is None:
+        return failure(
+            about,
+            f"{cold} of {len(kernels)} are not in {folder}, which can only be read, so every start compiles them:"
+            " `python -m planner_service.kernel_build` makes them where it can be written to",
+        )
     if cold:
         return warning(about, f"{cold} of {len(kernels)} are not compiled yet: the first start takes half a minute")
     return ok(about, f"all {len(kernels)} are compiled, in {folder}")

@@ -50,3 +50,8 @@ def serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
 def dashboard() -> str:
     """A dashboard for Grafana, as JSON."""
     return files("launch_scripts.metrics").joinpath("dashboard.json").read_text(encoding="utf-8")
+
+
+def alerts() -> str:
+    """Rules of Prometheus, as YAML."""
+    return files("launch_scripts.metrics").joinpath("alerts.yml").read_text(encoding="utf-8")

@@ -273,6 +273,9 @@ def metrics(
     dashboard: Annotated[
         bool, typer.Option("--dashboard", help="Print a dashboard for Grafana, as JSON, and exit.")
     ] = False,
+    alerts: Annotated[
+        bool, typer.Option("--alerts", help="Print rules for alerts of Prometheus, as YAML, and exit.")
+    ] = False,
 ) -> None:
     """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
 
@@ -280,12 +283,17 @@ def metrics(
 
     swarm metrics --dashboard > swarm.json
 
+    swarm metrics --alerts > swarm-alerts.yml
+
     `swarm up --metrics-port 9464` does the same for as long as the run lasts.
     """
     from launch_scripts.commands import metrics as command
+    from swarm.errors import ConfigError
 
-    if dashboard:
-        typer.echo(command.dashboard())
+    if dashboard and alerts:
+        raise ConfigError("--dashboard and --alerts print a file each: give one of them")
+    if dashboard or alerts:
+        typer.echo(command.dashboard() if dashboard else command.alerts(), nl=False)
     else:
         command.serve_metrics(where.network(tls), port, signals_address)
 

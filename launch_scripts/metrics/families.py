@@ -85,6 +85,10 @@ HELP = {
     "followed_gap_excess": "The same of routes that vehicles have begun",
     "saves_failed": "Writes that the keeper's store refused",
     "blocked_ticks": "Ticks at which a vehicle had to wait for another",
+    "sets_without_room": "Sets of marks refused as the map was full",
+    "plugin_failed": "Times that a plug-in was left out for what it did",
+    "driven_into": "Times that a vehicle drove into a body",
+    "hit_by_bodies": "Times that a body met a vehicle",
     "strangers": "Processes of another run, or with another terrain, that were heard",
     "cpu_s": "CPU that the process has used",
     "rss_bytes": "Memory that the process has in use, with what it shares",
@@ -159,9 +163,16 @@ def _of_processes(figures: Figures) -> Iterator[Metric]:
     began = GaugeMetricFamily(
         f"{PREFIX}process_start_time_seconds", "When the process began, in seconds of Unix time", labels=_PROCESS
     )
+    reported = GaugeMetricFamily(
+        f"{PREFIX}process_reported_timestamp_seconds",
+        "When the process told its figures last, in seconds of Unix time by its own clock",
+        labels=_PROCESS,
+    )
     for key, stats in sorted(newest.items()):
         began.add_metric(key, stats.incarnation / NS_PER_S)
+        reported.add_metric(key, stats.stamp_ns / NS_PER_S)
     yield began
+    yield reported
     for name in _names(stats.counts for stats in newest.values()):
         full, worth, text = named(name)
         counter = CounterMetricFamily(full, text, labels=_PROCESS)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
@@ -39,8 +40,27 @@ KERNELS: dict[str, Any] = {}
 """Name -> kernel, of all that Python calls, in the order in which modules were imported."""
 
 
+class _ReadOnlyLocator(caching.UserProvidedCacheLocator):
+    """The folder NUMBA_CACHE_DIR where it is there and cannot be written to, as in an image of a container."""
+
+    def ensure_cache_path(self):
+        os.scandir(self.get_cache_path()).close()  # an OSError sends numba on to the next place
+
+
+class _FolderCacheImpl(caching.CompileResultCacheImpl):
+    """numba's, which knows only folders that it can write to."""
+
+    _locator_classes = (
+        caching.UserProvidedCacheLocator,
+        _ReadOnlyLocator,
+        *caching.CompileResultCacheImpl._locator_classes[1:],
+    )
+
+
 class _FolderCache(caching.FunctionCache):
     """A function's cache on disk, found where numba would put it (NUMBA_CACHE_DIR, __pycache__ or the user's)."""
+
+    _impl_class = _FolderCacheImpl
 
     def __init__(self, function):
         super().__init__(function)
@@ -51,6 +71,15 @@ class _FolderCache(caching.FunctionCache):
         """As numba's, but without its registries, which only a compilation needs and which take 0.5 s to load."""
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
+
+    @property
+    def read_only(self):
+        return isinstance(self._impl.locator, _ReadOnlyLocator)
+
+    def save_overload(self, sig, data):
+        """As numba's, where there is a place for it."""
+        if not self.read_only:
+            super().save_overload(sig, data)
 
 
 def _compiled(function: Any, **options: bool) -> Any:
@@ -73,7 +102,7 @@ def kernel(signature: str) -> Callable[[Any], Any]:
     signature  as numba reads one, of the arguments; any other type is a TypeError
 
     It is compiled, or loaded, by `load`, or else by its first call. Where no folder can be written to, every
-    process compiles for itself. With NUMBA_DISABLE_JIT the function stays as it is.
+    process compiles for itself what NUMBA_CACHE_DIR lacks. With NUMBA_DISABLE_JIT the function stays as it is.
 
     Kernels and helpers allocate nothing, so that no references need to be counted: arrays to write to are handed
     in. That halved the time to compile them all.
@@ -155,5 +184,14 @@ def is_on_disk(compiled: Any) -> bool:
 
 def cache_folder() -> Path | None:
     """Where compiled code is kept; None where no folder can be written to."""
+    return next((Path(each.cache_path) for each in _caches() if not each.read_only), None)
+
+
+def code_folder() -> Path | None:
+    """Where compiled code is looked for: `cache_folder`, or NUMBA_CACHE_DIR where it can only be read."""
+    return next((Path(each.cache_path) for each in _caches()), None)
+
+
+def _caches() -> list[_FolderCache]:
     caches = [each._cache for each in KERNELS.values() if not config.DISABLE_JIT]
-    return next((Path(each.cache_path) for each in caches if isinstance(each, _FolderCache)), None)
+    return [each for each in caches if isinstance(each, _FolderCache)]

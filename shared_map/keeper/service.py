@@ -155,7 +155,8 @@ class KeeperService:
         self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]
-        self.counters.counts["sets_refused"] = counts["sets_refused"]
+        for name in ("sets_refused", "sets_without_room"):
+            self.counters.counts[name] = counts[name]
         self.counters.gauge("sets_waiting", float(self._keeper.waiting))
         self._member.tick(now_ns)
 

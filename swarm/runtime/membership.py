@@ -49,7 +49,10 @@ class Member:
         self.alarms = Alarms(() if before is None else before.alarms)
         """What people should know that watch the run."""
         self.counters = Counters()
-        """All that this process counts; never reset."""
+        """All that this process counts; never reset. What must not be is counted from 0, so that whoever watches
+        sees the first time."""
+        for name in ("strangers", "plugin_failed"):
+            self.counters.count(name, 0)
         self.web_port = 0
         """Where people can look at this process. Told each second: whoever begins to listen later hears it, too."""
         self._bus = bus

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -50,12 +51,16 @@ def folder(tmp_path: Path) -> Path:
     return kernels
 
 
-def call(folder: Path, **environment: str) -> tuple[int, int, int]:
-    """(f(7), cache hits, cache misses) in a fresh process."""
+def call(folder: Path, *, within: Sequence[str] = (), **environment: str) -> tuple[int, int, int]:
+    """(f(7), cache hits, cache misses) in a fresh process, started by the command `within`."""
     settings = {"PYTHONPATH": str(folder.parent), "PYTHONDONTWRITEBYTECODE": "1"}
     settings = {"NUMBA_CACHE_DIR": str(folder.parent / "cache")} | settings | environment
     done = subprocess.run(
-        [sys.executable, "-c", _CALL], env={**os.environ, **settings}, capture_output=True, text=True, timeout=120
+        [*within, sys.executable, "-c", _CALL],
+        env={**os.environ, **settings},
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     value, hits, misses = map(int, done.stdout.split())
@@ -79,3 +84,36 @@ def test_kernels_run_where_nothing_can_be_written(folder: Path) -> None:
     (folder / "__pycache__").write_text("a file, where numba would make a folder")
     nowhere = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), "/dev/null/nowhere")
     assert call(folder, **nowhere) == (21, 0, 1)
+
+
+@pytest.fixture
+def read_only(folder: Path) -> Iterator[list[str]]:
+    """Makes the cache and the sources read-only after a first call; the command that even root is held to it by."""
+    as_user = []
+    if os.geteuid() == 0:  # who may write to all, whatever the mode
+        if shutil.which("setpriv") is None:
+            pytest.skip("root may write everywhere: setpriv, which takes that right away, is not installed")
+        as_user = ["setpriv", "--bounding-set=-all"]
+    assert call(folder) == (21, 0, 1)
+    places = [folder, *(path for path in folder.parent.rglob("*") if path.is_dir()), folder.parent]
+    for place in places:
+        place.chmod(0o555)
+    yield as_user
+    for place in reversed(places):
+        place.chmod(0o755)
+
+
+def test_code_in_a_folder_that_can_only_be_read_is_called(folder: Path, read_only: list[str]) -> None:
+    assert call(folder, within=read_only) == (21, 1, 0)
+
+
+def test_what_a_folder_that_can_only_be_read_lacks_is_compiled(folder: Path, read_only: list[str]) -> None:
+    nowhere = dict.fromkeys(("XDG_CACHE_HOME", "HOME"), "/dev/null/nowhere")
+    assert call(folder, within=read_only, NUMBA_BOUNDSCHECK="1", **nowhere) == (21, 0, 1)
+
+
+def test_code_for_any_processor_is_called_whatever_the_processor(folder: Path) -> None:
+    """What is compiled for "generic" is found by every process that asks for that, and by no other."""
+    assert call(folder, NUMBA_CPU_NAME="generic") == (21, 0, 1)
+    assert call(folder, NUMBA_CPU_NAME="generic") == (21, 1, 0)
+    assert call(folder) == (21, 0, 1)

@@ -1,0 +1,58 @@
+"""What an exporter exports of a swarm that has everything to tell."""
+
+from __future__ import annotations
+
+from prometheus_client.openmetrics.exposition import generate_latest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families
+
+from launch_scripts.metrics.endpoint import OneScrape
+from launch_scripts.metrics.families import HELP, Figures, Run, families
+from launch_scripts.report.results.counts import Counts
+from shared_map.keeper.service import THROTTLED
+from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, READY, Counters
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.vehicles import VehicleState
+
+_MEASURED = ("_ms", "_us", "_excess")
+_NOW = (READY, "ended", "cpu_s", "rss_bytes")
+
+
+def exported() -> dict[str, set[str]]:
+    """Name of each sample -> its labels, of a swarm that has everything to tell; read by the strict parser."""
+    counters = Counters()
+    for name in HELP:
+        if name.endswith(_MEASURED):
+            counters.observe(name, 1.0)
+        elif name in _NOW:
+            counters.gauge(name, 1.0)
+        else:
+            counters.count(name)
+    for state in VehicleState:
+        counters.gauge(f"vehicles_{state.name.lower()}", 1.0)
+    counters.gauge(f"{THROTTLED}all.a0.1", 1.0)
+    counters.count_by(CAPTURES_OF, "t0")
+    counters.observe_by(GAPS_TO, "t0", 0.03)
+    counts = Counts()
+    counts.count(
+        Stats(
+            role="agent", id="a0", incarnation=1, stamp_ns=2, counts=counters.counts, gauges=counters.gauges,
+            histograms={name: each.buckets for name, each in counters.histograms.items()},
+            counts_by=counters.counts_by,
+            histograms_by={
+                name: {id: each.buckets for id, each in by.items()} for name, by in counters.histograms_by.items()
+            },
+        )
+    )  # fmt: skip
+    status = PlannerStatus(
+        target="t0", incarnation=1, stamp_ns=1, strategy="exact", target_cell=5, map_version=1, tree_age_ms=250.0,
+        window=[], growths=2, window_growths=3, growth_ms=4.0, routes_served=5, following=7, pose_age_s=0.5,
+        tracker_lost=True,
+    )  # fmt: skip
+    figures = Figures(Run("r", "demo", 1), counts, {"t0": status}, [("agent", "a0")])
+    text = generate_latest(OneScrape(families(figures))).decode()
+    found: dict[str, set[str]] = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            found.setdefault(sample.name, set()).update(sample.labels)
+    return found

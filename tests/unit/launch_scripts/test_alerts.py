@@ -1,0 +1,129 @@
+"""Each alert asks for what is exported, says what to do, and fires on what it is about."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from support.exported_metrics import exported
+
+from launch_scripts.commands.metrics import alerts
+from swarm.wire.messages.vehicles import VehicleState
+
+_PAGE = Path(__file__).parents[3] / "docs" / "operate" / "alerts.md"
+
+
+def rules() -> list[dict[str, Any]]:
+    [group] = yaml.safe_load(alerts())["groups"]
+    assert set(group) == {"name", "rules"}
+    found: list[dict[str, Any]] = group["rules"]
+    return found
+
+
+@pytest.mark.parametrize("rule", rules(), ids=lambda rule: rule["alert"])
+def test_a_rule_asks_for_what_is_exported_and_says_what_to_do(rule: dict[str, Any]) -> None:
+    known = exported()
+    asked = re.findall(r"swarm_[a-z0-9_]+", rule["expr"])
+    assert asked
+    assert set(asked) <= set(known)
+    labels = set.intersection(*(known[name] for name in asked)) if len(asked) else set()
+    said = rule["annotations"]
+    assert set(said) == {"summary", "runbook"}
+    assert set(re.findall(r"\$labels\.(\w+)", said["summary"])) <= labels
+    assert set(re.findall(r"\b(\w+)=\"", rule["expr"])) <= labels
+    for state in re.findall(r"state=\"(\w+)\"", rule["expr"]):
+        assert state.upper() in VehicleState.__members__
+    assert rule["labels"] in ({"severity": "critical"}, {"severity": "warning"})
+    assert re.fullmatch(r"\d+[sm]", rule.get("for", "0s"))
+    assert set(rule) <= {"alert", "expr", "for", "labels", "annotations"}
+    assert said["runbook"] == f"docs/operate/alerts.md#{rule['alert'].lower()}"
+
+
+def test_every_alert_has_a_heading_with_its_severity_and_every_heading_an_alert() -> None:
+    told = re.findall(r"^## (\w+)\n\n\*(Critical|Warning)\.\*", _PAGE.read_text(), re.MULTILINE)
+    assert told == [(rule["alert"], rule["labels"]["severity"].capitalize()) for rule in rules()]
+    assert len(re.findall(r"^## ", _PAGE.read_text(), re.MULTILINE)) == len(told)
+
+
+_PROCESS = '{role="agent", id="a0"}'
+_COUNTED = "0+0x20 1+0x20"
+"""A counter that is 0 for five minutes, and then 1."""
+FIRES: dict[str, dict[str, str]] = {
+    "SwarmNotObserved": {},
+    "SwarmProcessDown": {f"swarm_process_up{_PROCESS}": "1+0x20 0+0x20"},
+    "SwarmProcessSilent": {
+        f"swarm_process_up{_PROCESS}": "1+0x40",
+        f"swarm_process_reported_timestamp_seconds{_PROCESS}": "0+15x16 240+0x24",
+    },
+    "SwarmProcessNotReady": {f"swarm_process_up{_PROCESS}": "1+0x40", f"swarm_ready{_PROCESS}": "1+0x10 0+0x30"},
+    "SwarmProcessRestarts": {f"swarm_process_start_time_seconds{_PROCESS}": "0+0x20 1+1x20"},
+    "SwarmStrangers": {f"swarm_strangers_total{_PROCESS}": _COUNTED},
+    "SwarmStoreNotWritten": {f"swarm_saves_failed_total{_PROCESS}": "0+0x20 1+1x20"},
+    "SwarmMarksRefused": {f"swarm_sets_without_room_total{_PROCESS}": _COUNTED},
+    "SwarmAuthorThrottled": {'swarm_author_throttled{role="keeper", id="0", author="all.a0.1"}': "1+0x40"},
+    "SwarmTargetLost": {'swarm_target_lost{target="t0"}': "1+0x40"},
+    "SwarmVehiclesLost": {'swarm_vehicles{role="agent", id="a0", state="lost"}': "3+0x40"},
+    "SwarmVehiclesStranded": {'swarm_vehicles{role="agent", id="a0", state="stranded"}': "3+0x40"},
+    "SwarmTicksLate": {
+        f"swarm_ticks_late_total{_PROCESS}": "0+50x40",
+        f"swarm_tick_seconds_count{_PROCESS}": "0+150x40",
+    },
+    "SwarmQuestionsExpired": {f"swarm_asks_expired_total{_PROCESS}": "0+1x40"},
+    "SwarmInboxFull": {f"swarm_events_dropped_total{_PROCESS}": _COUNTED},
+    "SwarmPayloadsDropped": {f"swarm_payloads_dropped_total{_PROCESS}": _COUNTED},
+    "SwarmPluginFailed": {f"swarm_plugin_failed_total{_PROCESS}": _COUNTED},
+    "SwarmCollision": {f"swarm_driven_into_total{_PROCESS}": _COUNTED},
+    "SwarmLethalEntry": {f"swarm_lethal_entries_total{_PROCESS}": _COUNTED},
+    "SwarmCertificateBroken": {f"swarm_broken_certificates_total{_PROCESS}": _COUNTED},
+}
+"""Alert -> series, a value each 15 s, by which it fires at 7 min."""
+WELL = {
+    'swarm_run_info{run_id="r"}': "1+0x40",
+    f"swarm_process_up{_PROCESS}": "1+0x40",
+    'swarm_process_up{role="agent", id="left"}': "0+0x40",
+    'swarm_ended{role="agent", id="left"}': "1+0x40",
+    f"swarm_ready{_PROCESS}": "1+0x40",
+    f"swarm_process_reported_timestamp_seconds{_PROCESS}": "0+15x40",
+    f"swarm_process_start_time_seconds{_PROCESS}": "5+0x40",
+    f"swarm_ticks_late_total{_PROCESS}": "0+1x40",
+    f"swarm_tick_seconds_count{_PROCESS}": "0+150x40",
+    f"swarm_strangers_total{_PROCESS}": "3+0x40",
+    'swarm_vehicles{role="agent", id="a0", state="lost"}': "0+0x40",
+    'swarm_target_lost{target="t0"}': "0+0x40",
+}
+"""A swarm about which there is nothing to say: one process has left as it was asked to."""
+
+
+def test_there_is_a_history_for_every_alert() -> None:
+    assert list(FIRES) == [rule["alert"] for rule in rules()]
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not installed")
+def test_promtool_says_that_each_alert_fires_on_its_history_and_none_while_all_is_well(tmp_path: Path) -> None:
+    (tmp_path / "alerts.yml").write_text(alerts())
+
+    def history(series: dict[str, str], expected: dict[str, bool]) -> dict[str, Any]:
+        return {
+            "interval": "15s",
+            "input_series": [{"series": name, "values": values} for name, values in series.items()],
+            "promql_expr_test": [
+                {
+                    "expr": f'count(ALERTS{{alertname="{alert}", alertstate="firing"}}) > 0 or vector(0)',
+                    "eval_time": "7m",
+                    "exp_samples": [{"labels": "{}", "value": float(fires)}],
+                }
+                for alert, fires in expected.items()
+            ],
+        }
+
+    tests = [history(WELL, dict.fromkeys(FIRES, False))]
+    tests += [history(series, {alert: True}) for alert, series in FIRES.items()]
+    (tmp_path / "tests.yml").write_text(yaml.safe_dump({"rule_files": ["alerts.yml"], "tests": tests}))
+    for command in (["check", "rules", "alerts.yml"], ["test", "rules", "tests.yml"]):
+        told = subprocess.run(["promtool", *command], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        assert told.returncode == 0, told.stdout + told.stderr

@@ -1,0 +1,153 @@
+"""The recipe of the image: linted, built from what is there, nobody is root, and what it compiles is found."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from dockerfile_parse import DockerfileParser
+
+ROOT = Path(__file__).parents[3]
+RECIPE = ROOT / "Containerfile"
+
+
+class Step(NamedTuple):
+    """An instruction, of the stage of that number."""
+
+    stage: int
+    instruction: str
+    value: str
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory: pytest.TempPathFactory) -> list[Step]:
+    copy = tmp_path_factory.mktemp("recipe") / "Dockerfile"
+    copy.write_bytes(RECIPE.read_bytes())  # the parser writes into the folder of the file
+    stage, found = 0, []
+    for part in DockerfileParser(str(copy)).structure:
+        if part["instruction"] == "FROM":
+            stage += 1
+        if part["instruction"] != "COMMENT":
+            found.append(Step(stage, part["instruction"], part["value"]))
+    return found
+
+
+def values(steps: list[Step], instruction: str, stage: int) -> list[str]:
+    return [step.value for step in steps if step.instruction == instruction and step.stage == stage]
+
+
+def settings_of(steps: list[Step], stage: int) -> dict[str, str]:
+    pairs = re.findall(r"(\w+)=(\S+)", " ".join(values(steps, "ENV", stage)))
+    return dict(pairs)
+
+
+def test_the_recipe_passes_hadolint() -> None:
+    hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent)) or shutil.which("hadolint")
+    if hadolint is None:
+        pytest.skip("hadolint is not installed; the group dev has it")
+    done = subprocess.run([hadolint, "--no-color", str(RECIPE)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_image_runs_as_nobody_and_compiles_nothing(steps: list[Step]) -> None:
+    assert values(steps, "USER", 2) == ["10001:10001"]
+    assert values(steps, "ENTRYPOINT", 2) == ['["swarm"]']
+    (probe,) = values(steps, "HEALTHCHECK", 2)
+    assert '"swarm", "health"' in probe
+    last = " ".join(values(steps, "RUN", 2))
+    assert not re.search(r"gcc|build-essential|pip |uv ", last)
+    assert all(value.startswith("--from=build /opt/") for value in values(steps, "COPY", 2))
+
+
+def test_both_stages_look_for_kernels_in_one_place_and_for_one_processor(steps: list[Step]) -> None:
+    for name in ("NUMBA_CACHE_DIR", "NUMBA_CPU_NAME"):
+        assert settings_of(steps, 1)[name] == settings_of(steps, 2)[name]
+    assert settings_of(steps, 1)["UV_PROJECT_ENVIRONMENT"] == "/opt/swarm"
+    copied = [value.split()[1:] for value in values(steps, "COPY", 2)]
+    # A kernel's folder is named by the path of its source.
+    assert all(source == place for source, place in copied)
+    assert {settings_of(steps, 1)["NUMBA_CACHE_DIR"], "/opt/swarm"} == {source for source, _ in copied}
+
+
+def test_what_the_recipe_copies_is_there_and_let_through(steps: list[Step]) -> None:
+    let_through = {
+        line[1:]
+        for line in (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+        if line.startswith("!")
+    }
+    copied = {source for value in values(steps, "COPY", 1) for source in value.split()[:-1]}
+    assert copied == let_through
+    assert all((ROOT / source).exists() for source in copied)
+
+
+def test_every_step_is_a_script_that_the_shell_can_read(steps: list[Step]) -> None:
+    for step in steps:
+        if step.instruction == "RUN":
+            done = subprocess.run(["sh", "-n"], input=step.value, capture_output=True, text=True, timeout=20)
+            assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.thorough
+def test_the_steps_of_the_first_stage_make_an_environment_whose_kernels_are_only_read(
+    steps: list[Step], tmp_path: Path
+) -> None:
+    """As the builder of an image does them, below a folder of our own: with the lock, and no compiled kernel."""
+    folders = {name: str(tmp_path / name.strip("/").replace("/", "-")) for name in ("/opt/swarm", "/opt/kernels")}
+    folders |= {"/opt/uv": str(tmp_path / "uv"), "/src": str(tmp_path / "src")}
+
+    def here(text: str) -> str:
+        for name, folder in folders.items():
+            text = text.replace(name, folder)
+        return text
+
+    context, settings = tmp_path / "src", {"EXTRA": "roles", "PYTHONPATH": ""}
+    context.mkdir()
+    work = context
+    for step in steps:
+        if step.stage != 1:
+            continue
+        if step.instruction == "ENV":
+            pairs = re.findall(r"(\w+)=(\S+)", step.value)
+            settings |= {name: here(value).replace("${NUMBA_CPU_NAME}", "generic") for name, value in pairs}
+        elif step.instruction == "WORKDIR":
+            work = Path(here(step.value))
+        elif step.instruction == "COPY":
+            *sources, _ = step.value.split()
+            for source in sources:
+                kept = shutil.ignore_patterns("__pycache__")
+                if (ROOT / source).is_dir():
+                    shutil.copytree(ROOT / source, work / source, ignore=kept)
+                else:
+                    shutil.copy(ROOT / source, work / source)
+        elif step.instruction == "RUN":
+            done = subprocess.run(
+                ["sh", "-c", here(step.value)], cwd=work, env={**os.environ, **settings},
+                capture_output=True, text=True, timeout=1500, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr[-3000:]
+    count = (
+        "from planner_service.kernel_build import all_kernels, load_what_is_there\n"
+        "load_what_is_there()\n"
+        "print(sum(sum(each.stats.cache_misses.values()) for each in all_kernels()),"
+        " sum(bool(each.stats.cache_hits) for each in all_kernels()), len(all_kernels()))"
+    )
+    kernels = Path(folders["/opt/kernels"])
+    for path in [kernels, *kernels.rglob("*")]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    held = ["setpriv", "--bounding-set=-all"] if os.geteuid() == 0 else []
+    done = subprocess.run(
+        [*held, f"{folders['/opt/swarm']}/bin/python", "-c", count],
+        env={**os.environ, **settings}, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    for path in [kernels, *kernels.rglob("*")]:
+        path.chmod(0o755)
+    assert done.returncode == 0, done.stderr[-3000:]
+    misses, hits, every = map(int, done.stdout.split())
+    assert misses == 0
+    assert 0 < hits <= every
