@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.bench.whole_swarm.size import CELLS_PER_VEHICLE, Size
 from swarm.grid import REGION_CELLS
+from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY
 
 INTEREST_CELLS = 75
 """Within so many cells of a vehicle its agent holds the map: `map.interest_m` of the scenario, in cells."""
@@ -42,7 +43,8 @@ class Quantities:
     cells         of the map
     side          cells a side of the map
     rate          ticks a second
-    plots         regions that the map has; each is a plot of right of way
+    plots         plots of right of way, one for each region; 0 of fewer than three agents, as their plots have
+                  one member, which tells nobody
     shared        pairs of an agent and a region in which it has vehicles
     hearers       agents that hold the region of a vehicle, on average; they hear its marks
     near          share of all regions that an agent holds, on average
@@ -81,7 +83,7 @@ def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines:
         cells=size.side**2,
         side=size.side,
         rate=size.tick_hz,
-        plots=math.ceil(size.side / REGION_CELLS) ** 2,
+        plots=math.ceil(size.side / REGION_CELLS) ** 2 if size.agents >= FEWEST_FOR_MAJORITY else 0,
         shared=shared,
         hearers=hearers,
         near=near,

@@ -22,6 +22,7 @@ TERMS: Mapping[str, Callable[[Quantities], float]] = {
     "agents x rate": lambda q: q.agents * q.rate,
     "planners x rate": lambda q: q.planners * q.rate,
     "vehicles x rate": lambda q: q.vehicles * q.rate,
+    "vehicles in tables x rate": lambda q: q.vehicles * q.rate if q.plots else 0.0,
     "shared regions x rate": lambda q: q.shared * q.rate,
     "plots x rate": lambda q: q.plots * q.rate,
     "chases": lambda q: q.chases,
@@ -36,15 +37,6 @@ TERMS: Mapping[str, Callable[[Quantities], float]] = {
     "processes": lambda q: q.agents + q.planners + q.keepers + q.monitors + 1 + q.launchers,
 }
 """Term -> its value. Messages and bytes by role are terms, too: see `Work`."""
-
-TERM_MEANINGS: Mapping[str, str] = {
-    "shared regions x rate": "pairs of an agent and a region in which it has vehicles, each tick",
-    "plots x rate": "regions of the map, each tick",
-    "chases": "pairs of an agent and a target that one of its vehicles chases",
-    "asks": "requests of agents for what their vehicles need to each target: every 5 s, and after each capture",
-    "asked vehicles": "vehicles in those requests",
-    "planners x side": "trees follow their targets in windows that grow with the side of the map",
-}
 
 
 def one(_: Quantities) -> float:
@@ -112,7 +104,7 @@ SENT: tuple[Sent, ...] = (
         "table",
         "agent",
         ("plots x rate",),
-        ("plots x rate", "vehicles x rate"),
+        ("plots x rate", "vehicles in tables x rate"),
         {"agent": "one"},
         "a warden's table, to the two other members of its plot",
     ),
@@ -270,15 +262,15 @@ class Work:
 WORK: tuple[Work, ...] = (
     Work(
         "agent",
-        ("agents x rate", "vehicles x rate", "messages", "map bytes", "costs bytes"),
+        ("agents x rate", "vehicles x rate", "plots x rate", "messages", "map bytes", "costs bytes"),
         ("agents", "vehicles", "cells"),
-        "ticks, vehicles in each, messages; marks and digests that are merged; costs of all targets",
+        "ticks, vehicles, members of plots, messages; marks and digests that are merged; costs of all targets",
     ),
     Work(
         "planner",
-        ("planners x rate", "planners x side", "vehicles", "messages", "map bytes"),
+        ("planners x rate", "planners x side", "vehicles", "messages"),
         ("planners", "planners x cells", "cells"),
-        "ticks, a tree that follows its target, vehicles that are led, messages; marks and digests that are merged",
+        "ticks, a tree that follows its target, vehicles that are led, messages",
     ),
     Work(
         "router",

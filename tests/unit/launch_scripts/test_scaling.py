@@ -30,6 +30,7 @@ from launch_scripts.bench.scaling.traffic import MACHINES, Traffic, run
 from launch_scripts.bench.whole_swarm.size import Size, size_of
 from launch_scripts.commands.deploy import app as deploy
 from swarm.errors import ConfigError, SwarmError
+from swarm.grid import REGION_CELLS
 
 PAGE = Path(__file__).parents[3] / "docs" / "scaling.md"
 
@@ -146,7 +147,10 @@ sizes = st.builds(
 @given(sizes)
 def test_agents_share_regions_and_hear_marks_within_bounds(size: Size) -> None:
     q = quantities_of(size)
-    assert q.agents <= q.shared <= min(q.agents * q.plots, 9 * q.vehicles)
+    regions = math.ceil(size.side / REGION_CELLS) ** 2
+    assert q.plots == (regions if size.agents >= 3 else 0)
+    assert q.agents <= q.shared <= min(q.agents * regions, 9 * q.vehicles)
+    assert 0 < q.near <= 1
     assert 1 <= q.hearers <= q.agents
     assert 0 < q.chases <= min(size.agents * size.targets, size.vehicles) + 1e-9
 
