@@ -158,6 +158,15 @@ def up(
             help="Take part in this run; by default a new one, or the one in the namespace.", rich_help_panel=PART
         ),
     ] = None,
+    take_over: Annotated[
+        bool,
+        typer.Option(
+            "--take-over",
+            help="Take over from the launcher that runs this part of the run here, as for an upgrade: it is ended "
+            "once successors are ready.",
+            rich_help_panel=PART,
+        ),
+    ] = False,
     namespace: Namespace = None,
 ) -> None:
     """Run a scenario: all of its processes on this machine, or some of them.
@@ -173,7 +182,16 @@ def up(
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
     _up(
-        scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, rank=rank, run_id=run_id
+        scenario,
+        run,
+        tls,
+        connect=connect,
+        listen=listen,
+        namespace=namespace,
+        only=only,
+        rank=rank,
+        run_id=run_id,
+        take_over=take_over,
     )
 
 
@@ -188,6 +206,7 @@ def _up(
     only: list[str] | None = None,
     rank: int | None = None,
     run_id: str | None = None,
+    take_over: bool = False,
 ) -> None:
     from launch_scripts.launcher.busy_line import busy_loading
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
@@ -242,6 +261,7 @@ def _up(
         log_format=run.log_format,
         began_s=_began_s(),
         record_inputs=run.record_inputs,
+        takes_over=take_over,
     )
     raise typer.Exit(run_swarm(chosen))
 

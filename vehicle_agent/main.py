@@ -29,7 +29,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     store: PromiseStore = (
         MemoryPromiseStore(secrets.randbits(60))
         if setup.run_dir is None
-        else FilePromiseStore(setup.run_dir / f"promises-{setup.id}")
+        else FilePromiseStore(setup.run_dir / f"promises-{setup.id}", waits=setup.takes_over)
     )
     network = setup.scenario.network
     with (

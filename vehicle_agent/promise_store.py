@@ -91,10 +91,12 @@ class FilePromiseStore(MemoryPromiseStore):
 
     The file is locked for as long as the process lives: so an earlier life that ran on it has ended.
 
+    waits  for the end of a process that has locked it
+
     Raises StoreError if the file is in use, is not ours or cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, waits: bool = False) -> None:
         super().__init__(secrets.randbits(60))
         self._path = path
         self._spare_path = path.with_name(f"{path.name}.spare")
@@ -102,7 +104,7 @@ class FilePromiseStore(MemoryPromiseStore):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
         except BlockingIOError as error:
             raise StoreError(f"{path} is in use: the same agent runs here already; end it first") from error
         except OSError as error:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument
+
+KitName = Literal["systemd", "compose", "kubernetes"]
 
 if TYPE_CHECKING:
     from launch_scripts.deploy.plan import Plan
@@ -23,6 +26,12 @@ def plan(
             help="Write an archive for each machine here, certificates included; if not given, only show."
         ),
     ] = None,
+    kit: Annotated[
+        KitName, typer.Option(help="What starts the processes: systemd, compose (containers) or kubernetes.")
+    ] = "systemd",
+    image: Annotated[
+        str, typer.Option(help="Image of the roles, NAME:TAG, for containers; if not given, that of this version.")
+    ] = "",
     wheel: Annotated[
         Path | None, typer.Option(help="Put this wheel of the swarm into the archives, to be installed from them.")
     ] = None,
@@ -36,36 +45,68 @@ def plan(
 
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
+    swarm deploy plan my.toml --hosts hosts.toml --out kits --kit kubernetes && kubectl apply -f kits/kubernetes
+
     Every process runs once; keepers, and planners and their standbys, on machines of their own. A second plan into
     the same folder keeps the certificates.
     """
     from launch_scripts.check.settings import check_start
     from launch_scripts.deploy.hosts import load_hosts
-    from launch_scripts.deploy.kits import write_kits
+    from launch_scripts.deploy.kits import keepers_before
     from launch_scripts.deploy.plan import make_plan
-    from launch_scripts.deploy.systemd import systemd_files
     from launch_scripts.launcher.options import common_run_id, find_scenario, with_network
     from swarm.errors import ConfigError
 
     chosen = with_network(find_scenario(scenario), namespace=namespace)
     try:
-        made = make_plan(chosen, load_hosts(hosts), common_run_id(chosen))
+        run_id = common_run_id(chosen)
+        keepers = {} if out is None else keepers_before(out, run_id)
+        made = make_plan(chosen, load_hosts(hosts), run_id, keepers)
     except ConfigError as error:
         raise ConfigError(_of_file(str(error), hosts)) from error
     if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
         raise ConfigError(f"--wheel: found {wheel}, expected a file NAME.whl; `uv build --wheel` makes one")
+    if kit != "systemd" and wheel is not None:
+        raise ConfigError(f"--wheel: found {wheel} with --kit {kit}, expected none: containers have an image")
     check_start(chosen, joins=True, has_ground=True)
-    written = [] if out is None else write_kits(made, out, systemd_files, days, wheel)
+    written = [] if out is None else _write(made, out, kit, image, days, wheel)
     if as_json:
         from launch_scripts.deploy.shown_plan import as_json as fields
 
         typer.echo(json.dumps({**fields(made), "archives": list(map(str, written))}, indent=2))
         return
     _show(made)
-    for host, archive in zip(made.hosts, written, strict=True) if written else ():
-        typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
+    if kit == "kubernetes":
+        for folder in written:
+            typer.echo(f"{folder}: `kubectl apply -f {folder}`")
+    else:
+        for host, archive in zip(made.hosts, written, strict=True) if written else ():
+            typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
     if out is not None:
         typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
+
+
+def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
+    from launch_scripts.deploy.containers.cluster import write_cluster
+    from launch_scripts.deploy.containers.compose import compose_files
+    from launch_scripts.deploy.host_scenario import CERTIFICATES
+    from launch_scripts.deploy.kits import write_kits
+    from launch_scripts.deploy.revocations import revoked_in
+    from launch_scripts.deploy.systemd import systemd_files
+
+    match kit:
+        case "systemd":
+            return write_kits(made, out, systemd_files, days, wheel)
+        case "compose":
+            return write_kits(
+                made,
+                out,
+                partial(compose_files, image=image, revoked=revoked_in(out / CERTIFICATES)),
+                days,
+                launcher=False,
+            )
+        case "kubernetes":
+            return [write_cluster(made, out, days, image)]
 
 
 def _of_file(sentence: str, path: Path) -> str:

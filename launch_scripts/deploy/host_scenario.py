@@ -10,6 +10,7 @@ import msgspec
 from launch_scripts.deploy.plan import Plan, PlannedHost
 from swarm.config.ground import ZoneConfig
 from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES
+from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import UNTIL_STOPPED_S, Scenario, TlsConfig
 from swarm.errors import ConfigError
 
@@ -91,3 +92,15 @@ def parts_of(path: Path) -> list[Path]:
     """The files beside one that belong to it: x.dbf and x.prj to x.shp, x.tfw and x.tif.aux.xml to x.tif."""
     names = [*(f"{path.stem}{suffix}" for suffix in _BESIDE), *(f"{path.name}{suffix}" for suffix in _BESIDE)]
     return [found for name in names if (found := path.with_name(name)) != path and found.is_file()]
+
+
+def plugin_files(scenario: Scenario) -> dict[str, Path]:
+    """The modules of plug-ins that a scenario takes from its own folder, and those beside them."""
+    folder = Path(scenario.plugin_folder)
+    modules = {
+        named.name.partition(":")[0].partition(".")[0] for named in plugins_of(scenario) if ":" in named.name
+    }
+    if not any((folder / f"{module}.py").is_file() or (folder / module).is_dir() for module in modules):
+        return {}
+    packages = [path for module in modules for path in sorted((folder / module).rglob("*.py"))]
+    return {f"{PLUGINS}/{path.relative_to(folder)}": path for path in (*sorted(folder.glob("*.py")), *packages)}

@@ -10,63 +10,128 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import msgspec
+
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, called_of, hosts_of, issue
-from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, PLUGINS, host_scenario, parts_of
-from launch_scripts.deploy.plan import ROUTER, Plan, PlannedHost
+from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
+from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.deploy.shown_plan import as_json
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.access_control import common_name
-from swarm.config.plugin_names import plugins_of
-from swarm.config.scenario import Scenario
+from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 
 Render = Callable[[Plan, PlannedHost], Mapping[str, str]]
 """Name -> text of the files that start a machine's processes. Names without an ending are scripts."""
 _PRIVATE, _OPEN, _SCRIPT = 0o600, 0o644, 0o755
+PLAN = "plan.json"
 
 
-def write_kits(plan: Plan, out: Path, render: Render, days: int, wheel: Path | None = None) -> list[Path]:
+class _ProcessBefore(msgspec.Struct):
+    role: str
+    id: str
+
+
+class _HostBefore(msgspec.Struct):
+    name: str
+    processes: tuple[_ProcessBefore, ...]
+
+
+class _Before(msgspec.Struct):
+    """What is read of an earlier plan."""
+
+    run_id: str
+    hosts: tuple[_HostBefore, ...]
+
+
+def write_kits(
+    plan: Plan, out: Path, render: Render, days: int, wheel: Path | None = None, *, launcher: bool = True
+) -> list[Path]:
     """An archive for each machine, `out/NAME.tar.gz`, which unpacks into `swarm-NAME/`. Returns the archives.
 
     Certificates lie in `out/certs` with the authority's key, which leaves it for no archive. What is there already
-    is kept, so that a second plan replaces no key that needs none. Raises StoreError where a file cannot be read or
+    is kept, so that a second plan replaces no key that needs none. `launcher`: whether a launcher starts the
+    processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be read or
     written.
     """
-    folder = out / CERTIFICATES
-    revoked = revoked_in(folder)
-    authority(folder)
-    _issued(folder, OPERATOR, (), days, revoked)
+    folder, revoked = out / CERTIFICATES, for_operators(out, days)
     written = []
     for host in plan.hosts:
         scenario, ground = host_scenario(plan, host)
         texts = {
             "scenario.toml": scenario_text(scenario, Path()),
-            "plan.json": json.dumps(as_json(plan), indent=1) + "\n",
+            PLAN: _shown(plan),
             **render(plan, host),
         }
         if revoked and host.of(ROUTER):
             texts[f"{CERTIFICATES}/{REVOKED}"] = "".join(f"{name}\n" for name in revoked)
-        files = {**ground, **_plugin_files(plan.scenario), **_certificates(folder, host, days, revoked)}
+        files = {**ground, **plugin_files(plan.scenario), **certificates_of(folder, host, days, revoked)}
+        if launcher:
+            files |= _files_of(_issued(folder, host.operator, (), days, revoked), OPERATOR)
         if wheel is not None:
             files[f"wheels/{wheel.name}"] = wheel
         written.append(_archive(out, host.name, texts, files))
+    keep_plan(plan, out)
     return written
 
 
-def _certificates(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:
-    """Place in the archive -> file, of the certificates of a machine's processes. Its launcher's, whose name is the
-    machine's own, lies where `swarm up` looks for an operator's."""
+def for_operators(out: Path, days: int) -> tuple[str, ...]:
+    """Makes the authority and the certificate of operators in `out/certs`, if they lack. Returns the names that are
+    revoked there."""
+    folder = out / CERTIFICATES
+    revoked = revoked_in(folder)
+    authority(folder)
+    _issued(folder, OPERATOR, (), days, revoked)
+    return revoked
+
+
+def keep_plan(plan: Plan, out: Path) -> None:
+    """Writes the plan for `keepers_before`. Raises StoreError where it cannot."""
+    try:
+        (out / PLAN).write_text(_shown(plan), encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {out / PLAN}: {error.strerror or error}") from error
+
+
+def _shown(plan: Plan) -> str:
+    return json.dumps(as_json(plan), indent=1) + "\n"
+
+
+def keepers_before(out: Path, run_id: str) -> dict[str, str]:
+    """Keeper -> machine, in the plan of the same run whose archives were written to a folder before; empty if there
+    is none. Raises StoreError where it cannot be read."""
+    path = out / PLAN
+    if not path.exists():
+        return {}
+    try:
+        before = msgspec.json.decode(read_bytes(path, FileKind.RUN), type=_Before)
+    except msgspec.DecodeError as error:
+        raise StoreError(f"{path} is no plan of `swarm deploy plan`: {error}; write to another folder") from error
+    if before.run_id != run_id:
+        return {}
+    return {process.id: host.name for host in before.hosts for process in host.processes if process.role == KEEPER}
+
+
+def certificates_of(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:
+    """Place in the archive -> file, of the certificates of a machine's processes. Those that lack are made."""
     found = {f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
-    named = [(process.certificate, process.certificate, process.role) for process in host.processes]
-    for name, place, role in (*named, (host.operator, OPERATOR, "")):
-        reached = (host.address, *THIS_MACHINE) if role == ROUTER else ()
-        certificate = _issued(folder, name, reached, days, revoked)
-        for suffix in (".pem", ".key"):
-            found[f"{CERTIFICATES}/{place}{suffix}"] = certificate.with_name(f"{name}{suffix}")
+    for process in host.processes:
+        reached = (host.address, router_name(host), *THIS_MACHINE) if process.role == ROUTER else ()
+        found |= _files_of(_issued(folder, process.certificate, reached, days, revoked), process.certificate)
     return found
+
+
+def router_name(host: PlannedHost) -> str:
+    """Under which containers reach the router of a machine; it stands in that router's certificate."""
+    return f"router-{host.name}"
+
+
+def _files_of(certificate: Path, name: str) -> dict[str, Path]:
+    """A certificate and its key, under the name by which a process looks for them."""
+    return {f"{CERTIFICATES}/{name}{suffix}": certificate.with_suffix(suffix) for suffix in (".pem", ".key")}
 
 
 def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked: tuple[str, ...]) -> Path:
@@ -76,18 +141,6 @@ def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked:
     if renew and hosts_of(path) >= set(hosts) and called_of(path) == called:
         return path
     return issue(folder, name, hosts, days, renew=renew, called=called)
-
-
-def _plugin_files(scenario: Scenario) -> dict[str, Path]:
-    """The modules of plug-ins that a scenario takes from its own folder, and those beside them."""
-    folder = Path(scenario.plugin_folder)
-    modules = {
-        named.name.partition(":")[0].partition(".")[0] for named in plugins_of(scenario) if ":" in named.name
-    }
-    if not any((folder / f"{module}.py").is_file() or (folder / module).is_dir() for module in modules):
-        return {}
-    packages = [path for module in modules for path in sorted((folder / module).rglob("*.py"))]
-    return {f"{PLUGINS}/{path.relative_to(folder)}": path for path in (*sorted(folder.glob("*.py")), *packages)}
 
 
 def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str, Path]) -> Path:
@@ -101,7 +154,7 @@ def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str,
                 data = text.encode()
                 mode = _SCRIPT if "." not in Path(place).name and "/" not in place else _OPEN
                 archive.addfile(_entry(name, place, len(data), mode), io.BytesIO(data))
-            for place, source in _with_parts(files):
+            for place, source in with_parts(files):
                 with source.open("rb") as content:
                     size = os.fstat(content.fileno()).st_size
                     mode = _PRIVATE if place.endswith(".key") else _OPEN
@@ -112,7 +165,7 @@ def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str,
     return path
 
 
-def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
+def with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
     """With what belongs to a file by its name, as .shp, .dbf and .prj."""
     for place, source in files.items():
         yield place, source

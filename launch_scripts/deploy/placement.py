@@ -21,14 +21,16 @@ _WITH_KEEPERS = frozenset({"targets"})
 class Job:
     """A process to place.
 
-    job    what it does, alone or with others that are kept on other machines
-    cores  that it is expected to use
+    job     what it does, alone or with others that are kept on other machines
+    cores   that it is expected to use
+    before  name of the machine that has its store; "" if none has
     """
 
     role: str
     id: str
     job: str
     cores: float
+    before: str = ""
 
 
 def place(jobs: Sequence[Job], hosts: Sequence[HostConfig]) -> dict[str, list[Job]]:
@@ -46,7 +48,8 @@ def place(jobs: Sequence[Job], hosts: Sequence[HostConfig]) -> dict[str, list[Jo
         if role == _AGENT:
             placed.share_out(by_role[role])
         else:
-            for job in by_role[role]:
+            # First those that stay where they are, so that no other takes their place.
+            for job in sorted(by_role[role], key=lambda job: not placed.stays(job)):
                 placed.put_apart(job)
     return placed.jobs
 
@@ -64,11 +67,17 @@ class _Placed:
     def carrying(self, role: str) -> list[HostConfig]:
         return [host for host in self._hosts if role in host.roles]
 
+    def stays(self, job: Job) -> bool:
+        """Whether the machine that has its store may still carry it."""
+        return any(host.name == job.before for host in self.carrying(job.role))
+
     def put_apart(self, job: Job) -> None:
         carrying = self.carrying(job.role)
         free = [host for host in carrying if all(each.job != job.job for each in self.jobs[host.name])]
         if job.role in _WITH_KEEPERS:
             free = [host for host in free if any(each.role == "keeper" for each in self.jobs[host.name])] or free
+        if self.stays(job):
+            free = [host for host in free if host.name == job.before] or free
         least = min(free or carrying, key=lambda host: (self._cores[host.name] + job.cores) / host.cores)
         self._put(job, least)
 

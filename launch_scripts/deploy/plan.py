@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import msgspec
 
 from launch_scripts.deploy.hosts import HostConfig, HostsConfig
@@ -98,17 +101,22 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         return [(host, process) for host in self.hosts for process in host.processes]
 
 
-def make_plan(scenario: Scenario, hosts: HostsConfig, run_id: str) -> Plan:
+def make_plan(
+    scenario: Scenario, hosts: HostsConfig, run_id: str, keepers: Mapping[str, str] = MappingProxyType({})
+) -> Plan:
     """The plan of a scenario on these machines. Raises ConfigError where the machines do not suffice.
 
     Every process runs once, a monitor if a machine may have one. Each machine that may has a router. Keepers, and
     the processes of one job, run on machines of their own. Agents with consecutive ids run together, as their
     vehicles start near each other. The same scenario and machines give the same plan.
+
+    keepers  id of a keeper -> name of the machine that it ran on before: it stays there if it can, with its store
     """
     scenario = _surviving(scenario, hosts.losses)
     _check(scenario, hosts)
     carried = {role for host in hosts.hosts for role in host.roles}
-    placed = place([job for job in _jobs(scenario, hosts.losses) if job.role in carried], hosts.hosts)
+    jobs = _jobs(scenario, hosts.losses, keepers)
+    placed = place([job for job in jobs if job.role in carried], hosts.hosts)
     routers = [host for host in hosts.hosts if ROUTER in host.roles]
     scenario = _admitting(scenario, hosts, len(routers))
     planned = tuple(_host(scenario, hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
@@ -133,10 +141,11 @@ def _admitting(scenario: Scenario, hosts: HostsConfig, routers: int) -> Scenario
     return msgspec.structs.replace(scenario, network=msgspec.structs.replace(scenario.network, admit=tuple(admit)))
 
 
-def _jobs(scenario: Scenario, losses: int) -> list[Job]:
+def _jobs(scenario: Scenario, losses: int, kept: Mapping[str, str]) -> list[Job]:
     """Every process but routers, of which each machine that may has one."""
     vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
-    keepers = [Job(KEEPER, str(n), KEEPER, _CORES[KEEPER]) for n in range(losses + 1)]
+    ids = [str(n) for n in range(losses + 1)]
+    keepers = [Job(KEEPER, id, KEEPER, _CORES[KEEPER], kept.get(id, "")) for id in ids]
     others = []
     for spec in processes_of(scenario, tuple(role for role in ROLES if role not in (ROUTER, KEEPER))):
         match spec.role:

@@ -113,6 +113,9 @@ if [ -z "$root" ]; then
         /opt/swarm/bin/python -m pip install --quiet --disable-pip-version-check "$(echo wheels/*.whl)[all]"
     elif [ ! -x {program} ]; then
         found=$(command -v swarm) || fail "there is no program swarm: plan with --wheel, or make a venv /opt/swarm"
+        case $found in
+            /home/* | /root/*) fail "$found is in a home folder, which the service does not see; move it" ;;
+        esac
         mkdir -p /opt/swarm/bin
         ln -sf "$found" {program}
     fi

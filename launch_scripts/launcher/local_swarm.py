@@ -20,6 +20,7 @@ from typing import Any
 
 from launch_scripts.health.verdict import Process
 from launch_scripts.launcher.child import ExitReason, Reports, run_child
+from launch_scripts.launcher.hang_watch import STILL_S, HangWatch
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
 from swarm.errors import StoreError, SwarmError
@@ -83,10 +84,18 @@ class Running:
     refused_s: list[float] = field(default_factory=list)
     """When it refused to run, within the last `REFUSALS_WITHIN_S`."""
     backoff: Backoff = field(default_factory=Backoff)
+    begins_when: Callable[[], bool] | None = None
+    """What its first start waits for; None once it has been started, or where it waits for nothing."""
+    takes_over: bool = False
+    """Whether its first start is beside a life that still runs here."""
+    incarnation: int = 0
+    """Of the life that was started last."""
     dismissed_s: float | None = None
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
     """Memory of a `Board` that its lives write and the launcher reads; None before the first."""
+    hung: bool = False
+    """Whether this life was asked to say where it hangs, and to end."""
 
     @property
     def alive(self) -> bool:
@@ -121,6 +130,7 @@ class LocalSwarm:
         self._setup_of = setup_of
         self._log_dir = log_dir
         self._log_format = log_format
+        self._hang_watch = HangWatch()
         self._context = multiprocessing.get_context("forkserver")
 
     @property
@@ -140,9 +150,10 @@ class LocalSwarm:
         return [running.seen() for running in list(self.running)]
 
     def start(self, role: str | None = None) -> None:
-        """Starts the processes of a role, or all that have not been started."""
+        """Starts the processes of a role, or all that have not been started and wait for nothing."""
         for running in self.running:
-            if running.process is None and running.due_s is None and role in (None, running.spec.role):
+            idle = running.process is None and running.due_s is None and running.begins_when is None
+            if idle and role in (None, running.spec.role):
                 self._start(running)
 
     def add(self, spec: ProcessSpec) -> None:
@@ -172,8 +183,9 @@ class LocalSwarm:
             self.running.remove(running)
 
     def poll(self) -> list[Ending]:
-        """Reaps processes which ended, and starts those which are due."""
+        """Reaps processes which ended, kills those which hang, and starts those which are due."""
         self._let_go()
+        self._end_hung()
         endings = []
         # One look at all: to ask each for its exit code costs a system call and a selector each time.
         ended = wait([running.process.sentinel for running in self.running if running.process is not None], 0)
@@ -183,6 +195,9 @@ class LocalSwarm:
                 continue
             if process is not None and process.sentinel in ended and process.exitcode is not None:
                 endings.append(self._ended(running, process))
+            elif running.begins_when is not None and running.begins_when():
+                running.begins_when = None
+                self._start(running)
             elif running.due_s is not None and time.monotonic() >= running.due_s:
                 try:
                     self._start(running, running.restarts + 1)
@@ -194,6 +209,17 @@ class LocalSwarm:
                         Ending(running.spec, str(error), error.exit_code, True, wait_s, running.restarts + 1)
                     )
         return endings
+
+    def _end_hung(self) -> None:
+        """End processes whose loop stands still: at first by SIGABRT, at which they write into their log where all
+        of their threads are, and one that does not even do that, as it was stopped, at the next look."""
+        still = self._hang_watch.look(self.seen, time.monotonic())
+        for running in self.running if still else ():
+            if running.spec.name in still and running.process is not None and running.process.pid is not None:
+                log.error("%s hangs: its loop stands still for %.0f s", running.spec.name, STILL_S)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(running.process.pid, signal.SIGKILL if running.hung else signal.SIGABRT)
+                running.hung = True
 
     def stop(
         self,
@@ -208,7 +234,7 @@ class LocalSwarm:
         and nobody's failure.
         """
         for running in self.running:
-            running.due_s = None
+            running.due_s = running.begins_when = None
         roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
         failures = []
         for role in roles:
@@ -223,7 +249,7 @@ class LocalSwarm:
     def kill(self) -> None:
         """Kills all processes."""
         for running in self.running:
-            running.due_s = None
+            running.due_s = running.begins_when = None
             if running.process is not None:
                 running.process.kill()
                 running.process.join(1.0)
@@ -234,12 +260,21 @@ class LocalSwarm:
         spec = running.spec
         setup = self._setup_of(spec)
         if running.health is None:
-            running.health = self._context.RawArray(ctypes.c_ubyte, BOARD_BYTES)
+            running.health = self._context.RawArray(ctypes.c_char, BOARD_BYTES)
         running.health[:] = bytes(BOARD_BYTES)  # of the life before
         reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
         process = self._context.Process(
             target=run_child,
-            args=(spec.entry, replace(setup, restarts=restarts, anew=setup.anew and not restarts), reports),
+            args=(
+                spec.entry,
+                replace(
+                    setup,
+                    restarts=restarts,
+                    anew=setup.anew and not restarts,
+                    takes_over=running.takes_over and not restarts,
+                ),
+                reports,
+            ),
             name=spec.name,
             daemon=True,  # should the launcher itself fail, multiprocessing ends them
         )
@@ -247,7 +282,8 @@ class LocalSwarm:
             process.start()
         tell.close()
         running.process, running.pipe = process, listen
-        running.began_s, running.due_s = time.monotonic(), None
+        running.incarnation = setup.incarnation
+        running.began_s, running.due_s, running.hung = time.monotonic(), None, False
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
         """Decides what follows an unexpected end."""
@@ -284,6 +320,8 @@ class LocalSwarm:
                 reason = running.pipe.recv()
                 assert isinstance(reason, ExitReason)
                 return reason
+        if running.hung:
+            return ExitReason("its loop stood still, so it was killed; its log says where", 1, refused=False)
         if code == -KILLED_BY:
             return ExitReason("a plug-in did not come back from native code; its log says where", 1, refused=False)
         if code < 0:

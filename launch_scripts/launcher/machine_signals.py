@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from launch_scripts.health.verdict import Process
 from launch_scripts.launcher.up_options import UpOptions
+from swarm.errors import BusError
 from swarm.runtime.health import Health
 from swarm.runtime.supervisor import supervisor_of
 
 if TYPE_CHECKING:
+    from launch_scripts.metrics.endpoint import MetricsEndpoint
     from launch_scripts.report.latest_state import Observed
 
 _TURNS_HZ = 2.0
@@ -21,7 +24,8 @@ _NAME = "launcher"
 
 
 class MachineSignals:
-    """Raises BusError if the port is taken.
+    """Raises BusError if the port is taken; where another launcher is taken over from, it is opened once that one
+    has left it.
 
     seen  how the processes are that this launcher has started; called by any thread
     """
@@ -32,18 +36,21 @@ class MachineSignals:
         self._health.starts("the start of its processes")
         self._health.begins(_TURNS_HZ)
         self.url = ""
-        """Of the figures; empty without a port."""
-        self._metrics = None
-        if options.metrics_port is not None:
-            from launch_scripts.metrics.endpoint import MetricsEndpoint  # takes time to import
+        """Of the figures; empty without a port, and before it is opened."""
+        self._port, self._address = options.metrics_port, options.signals_address
+        self._seen = seen
+        self._metrics: MetricsEndpoint | None = None
+        if not options.takes_over:
+            self._open()
 
-            board = self._health.board
-            self._metrics = MetricsEndpoint(
-                options.metrics_port,
-                lambda: [Process(_NAME, board.read()), *seen()],
-                options.signals_address,
-            )
-            self.url = self._metrics.url
+    def _open(self) -> None:
+        if self._port is None:
+            return
+        from launch_scripts.metrics.endpoint import MetricsEndpoint  # takes time to import
+
+        board, seen = self._health.board, self._seen
+        self._metrics = MetricsEndpoint(self._port, lambda: [Process(_NAME, board.read()), *seen()], self._address)
+        self.url = self._metrics.url
 
     def turned(self, observed: Observed, started_ns: int, missing: Sequence[str]) -> None:
         """The launcher has turned: tells so, and answers who has asked for figures since the last time.
@@ -51,6 +58,9 @@ class MachineSignals:
         missing  names of processes that it has started and nobody has heard yet
         """
         self._health.turned([f"word of {name}" for name in missing])
+        if self._metrics is None:
+            with suppress(BusError):  # the launcher before still has the port
+                self._open()
         if self._metrics is not None:
             from launch_scripts.metrics.families import Figures, Run, families
 

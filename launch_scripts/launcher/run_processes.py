@@ -41,6 +41,21 @@ def processes(run_dir: Path) -> dict[str, int]:
     return found
 
 
+def holding(file: Path) -> list[int]:
+    """The processes of this user that have a file open."""
+    found: list[int] = []
+    if not _PROC.is_dir():
+        return found
+    for pid in filter(str.isdigit, os.listdir(_PROC)):
+        try:
+            opened = [os.readlink(entry.path) for entry in os.scandir(_PROC / pid / "fd")]
+        except OSError:  # ended meanwhile, or somebody else's
+            continue
+        if str(file) in opened and not has_ended(int(pid)):
+            found.append(int(pid))
+    return found
+
+
 def has_ended(pid: int) -> bool:
     """Whether a process is gone, or dead and not yet reaped."""
     fields = _stat(pid)

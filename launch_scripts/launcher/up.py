@@ -21,6 +21,7 @@ from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_targe
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.stop_signals import StopAsked
+from launch_scripts.launcher.take_over import TakeOver
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.warm_up import WarmUp
@@ -72,7 +73,7 @@ def run_swarm(options: UpOptions) -> int:
     for spec in table_of(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
-    if not options.joins:
+    if not options.joins and not options.takes_over:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
@@ -118,6 +119,10 @@ class _Run:
         self._web_port = 0
         """When the swarm was whole, on the run's clock."""
         self._recorder: Recorder | None = None
+        self._take_over: TakeOver | None = None
+        if options.takes_over:
+            targets = options.scenario.target_ids
+            self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
         self._signals = MachineSignals(options, run_id, self._swarm.seen)
         if self._signals.url:
             self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
@@ -166,6 +171,8 @@ class _Run:
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
+                if self._take_over is not None:
+                    self._take_over.begin(bus)
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
@@ -238,13 +245,15 @@ class _Run:
 
     def _join(self, bus: Bus) -> None:
         """Refuses to share a namespace with another run, or to start a process that runs already."""
-        if not self._options.joins:
+        if not self._options.joins and self._take_over is None:
             return
         found = ask_run(bus)
         mine = self._setup_of(ProcessSpec(LAUNCHER, "0", "")).info(self._terrain.grid, self._terrain.digest)
         check_belongs(mine, found)
+        followed = () if self._take_over is None else self._take_over.predecessors
         for running in self._swarm.running:
-            check_vacant(found, running.spec.role, running.spec.id)
+            if running.spec.name not in followed:
+                check_vacant(found, running.spec.role, running.spec.id)
 
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
@@ -253,6 +262,8 @@ class _Run:
         ordered = self._ordered_planners()
         while not self._stop_asked:
             ordered.look(watcher.recorder.book, set(watcher.recorder.observed.up()), time.monotonic())
+            if self._take_over is not None:
+                self._take_over.look(time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -280,7 +291,7 @@ class _Run:
         )
 
     def _is_up(self, watcher: Watcher) -> bool:
-        if self._missing(watcher):
+        if self._missing(watcher) or (self._take_over is not None and not self._take_over.done):
             return False
         planners = "planner" in self._options.roles
         return not planners or watcher.routes_served or self._all_external

@@ -36,6 +36,7 @@ class UpOptions:
     signals_address  of this machine, on which that port is opened
     log_format     of all logs of this machine
     record_inputs  of every process, for `swarm replay`
+    takes_over     from the launcher that runs this part of the run here
     """
 
     scenario: Scenario
@@ -50,13 +51,14 @@ class UpOptions:
     table: tuple[ProcessSpec, ...] | None = None
     record_inputs: bool = False
     metrics_port: int | None = None
+    takes_over: bool = False
     signals_address: str = LOOPBACK
     log_format: LogFormat = "text"
 
     @property
     def is_new(self) -> bool:
         """Whether the run begins here, with all of its processes."""
-        return not self.joins and self.is_whole and self.run_id is None
+        return not self.joins and self.is_whole and self.run_id is None and not self.takes_over
 
     @property
     def is_whole(self) -> bool:
@@ -118,11 +120,11 @@ def run_id_of(options: UpOptions) -> tuple[str, int | None]:
     """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario. With
     the id comes when the run began, if it runs already."""
     found: list[RunInfo] = []
-    if options.joins:
+    if options.joins or options.takes_over:
         log_to(None, options.log_format)  # it may have to wait, and says so
         found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
     run_id = options.run_id
-    if run_id is None and options.is_whole:
+    if run_id is None and options.is_whole and not options.takes_over:
         run_id = new_run_id()
     elif run_id is None:
         run_id = found[0].run_id if found else common_run_id(options.scenario)

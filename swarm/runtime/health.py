@@ -63,7 +63,7 @@ class Board:
     """
 
     def __init__(self, memory: Any = None) -> None:
-        """`memory`: a bytearray, or an array of bytes of ctypes; if not given, one of this process's own."""
+        """`memory`: a bytearray, or an array of c_char; if not given, one of this process's own."""
         self._memory = bytearray(BOARD_BYTES) if memory is None else memory
         self._slot = 0
 

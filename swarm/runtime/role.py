@@ -26,6 +26,7 @@ class RoleSetup:
     restarts     how often it was started before in this run
     before       what its earlier lives have counted; None if that is not known
     anew         whether the run begins with it: nobody has seen an earlier life of it
+    takes_over   whether the life before it may still run on this machine, and ends soon
     record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     health         what its loop tells of itself; None: nobody wants to know
     """
@@ -42,6 +43,7 @@ class RoleSetup:
     before: Stats | None = None
     record_inputs: bool = False
     anew: bool = False
+    takes_over: bool = False
     health: Health | None = None
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:

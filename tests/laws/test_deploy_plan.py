@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 from hypothesis import given, settings
@@ -48,11 +50,13 @@ def machines(draw: st.DrawFn, roles: st.SearchStrategy[tuple[str, ...]] = ROLES)
     return HostsConfig(hosts=hosts, survive=draw(st.none() | st.integers(0, 3)))
 
 
-def planned(scenario: Scenario, hosts: HostsConfig) -> Plan | None:
+def planned(
+    scenario: Scenario, hosts: HostsConfig, keepers: Mapping[str, str] = MappingProxyType({})
+) -> Plan | None:
     """The plan, or None where a sentence says what the machines lack."""
     refusal = ""
     try:
-        return make_plan(scenario, hosts, "run")
+        return make_plan(scenario, hosts, "run", keepers)
     except ConfigError as error:
         refusal = str(error)
     assert "\n" not in refusal
@@ -181,3 +185,22 @@ def test_each_two_routers_have_one_link_and_every_process_a_router_that_admits_i
 @settings(max_examples=few(20), deadline=None)
 def test_a_plan_is_the_same_each_time(scenario: Scenario, hosts: HostsConfig) -> None:
     assert planned(scenario, hosts) == planned(scenario, hosts)
+
+
+@given(SCENARIOS, machines(), st.data())
+@settings(max_examples=few(100), deadline=None)
+def test_a_keeper_stays_with_its_store_while_its_machine_may_have_one(
+    scenario: Scenario, hosts: HostsConfig, data: st.DataObject
+) -> None:
+    first = planned(scenario, hosts)
+    if first is None or len(hosts.hosts) == 1:
+        return
+    before = {keeper.id: host.name for host in first.hosts for keeper in host.of("keeper")}
+    gone = data.draw(st.sampled_from(hosts.hosts))
+    left = tuple(host for host in hosts.hosts if host is not gone)
+    fewer = msgspec.structs.replace(hosts, hosts=tuple(data.draw(st.permutations(left))))
+    second = planned(scenario, fewer, before)
+    if second is None:
+        return
+    after = {keeper.id: host.name for host in second.hosts for keeper in host.of("keeper")}
+    assert {id: name for id, name in before.items() if name != gone.name and id in after}.items() <= after.items()

@@ -3,6 +3,7 @@ started again (decision 87)."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -203,6 +204,26 @@ def test_the_version_before_reads_every_message_of_this_one(tmp_path: Path) -> N
     for line, answer in heard:
         assert not answer.startswith("error"), f"{line}: {answer}"
         check_same(line, answer)
+
+
+@pytest.mark.parametrize("upgraded", [True, False], ids=["upgrade", "way back"])
+def test_what_one_version_leaves_on_disk_the_other_reads(tmp_path: Path, upgraded: bool) -> None:
+    script, old, folder = ROOT / "tests" / "support" / "stored_by.py", neighbour_tree(tmp_path), tmp_path / "run"
+    folder.mkdir()
+    writer, reader = (old, ROOT) if upgraded else (ROOT, old)
+    found = [
+        subprocess.run(
+            [sys.executable, str(script), what, str(folder)], env=environment_of(tree), capture_output=True,
+            text=True, timeout=120, check=True,
+        ).stdout
+        for what, tree in (("write", writer), ("read", writer), ("read", reader))
+    ]  # fmt: skip
+    left, again = ([json.loads(line) for line in each.splitlines()] for each in found[1:])
+    assert len(left) == len(again) >= 6
+    for meant, heard in zip(left, again, strict=True):
+        both = meant.keys() & heard.keys()
+        assert len(both) >= 2
+        assert {name: heard[name] for name in both} == {name: meant[name] for name in both}
 
 
 def check_same(line: str, answer: str) -> None:

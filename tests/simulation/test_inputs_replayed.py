@@ -361,6 +361,7 @@ def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_diff
 
 
 def test_all_that_a_process_is_started_with_is_recorded() -> None:
-    # Where a process keeps its files, and whom it tells how it is, is no input: what it reads there is.
-    here = {"run_dir", "record_inputs", "health"}
+    # Where a process keeps its files, who had them before, and whom it tells how it is, is no input: what it reads
+    # there is.
+    here = {"run_dir", "record_inputs", "health", "takes_over"}
     assert {field.name for field in dataclasses.fields(RoleSetup)} - here <= set(records.Head.__struct_fields__)

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from swarm.bus.bus import Event
 from swarm.clock import MonotonicClock
@@ -120,5 +121,31 @@ class Ticking:
 
 def tick(setup: RoleSetup, stop_when: StopWhen) -> None:
     process = Process(Ticking(), Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
+    process.stop_on_signals()
+    process.run()
+
+
+class StandsStill(Ticking):
+    """Its third tick never ends, in the first life of the process."""
+
+    def __init__(self, marker: Path) -> None:
+        super().__init__()
+        self._marker = marker
+        self._ticks = 0
+
+    def tick(self, now_ns: int) -> None:
+        self._ticks += 1
+        if self._ticks == 3 and not self._marker.exists():
+            self._marker.touch()
+            self.stand_still()
+
+    def stand_still(self) -> None:
+        threading.Event().wait()
+
+
+def stand_still(setup: RoleSetup, stop_when: StopWhen) -> None:
+    assert setup.run_dir is not None
+    service = StandsStill(setup.run_dir / "stood still")
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
     process.stop_on_signals()
     process.run()

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from typing import Any
 
 from launch_scripts.bench.wire.partition import why_not
 
@@ -17,13 +17,14 @@ __all__ = ["Machines", "machines", "why_not"]
 class Machines:
     """The namespaces, what runs in them, and how it is ended.
 
-    addresses  name -> address
+    addresses    name -> address
+    environment  of what is started there
     """
 
-    def __init__(self, addresses: Mapping[str, str]) -> None:
-        self.addresses = dict(addresses)
+    def __init__(self, addresses: Mapping[str, str], environment: Mapping[str, str]) -> None:
+        self.addresses, self.environment = dict(addresses), dict(environment)
         self._mark = f"{os.getpid() % 100_000}"
-        self._running: dict[str, list[subprocess.Popen[bytes]]] = {name: [] for name in addresses}
+        self._running: dict[str, list[subprocess.Popen[str]]] = {name: [] for name in addresses}
 
     def space(self, name: str) -> str:
         return f"swarm-{name}-{self._mark}"
@@ -43,25 +44,18 @@ class Machines:
             _ip("-n", space, "link", "set", "lo", "up")
             _ip("-n", space, "link", "set", end, "up")
 
-    def start(
-        self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str] | None = None
-    ) -> subprocess.Popen[bytes]:
-        """A command on a machine, in a session of its own."""
-        with log.open("ab") as output:
-            process = subprocess.Popen(
-                ["ip", "netns", "exec", self.space(name), *command],
-                stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True,
-                env={**os.environ, **(environment or {})},
-            )  # fmt: skip
+    def start(self, name: str, command: Sequence[str], **options: Any) -> subprocess.Popen[str]:
+        """A command on a machine, in a session of its own; `options` are those of Popen."""
+        process = subprocess.Popen(
+            ["ip", "netns", "exec", self.space(name), *command],
+            start_new_session=True, text=True, env=self.environment, **options,
+        )  # fmt: skip
         self._running[name].append(process)
         return process
 
-    def call(self, name: str, command: Sequence[str], within_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-        """A command on a machine, to its end."""
-        return subprocess.run(
-            ["ip", "netns", "exec", self.space(name), *command],
-            capture_output=True, text=True, timeout=within_s, check=False,
-        )  # fmt: skip
+    def keep(self, name: str, process: subprocess.Popen[str]) -> None:
+        """A process that ends with those of a machine, though it was not started here."""
+        self._running[name].append(process)
 
     def lose(self, name: str) -> None:
         """The machine loses its power: first its cable, so that nobody hears its processes end."""
@@ -87,8 +81,8 @@ class Machines:
 
 
 @contextlib.contextmanager
-def machines(addresses: Mapping[str, str]) -> Iterator[Machines]:
-    made = Machines(addresses)
+def machines(addresses: Mapping[str, str], environment: Mapping[str, str]) -> Iterator[Machines]:
+    made = Machines(addresses, environment)
     try:
         made.build()
         yield made

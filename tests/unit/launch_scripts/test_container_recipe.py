@@ -87,6 +87,7 @@ def test_what_the_recipe_copies_is_there_and_let_through(steps: list[Step]) -> N
 
 
 def test_every_step_is_a_script_that_the_shell_can_read(steps: list[Step]) -> None:
+    assert "SHELL" not in {step.instruction for step in steps}, "podman ignores it"
     for step in steps:
         if step.instruction == "RUN":
             done = subprocess.run(["sh", "-n"], input=step.value, capture_output=True, text=True, timeout=20)
@@ -114,7 +115,7 @@ def test_the_steps_of_the_first_stage_make_an_environment_whose_kernels_are_only
             continue
         if step.instruction == "ENV":
             pairs = re.findall(r"(\w+)=(\S+)", step.value)
-            settings |= {name: here(value).replace("${NUMBA_CPU_NAME}", "generic") for name, value in pairs}
+            settings |= {name: here(value) for name, value in pairs}
         elif step.instruction == "WORKDIR":
             work = Path(here(step.value))
         elif step.instruction == "COPY":

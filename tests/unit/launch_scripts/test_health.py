@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,9 @@ from support.processes import eventually
 from launch_scripts.health.pages import PageServer, health_pages
 from launch_scripts.health.probe import ask, fast
 from launch_scripts.health.verdict import HEALTHY, READY, Process, verdict
-from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher import hang_watch
+from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, HangWatch
+from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS
 from launch_scripts.process_table import ProcessSpec
@@ -231,11 +234,55 @@ def test_a_probe_loads_no_command_line() -> None:
     assert not heavy & set(loaded)
 
 
-@pytest.mark.network
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_launcher_sees_a_process_that_is_stopped_and_one_that_is_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+looks = st.lists(st.tuples(st.floats(0.01, 100.0), st.booleans()), max_size=60)
+"""Seconds since the look before, and whether the process has ticked since then."""
+
+
+def running(stamp_ns: int) -> list[Process]:
+    """A process that has ticked then."""
+    return [Process("a", Vitals(stamp_ns, 0, Phase.RUNS, ()))]
+
+
+@given(looks)
+def test_who_is_killed_stood_still_for_a_minute_in_which_the_launcher_turned(
+    looks: list[tuple[float, bool]],
 ) -> None:
+    watch, now_s, stamp_ns, still_s = HangWatch(), 1000.0, 1, 0.0
+    watch.look(partial(running, stamp_ns), now_s)
+    looked_s = now_s
+    for passed_s, ticked in looks:
+        now_s += passed_s
+        stamp_ns += ticked
+        found = watch.look(partial(running, stamp_ns), now_s)
+        turned_s = 0.0 if now_s - looked_s < LOOK_EVERY_S else min(now_s - looked_s, 2.0)
+        still_s = 0.0 if ticked else still_s + turned_s
+        if turned_s:
+            looked_s = now_s
+        if found:
+            assert still_s >= STILL_S - 0.001
+
+
+@given(st.sampled_from([Phase.STARTS, Phase.ENDS]) | st.none(), st.none() | st.just("it has ended"))
+def test_nobody_is_killed_who_starts_ends_or_says_nothing(phase: Phase | None, ended: str | None) -> None:
+    watch = HangWatch()
+    for second in range(300):
+        vitals = None if phase is None else Vitals(1, 0, phase, ())
+        assert watch.look(lambda vitals=vitals: [Process("a", vitals, ended)], float(second)) == []
+
+
+def test_who_stands_still_for_a_minute_is_found_then_and_at_every_look_until_it_ticks() -> None:
+    watch = HangWatch()
+
+    def found(second: int, stamp_ns: int) -> list[str]:
+        return watch.look(partial(running, stamp_ns), float(second))
+
+    assert not any(found(second, 1) for second in range(60))
+    assert [found(second, 1) for second in range(60, 64)] == [["a"]] * 4
+    assert found(64, 2) == []
+
+
+def started(tmp_path: Path, function: str) -> LocalSwarm:
+    """A launcher with one process that does what a dummy role does."""
     warm_up = WarmUp(None)
     warm_up.begin()
     eventually(lambda: warm_up.done(0.05), 20)
@@ -243,7 +290,46 @@ def test_a_launcher_sees_a_process_that_is_stopped_and_one_that_is_killed(
     def setup_of(spec: ProcessSpec) -> RoleSetup:
         return RoleSetup(Scenario(), "run-1", spec.role, spec.id, time.time_ns(), 0, tmp_path)
 
-    swarm = LocalSwarm([ProcessSpec("planner", "t0", "support.dummy_roles:tick")], setup_of, tmp_path)
+    return LocalSwarm([ProcessSpec("planner", "t0", f"support.dummy_roles:{function}")], setup_of, tmp_path)
+
+
+def is_ready(swarm: LocalSwarm) -> bool:
+    return verdict(READY, swarm.seen(), time.monotonic_ns()).ok
+
+
+@pytest.mark.network
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("function", ["stand_still", "tick"])
+def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str
+) -> None:
+    """One whose tick does not end, and one that was stopped, so that it cannot say anything."""
+    monkeypatch.setattr(hang_watch, "STILL_S", 2.0)
+    swarm = started(tmp_path, function)
+    endings: list[Ending] = []
+    try:
+        swarm.start()
+        eventually(lambda: is_ready(swarm), 20, "ready")
+        if function == "tick":
+            [running] = swarm.running
+            assert running.process is not None
+            assert running.process.pid is not None
+            os.kill(running.process.pid, signal.SIGSTOP)
+        eventually(lambda: endings.extend(swarm.poll()) or endings, 60, "its end")
+        assert endings[0].sentence == "its loop stood still, so it was killed; its log says where"
+        assert endings[0].restart_in_s == 0.2
+        eventually(
+            lambda: endings.extend(swarm.poll()) or (swarm.restarts and is_ready(swarm)), 60, "its next life"
+        )
+    finally:
+        swarm.kill()
+    assert ("stand_still" in (tmp_path / "planner-t0.log").read_text()) is (function == "stand_still")
+
+
+@pytest.mark.network
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_launcher_sees_a_process_that_is_stopped_and_one_that_is_killed(tmp_path: Path) -> None:
+    swarm = started(tmp_path, "tick")
     try:
         assert verdict(READY, swarm.seen(), time.monotonic_ns()).missing == ("planner-t0: it does not run",)
         swarm.start()

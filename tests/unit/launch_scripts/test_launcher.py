@@ -403,6 +403,29 @@ def test_processes_are_added_and_dismissed_while_the_others_run(tmp_path: Path, 
     assert swarm.by_role() == {"agent": (1, 1)}
 
 
+def test_a_process_begins_once_what_it_waits_for_is_so_and_not_at_all_after_the_end(
+    tmp_path: Path, swarms: list[LocalSwarm]
+) -> None:
+    rows = [("keeper", "0", "quiet"), ("agent", "a0", "quiet"), ("agent", "a1", "quiet")]
+    swarm = swarm_of(swarms, tmp_path, *rows)
+    keeper, agent, other = swarm.running
+    allowed: list[str] = []
+    agent.begins_when = lambda: "a0" in allowed
+    other.begins_when = lambda: "a1" in allowed
+    swarm.start()
+    wait_for_line(tmp_path / "order.txt", "+keeper-0")
+    assert swarm.poll() == []
+    assert [each.alive for each in swarm.running] == [True, False, False]
+    allowed.append("a0")
+    assert swarm.poll() == []
+    wait_for_line(tmp_path / "order.txt", "+agent-a0")
+    assert agent.incarnation > keeper.incarnation
+    assert swarm.stop() == []
+    allowed.append("a1")
+    assert swarm.poll() == []
+    assert not other.alive
+
+
 def test_an_added_process_that_refuses_ends_no_run(tmp_path: Path, swarms: list[LocalSwarm]) -> None:
     swarm = swarm_of(swarms, tmp_path)
     swarm.add(ProcessSpec("planner", "x", "support.dummy_roles:refuse", added=True))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,21 @@ def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int
     third = FilePromiseStore(path)
     assert {plot: promised for plot, (promised, _) in third.saved.items()} == {0: 3, 1: 4}
     third.close()
+
+
+def test_one_that_waits_goes_on_with_what_the_life_before_has_left(tmp_path: Path) -> None:
+    path = tmp_path / "promises-a0"
+    first = FilePromiseStore(path)
+    found: list[FilePromiseStore] = []
+    waiting = threading.Thread(target=lambda: found.append(FilePromiseStore(path, waits=True)))
+    waiting.start()
+    waiting.join(0.2)
+    assert found == []
+    first.save(3, table(0, 1))
+    first.close()
+    waiting.join(30)
+    assert [store.saved for store in found] == [{0: (3, table(0, 1))}]
+    found[0].close()
 
 
 def test_a_second_process_on_the_same_file_is_refused(tmp_path: Path) -> None:

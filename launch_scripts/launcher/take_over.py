@@ -1,0 +1,135 @@
+"""Takes a run's part on this machine over from the launcher that runs it, of this version or the one before.
+
+All that takes long happens beside the predecessor: terrain, kernels, planners with their trees, agents up to their
+promises. Then the predecessor is asked to end, and each process of its roles is followed by its successor as soon
+as the operating system says that it has ended. The predecessor knows nothing of this: SIGTERM ends it in order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+from collections.abc import Callable, Collection
+from functools import partial
+from pathlib import Path
+
+from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher.run_processes import has_ended, holding, processes
+from swarm.bus.bus import Bus, Event, Heard
+from swarm.errors import ConfigError
+from swarm.ranks import job_of
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Beat
+from swarm.wire.topics import LEAD, STATUS
+
+log = logging.getLogger(__name__)
+
+_BESIDE = "planner"
+"""The role whose two lives may work side by side: each answer is complete, and of two the younger life's counts."""
+_WAITS = "agent"
+"""The role whose next life waits for the file that the life before has locked."""
+_PATIENCE_S = 60.0
+"""For successors to be ready: a target without a tracker has no tree, however long one waits."""
+
+
+class TakeOver:
+    """What is waited for and what is done, turn by turn. Raises ConfigError where there is nobody to follow.
+
+    running  the processes that are started here; those whose predecessors have to end before begin then
+    targets  of the scenario: planners of others were ordered, and are ordered again
+    say      tells people
+    """
+
+    def __init__(
+        self, run_dir: Path, running: list[Running], targets: Collection[str], say: Callable[[str], None]
+    ) -> None:
+        self._run_dir = run_dir
+        self._running = running
+        self._say = say
+        self._launcher = _launcher_of(run_dir)
+        self.predecessors = processes(run_dir)
+        """Name -> pid of the processes that are followed."""
+        left = set(self.predecessors) - {each.spec.name for each in running}
+        if left := {name for name in left if not _was_ordered(name, targets)}:
+            raise ConfigError(
+                f"--take-over: the launcher in {run_dir} runs {', '.join(sorted(left))} too, which this one would "
+                "end and not start again: give it the same part"
+            )
+        self._ready: set[tuple[str, int]] = set()
+        """(id, incarnation) of planners that can answer."""
+        self._began_s: float | None = None
+        self._planners_ready = False
+        """Once they are, agents begin beside theirs."""
+        self._asked = False
+        """Whether the predecessor has been asked to end."""
+        for each in running:
+            pid = self.predecessors.get(each.spec.name)
+            if pid is None or each.spec.role == _BESIDE:
+                continue
+            if each.spec.role == _WAITS:
+                each.takes_over = True
+                each.begins_when = lambda: self._planners_ready
+            else:
+                each.begins_when = partial(has_ended, pid)
+
+    def begin(self, bus: Bus) -> None:
+        """Listen to who is ready."""
+        bus.subscribe(STATUS, self._hear)
+        bus.subscribe(LEAD, self._hear)
+
+    def _hear(self, event: Event) -> None:
+        match event:
+            case Heard(message=PlannerStatus(target=id, incarnation=life, growths=growths)) if growths:
+                self._ready.add((id, life))
+            case Heard(message=Beat(role=role, id=id, incarnation=life, ready=True)) if role == _BESIDE:
+                self._ready.add((id, life))
+
+    @property
+    def done(self) -> bool:
+        """Whether all of this machine's part has been taken over."""
+        return self._asked and all(running.alive for running in self._running)
+
+    def look(self, now_s: float) -> None:
+        """Do what has become possible. `now_s`: of a clock that only goes on."""
+        if self._asked:
+            return
+        self._began_s = self._began_s or now_s
+        impatient = now_s - self._began_s >= _PATIENCE_S
+        if not self._planners_ready:
+            self._planners_ready = impatient or all(map(self._plans, self._running))
+        elif impatient or all(map(self._waits, self._running)):
+            self._ask_to_end()
+
+    def _ask_to_end(self) -> None:
+        self._asked = True
+        self._say("successors are ready: the launcher before is asked to end")
+        log.info("asks the launcher before to end, pid %d", self._launcher)
+        with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+            os.kill(self._launcher, signal.SIGTERM)
+
+    def _plans(self, running: Running) -> bool:
+        """Whether a process can answer, if it is a planner."""
+        return running.spec.role != _BESIDE or (running.spec.id, running.incarnation) in self._ready
+
+    def _waits(self, running: Running) -> bool:
+        """Whether a process has come as far as the file of its promises, if it is an agent that follows another."""
+        if not running.takes_over:
+            return True
+        pid = None if running.process is None else running.process.pid
+        return pid is not None and pid in holding(self._run_dir / f"promises-{running.spec.id}.lock")
+
+
+def _was_ordered(name: str, targets: Collection[str]) -> bool:
+    """Whether a process is the planner of a target that an operator has added."""
+    role, _, id = name.partition("-")
+    return role == "planner" and job_of(id) not in targets
+
+
+def _launcher_of(run_dir: Path) -> int:
+    """The pid of the launcher that runs a run's part from this folder. Raises ConfigError where there is none."""
+    found = [pid for pid in holding(run_dir / "launcher.log") if pid != os.getpid()]
+    if not found:
+        raise ConfigError(f"--take-over: no launcher of this user runs in {run_dir}; start without it")
+    return found[0]

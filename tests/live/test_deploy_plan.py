@@ -1,0 +1,263 @@
+"""Three machines, as docs/deploy.md says word by word, and the loss of one of them for good.
+
+Figures, of so many losses: `PYTHONPATH=.:tests python tests/live/test_deploy_plan.py 3`"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from support.machines import Machines, machines, why_not
+from support.onlooker import Onlooker
+from support.processes import eventually
+
+from swarm.ranks import job_of, split_rank
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+PAGE = Path(__file__).parents[2] / "docs" / "deploy.md"
+COMMANDS_AT_MOST = 6
+LOST = "alpha"
+LOOKS_FROM, THROUGH = "desk", "bravo"
+LONGEST_S = 20.0
+"""Beside other tests on two cores; what it takes alone is in docs/deploy.md."""
+ADDRESSES = {"alpha": "10.77.0.1", "bravo": "10.77.0.2", "charlie": "10.77.0.3", LOOKS_FROM: "10.77.0.9"}
+PER_AGENT = 2
+SCENARIO = f"""
+name = "small"
+seed = 3
+time_scale = 4
+[terrain]
+source = "synthetic"
+rows = 96
+cols = 128
+resolution_m = 30
+relief_m = 300
+roads = 4
+[terrain.hidden]
+rubble_fields = 5
+[[targets]]
+count = 2
+walk = "waypoints"
+[[groups]]
+vehicles = 12
+[vehicles]
+per_agent = {PER_AGENT}
+"""
+
+
+def block(heading: str, number: int = 0) -> list[str]:
+    """The lines of a block of code below a heading of the page."""
+    _, _, text = PAGE.read_text(encoding="utf-8").partition(f"\n## {heading}\n")
+    blocks = re.findall(r"(?:^    .*\n(?:\n(?=    ))?)+", text.partition("\n## ")[0], re.MULTILINE)
+    return [line[4:] for line in blocks[number].splitlines()]
+
+
+def program(path: Path, text: str) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+
+
+class Deployed:
+    """The page followed on three machines: its file of machines, its commands, in a shell of its own."""
+
+    def __init__(self, folder: Path, network: Machines) -> None:
+        self.folder, self.network = folder, network
+        self.kits = folder / "kits"
+        run_swarm = "import sys; from launch_scripts.cli import main; sys.exit(main())"
+        program(folder / "bin" / "swarm", f"exec {sys.executable} -c '{run_swarm}' \"$@\"")
+        cases = "".join(
+            f"{address}) space={network.space(name)} place={folder / name};;\n"
+            for name, address in network.addresses.items()
+        )
+        program(
+            folder / "bin" / "ssh",
+            f'case "$1" in\n{cases}esac\nmkdir -p "$place"; cd "$place"; exec ip netns exec "$space" sh -c "$2"',
+        )
+        (folder / "my.toml").write_text(SCENARIO)
+        (folder / "hosts.toml").write_text("\n".join(block("From nothing", 0)))
+
+    def follow(self, commands: list[str]) -> None:
+        """Runs the commands of the page: those of `ssh` side by side, as they last as long as the swarm."""
+        for line in commands:
+            if line.startswith("ssh "):
+                name = next(name for name, address in self.network.addresses.items() if f" {address} " in line)
+                log = (self.folder / f"{name}.log").open("ab")
+                with log:
+                    self.network.keep(
+                        name,
+                        subprocess.Popen(
+                            ["sh", "-c", line], cwd=self.folder, env=self.network.environment, text=True,
+                            stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                        ),
+                    )  # fmt: skip
+            else:
+                subprocess.run(
+                    ["sh", "-c", line], cwd=self.folder, env=self.network.environment, check=True, timeout=120
+                )
+
+    def store(self, machine: str) -> Path:
+        (path,) = {path.resolve() for path in (self.folder / machine).glob("swarm-*/runs/*/map*.sqlite")}
+        return path
+
+    def logs(self) -> str:
+        return "\n".join(f"{path.name}:\n{path.read_text()[-3000:]}" for path in self.folder.glob("*.log"))
+
+
+@contextmanager
+def deployed(folder: Path) -> Iterator[tuple[Deployed, Onlooker]]:
+    environment = {
+        **os.environ,
+        "PATH": f"{folder / 'bin'}:{os.environ['PATH']}",
+        "PYTHONPATH": f"{PAGE.parents[1]}:{PAGE.parents[1] / 'tests'}",
+    }
+    with machines(ADDRESSES, environment) as network:
+        made = Deployed(folder, network)
+        made.follow([*block("From nothing", 1), *block("Without systemd", 0)])
+        scenario = folder / "my.toml"
+        endpoint = f"tls/{ADDRESSES[THROUGH]}:7447"
+        onlooker = Onlooker(network, LOOKS_FROM, scenario, endpoint, made.kits / "certs")
+        try:
+            yield made, onlooker
+        finally:
+            onlooker.close()
+
+
+class Machine:
+    """One of the plan that the page's commands made."""
+
+    def __init__(self, made: Deployed, name: str) -> None:
+        with tarfile.open(made.kits / f"{name}.tar.gz") as archive:
+            file = archive.extractfile(f"swarm-{name}/plan.json")
+            assert file is not None
+            plan = json.load(file)
+        (host,) = (host for host in plan["hosts"] if host["name"] == name)
+        self.ids: dict[str, list[str]] = {}
+        for process in host["processes"]:
+            self.ids.setdefault(process["role"], []).append(process["id"])
+        self.leads = [id for id in self.ids["planner"] if split_rank(id)[1] == 0]
+        self.vehicles = {f"{agent}-{n:02d}" for agent in self.ids["agent"] for n in range(PER_AGENT)}
+
+
+def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
+    """Takes a machine away, and returns what that cost the others, in seconds; fails where it is too much."""
+    gone, *others = (Machine(made, name) for name in (LOST, THROUGH, "charlie"))
+    left = set().union(*(machine.vehicles for machine in others))
+    assert gone.leads, "a machine whose loss takes away planners that lead"
+
+    def settled() -> bool:
+        notes = onlooker.notes
+        return bool(
+            notes
+            and set(notes["routed"]) == left | gone.vehicles
+            and set(notes["answered"]) == {"t0", "t1"}
+            and all(steady(notes["leads"], planner) for planner in gone.leads)
+            and set(gone.leads) <= {notes["targets"].get(vehicle) for vehicle in left}
+            and len(notes["acknowledged"].get(gone.ids["keeper"][0], ())) > 5
+        )
+
+    within(240, settled, made, "a whole swarm")
+    lost_s, before = time.monotonic(), onlooker.notes
+    made.network.lose(LOST)
+    orphans = {vehicle: before["targets"][vehicle] for vehicle in left if before["targets"][vehicle] in gone.leads}
+    acknowledged = before["acknowledged"][gone.ids["keeper"][0]]
+
+    def new_lives(target: str) -> dict[str, list[float]]:
+        return {
+            life: at
+            for life, at in onlooker.notes["answered"][target].items()
+            if life not in before["answered"][target]
+        }
+
+    def first_pushes() -> list[float]:
+        pushed = onlooker.notes["pushed"]
+        lives = {target: set(new_lives(target)) for target in gone.leads}
+        times = (
+            [at for life, at in pushed.get(vehicle, {}).items() if life in lives[target]]
+            for vehicle, target in orphans.items()
+        )
+        return [min(each, default=math.inf) for each in times]
+
+    def routed_again() -> bool:
+        routed = onlooker.notes["routed"]
+        return (
+            max(first_pushes()) < math.inf
+            and all(new_lives(target) for target in gone.leads)
+            and all(routed[vehicle] > lost_s + 1 for vehicle in left)
+        )
+
+    within(LONGEST_S, routed_again, made, "routes for all vehicles that are left")
+    silent_s = [
+        min(first for first, _ in new_lives(target).values())
+        - max(
+            last
+            for life, (_, last) in onlooker.notes["answered"][target].items()
+            if life in before["answered"][target]
+        )
+        for target in gone.leads
+    ]
+    within(LONGEST_S, lambda: not lacking(acknowledged, made.store(THROUGH)), made, "every acknowledged mark")
+    return {
+        "until the last vehicle got a route from the new planner": max(first_pushes()) - lost_s,
+        "without an answer to a client": max(silent_s),
+    }
+
+
+def steady(leads: dict[str, float], planner: str) -> bool:
+    """Whether a planner leads, and none of its standbys has for a while."""
+    others = [at_s for id, at_s in leads.items() if id != planner and job_of(id) == planner]
+    now_s = time.monotonic()
+    return now_s - leads.get(planner, -math.inf) < 1.0 and now_s - max(others, default=-math.inf) > 3.0
+
+
+def lacking(acknowledged: dict[str, list[int]], path: Path) -> set[str]:
+    """Sets that were acknowledged and that a store has neither as they were nor newer."""
+    with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as store:
+        rows = store.execute("SELECT author, tile, epoch, seq FROM sets").fetchall()
+    kept = {f"{author}/{tile}": [epoch, seq] for author, tile, epoch, seq in rows}
+    return {name for name, numbers in acknowledged.items() if kept.get(name, [0, 0]) < numbers}
+
+
+def within(seconds: float, condition: Callable[[], bool], made: Deployed, what: str) -> None:
+    try:
+        eventually(condition, seconds, what)
+    except AssertionError as error:
+        raise AssertionError(f"{error}\n{made.logs()}") from None
+
+
+@pytest.mark.thorough
+def test_the_page_brings_up_three_machines_and_the_loss_of_one_costs_no_route_and_no_acknowledged_mark(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reason = why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    with deployed(tmp_path) as (made, onlooker):
+        figures = lose_one(made, onlooker)
+    told = ", ".join(f"{seconds:.2f} s {what}" for what, seconds in figures.items())
+    with capsys.disabled():
+        sys.stdout.write(f"\na machine lost for good: {told}\n")
+
+
+def test_the_page_needs_few_commands() -> None:
+    assert len(block("From nothing", 1)) + len(block("From nothing", 2)) <= COMMANDS_AT_MOST
+
+
+if __name__ == "__main__":
+    for _ in range(int(sys.argv[1])):
+        with tempfile.TemporaryDirectory() as name, deployed(Path(name)) as (made, onlooker):
+            sys.stdout.write(f"{lose_one(made, onlooker)}\n")

@@ -1,0 +1,111 @@
+"""An operator's program on a machine of its own: it notes who is routed, who answers, what keepers acknowledge.
+Run by `onlooker.Onlooker`.
+
+argv: the scenario, the router's endpoint, the folder of certificates, seconds after which it ends by itself. It
+prints a line of JSON ten times a second, and ends with its input, too.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from launch_scripts.launcher.options import as_process
+from launch_scripts.process_table import LAUNCHER
+from swarm.bus.bus import Event, Heard, Replied
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.config.load import load_scenario
+from swarm.config.scenario import TlsConfig
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.marks import DIGEST_ROW, Digest
+from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
+from swarm.wire.messages.processes import Beat
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import DIGEST, FLEET, LEAD, PUSHED_ROUTE, ROUTE
+
+ROUTED = (VehicleState.FOLLOWING, VehicleState.ARRIVED)
+ASK_S = 0.05
+TELL_S = 0.1
+
+
+class Notes:
+    """What was heard: times are of the monotonic clock, in seconds."""
+
+    def __init__(self) -> None:
+        self.routed: dict[str, float] = {}
+        """Vehicle -> when it last told that it is on a route."""
+        self.targets: dict[str, str] = {}
+        """Vehicle -> its target."""
+        self.pushed: dict[str, dict[int, float]] = {}
+        """Vehicle -> life of a planner -> when that first pushed a route to it."""
+        self.answered: dict[str, dict[int, tuple[float, float]]] = {}
+        """Target -> life of a planner -> when that first and last answered for a route."""
+        self.leads: dict[str, float] = {}
+        """Planner -> when it last told that it leads."""
+        self.acknowledged: dict[str, dict[str, tuple[int, int]]] = {}
+        """Keeper -> "author/tile" -> (epoch, seq) of the newest set that it told to have on its disk."""
+
+    def take(self, event: Event | None) -> None:
+        now_s = time.monotonic()
+        match event:
+            case Heard(message=Fleet() as fleet):
+                whose = np.frombuffer(fleet.targets, np.uint8)
+                for id, state, target in zip(fleet.ids, np.frombuffer(fleet.states, np.uint8), whose, strict=True):
+                    if state in ROUTED:
+                        self.routed[id] = now_s
+                    if target != NO_TARGET:
+                        self.targets[id] = fleet.target_ids[target]
+            case Heard(message=PushedRoute() as pushed):
+                self.pushed.setdefault(pushed.vehicle, {}).setdefault(pushed.incarnation, now_s)
+            case Heard(message=Beat(role="planner", leads=True) as beat):
+                self.leads[beat.id] = now_s
+            case Heard(message=Digest(role="keeper") as digest):
+                kept = self.acknowledged.setdefault(digest.author.partition(".")[0], {})
+                for author, rows in digest.held.items():
+                    for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist():
+                        key = f"{author}/{tile}"
+                        kept[key] = max(kept.get(key, (0, 0)), (epoch, seq))
+            case Replied(tag=target, message=RouteReply() as reply):
+                if reply.routes[0].status is not RouteStatus.NO_TARGET:
+                    lives = self.answered.setdefault(target, {})
+                    lives[reply.incarnation] = lives.get(reply.incarnation, (now_s, now_s))[0], now_s
+
+
+def look_on(bus: ZenohBus, targets: list[str], seconds: float) -> None:
+    notes, inbox = Notes(), Inbox()
+    for topic in (FLEET, PUSHED_ROUTE, LEAD, DIGEST):
+        bus.subscribe(topic, inbox.post)
+    ask_at_s = tell_at_s = time.monotonic()
+    until_s = ask_at_s + seconds
+    while (now_s := time.monotonic()) < until_s and not select.select([sys.stdin], [], [], 0)[0]:
+        if now_s >= ask_at_s:
+            ask_at_s = now_s + ASK_S
+            for target in targets:
+                bus.ask(ROUTE, RouteRequest(row=8, col=8), inbox.post, tag=target, timeout_s=1.0, target=target)
+        if now_s >= tell_at_s:
+            tell_at_s = now_s + TELL_S
+            sys.stdout.write(json.dumps(vars(notes)) + "\n")
+            sys.stdout.flush()
+        notes.take(inbox.take(max(min(ask_at_s, tell_at_s) - time.monotonic(), 0.0)))
+        while (event := inbox.take(0.0)) is not None:
+            notes.take(event)
+
+
+def main(path: str, endpoint: str, certificates: str, seconds: str) -> None:
+    scenario = load_scenario(Path(path))
+    tls = TlsConfig(ca=str(Path(certificates) / "ca.pem"), certificate=certificates, key=certificates)
+    network = msgspec.structs.replace(scenario.network, connect=(endpoint,), tls=tls)
+    own = as_process(msgspec.structs.replace(scenario, network=network), LAUNCHER, "0")
+    with open_bus(own.network, patient=True) as bus:
+        look_on(bus, scenario.target_ids, float(seconds))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,61 @@
+"""What a build leaves on disk, and what it reads there: run with the PYTHONPATH of any version.
+
+    PYTHONPATH=TREE:TREE/tests python tests/support/stored_by.py write FOLDER
+    PYTHONPATH=TREE:TREE/tests python tests/support/stored_by.py read FOLDER
+
+`read` writes what it has found to standard output, a JSON object a line.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from msgspec.json import encode
+from support.wire_strategies import EXAMPLES
+
+from shared_map.keeper.store import KeeperStore
+from swarm.grid import GridSpec
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.orders import Order, Orders
+from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.traffic import Table
+from vehicle_agent.promise_store import FilePromiseStore
+from vehicle_agent.traffic.right_of_way import OwnRecord
+
+_GRID = GridSpec(64, 96, 30.0)
+
+
+def write(folder: Path) -> None:
+    """Leave a keeper's store and an agent's promises."""
+    [marks], [sighted] = ([each for each in EXAMPLES if isinstance(each, kind)] for kind in (MarkSet, Sighted))
+    [table] = [each for each in EXAMPLES if isinstance(each, Table)]
+    orders: list[Order] = [order for each in EXAMPLES if isinstance(each, Orders) for order in each.orders]
+    with KeeperStore(folder / "map.sqlite") as store:
+        store.bind("terrain", _GRID)
+        store.save([marks])
+        store.save_sightings([sighted])
+        store.save_orders(orders)
+    promises = FilePromiseStore(folder / "promises-a0")
+    promises.save_own(OwnRecord(disk=7, lives=[1, 1 << 32], noted={"a1": 5}, noted_by=["a2"]))
+    promises.save(4, table)
+    promises.close()
+
+
+def read(folder: Path) -> str:
+    """What is in them."""
+    with KeeperStore(folder / "map.sqlite") as store:
+        store.bind("terrain", _GRID)
+        kept = [*store.load(), *store.sightings(), *store.orders()]
+    promises = FilePromiseStore(folder / "promises-a0")
+    [(plot, (promised, table))] = promises.saved.items()
+    kept += [promises.own, table]
+    return "\n".join([f'{{"plot": {plot}, "promised": {promised}}}', *(encode(each).decode() for each in kept)])
+
+
+if __name__ == "__main__":
+    what, name = sys.argv[1:]
+    if what == "write":
+        write(Path(name))
+    else:
+        sys.stdout.write(read(Path(name)))

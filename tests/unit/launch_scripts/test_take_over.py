@@ -1,0 +1,198 @@
+"""A launcher that takes over: successors are ready before anybody is asked to end; no two lives write one file."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.effort import few
+
+from launch_scripts.launcher import take_over
+from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher.machine_signals import MachineSignals
+from launch_scripts.launcher.run_processes import holding
+from launch_scripts.launcher.take_over import TakeOver
+from launch_scripts.launcher.up_options import UpOptions
+from launch_scripts.process_table import ProcessSpec
+from launch_scripts.report.latest_state import Observed
+from swarm.bus.bus import Event, Heard, Post
+from swarm.config.scenario import Scenario
+from swarm.errors import BusError, ConfigError
+from swarm.grid import GridSpec
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Beat
+from swarm.wire.topics import LEAD, STATUS, Topic
+
+LAUNCHER = 100
+PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}
+STATUS_OF_T0 = PlannerStatus(
+    target="t0", incarnation=8, stamp_ns=0, strategy="auto", target_cell=None, map_version=0, tree_age_ms=0.0,
+    window=[], growths=1, window_growths=0, growth_ms=0.0, routes_served=0, following=0,
+)  # fmt: skip
+BEAT_OF_T1 = Beat(role="planner", id="t1.r1", incarnation=8, ready=True, leads=False)
+
+
+class Ear:
+    """What a `TakeOver` has of a bus."""
+
+    def __init__(self) -> None:
+        self.posts: dict[Topic, Post] = {}
+
+    def subscribe(self, topic: Topic, post: Post) -> None:
+        self.posts[topic] = post
+
+    def tell(self, topic: Topic, event: Event) -> None:
+        self.posts[topic](event)
+
+
+class Process:
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+
+
+class Machine:
+    """The operating system of a take-over, and the processes of both launchers."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.alive = {*PREDECESSORS.values(), LAUNCHER}
+        self.waiting: set[int] = set()
+        self.asked: list[tuple[int, int]] = []
+        self.said: list[str] = []
+        self.now_s = 50.0
+        patch.setattr(take_over, "processes", lambda _: dict(PREDECESSORS))
+        patch.setattr(take_over, "has_ended", lambda pid: pid not in self.alive)
+        patch.setattr(take_over, "holding", self._holding)
+        patch.setattr(take_over.os, "kill", lambda pid, number: self.asked.append((pid, number)))
+        self.running = [
+            Running(ProcessSpec(role, id, "m:f")) for role, _, id in (name.partition("-") for name in PREDECESSORS)
+        ]
+        self.over = TakeOver(Path("run"), self.running, ["t0", "t1"], self.said.append)
+        self.ear = Ear()
+        self.over.begin(self.ear)  # type: ignore[arg-type]
+        self.turn()
+
+    def _holding(self, file: Path) -> list[int]:
+        return [LAUNCHER, os.getpid()] if file.name == "launcher.log" else sorted(self.waiting)
+
+    def one(self, role: str) -> Running:
+        return next(each for each in self.running if each.spec.role == role)
+
+    def turn(self) -> None:
+        """What the launcher does in each turn: look, then start what may begin."""
+        self.over.look(self.now_s)
+        for index, each in enumerate(self.running):
+            if each.process is None and (each.begins_when is None or each.begins_when()):
+                each.begins_when = None
+                each.process = Process(200 + index)  # type: ignore[assignment]
+                each.incarnation = 8
+
+    def happens(self, what: str) -> None:
+        match what:
+            case "t0 answers":
+                self.ear.tell(STATUS, Heard(STATUS, {"target": "t0"}, STATUS_OF_T0))
+            case "t1 answers":
+                self.ear.tell(LEAD, Heard(LEAD, {"role": "planner", "id": "t1.r1"}, BEAT_OF_T1))
+            case "agent waits":
+                if (process := self.one("agent").process) is not None:
+                    self.waiting.add(process.pid or 0)
+            case "ten seconds pass":
+                self.now_s += 10.0
+            case "one ends":
+                if self.asked and len(self.alive) > 1:
+                    self.alive.remove(min(self.alive))
+        self.turn()
+
+
+EVENTS = ("t0 answers", "t1 answers", "agent waits", "ten seconds pass", "one ends")
+
+
+@settings(max_examples=few(200), deadline=None)
+@given(st.lists(st.sampled_from(EVENTS), max_size=30))
+def test_nobody_is_asked_before_successors_are_ready_and_no_two_lives_write_one_file(history: list[str]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        machine = Machine(patch)
+        seen: set[str] = set()
+        for what in history:
+            began = machine.one("agent").process is not None
+            machine.happens(what)
+            seen |= {what} if what != "agent waits" or began else set()
+            patient = machine.now_s < 110.0
+            planners = {"t0 answers", "t1 answers"} <= seen
+            if patient:
+                assert (machine.one("agent").process is not None) <= planners
+                assert bool(machine.asked) <= (planners and "agent waits" in seen)
+            assert machine.asked in ([], [(LAUNCHER, signal.SIGTERM)])
+            for each in machine.running:
+                if each.spec.role not in ("planner", "agent") and each.process is not None:
+                    assert PREDECESSORS[each.spec.name] not in machine.alive
+
+
+def test_all_are_followed_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Machine(monkeypatch)
+    assert [each.spec.name for each in machine.running if each.alive] == ["planner-t0", "planner-t1.r1"]
+    for what in ("t0 answers", "t1 answers", "agent waits", *["one ends"] * 5):
+        assert not machine.over.done
+        machine.happens(what)
+    assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
+    assert machine.over.done
+    assert machine.one("agent").takes_over
+    assert machine.said == ["successors are ready: the launcher before is asked to end"]
+
+
+def test_a_planner_that_never_has_a_tree_holds_nothing_up_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Machine(monkeypatch)
+    for _ in range(8):
+        machine.happens("ten seconds pass")
+    assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
+
+
+def test_where_there_is_nobody_to_follow_or_a_role_would_be_lost_it_is_refused_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match=r"--take-over: no launcher of this user runs in .*; start without it"):
+        TakeOver(tmp_path, [], [], print)
+    monkeypatch.setattr(take_over, "holding", lambda _: [LAUNCHER])
+    monkeypatch.setattr(take_over, "processes", lambda _: {"agent-a0": 6, "agent-a1": 7, "planner-added": 2})
+    part = [Running(ProcessSpec("agent", "a0", "m:f"))]
+    with pytest.raises(ConfigError, match="runs agent-a1 too, which this one would end and not start again"):
+        TakeOver(tmp_path, part, ["t0"], print)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_who_has_a_file_open_is_found(tmp_path: Path) -> None:
+    path = tmp_path.resolve() / "launcher.log"
+    assert holding(path) == []
+    with path.open("w"):
+        assert holding(path) == [os.getpid()]
+        code = "import sys; file = open(sys.argv[1]); print(flush=True); sys.stdin.read()"
+        with subprocess.Popen(
+            [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as other:
+            assert other.stdout is not None
+            other.stdout.readline()
+            assert sorted(holding(path)) == sorted([os.getpid(), other.pid])
+            other.communicate()
+    assert holding(path) == []
+
+
+@pytest.mark.network
+def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_path: Path) -> None:
+    observed = Observed(GridSpec(4, 5, 30.0))
+    before = MachineSignals(UpOptions(Scenario(), tmp_path, metrics_port=0), "run-1", list)
+    options = UpOptions(Scenario(), tmp_path, metrics_port=int(before.url.split(":")[2].partition("/")[0]))
+    with pytest.raises(BusError, match="Address already in use"):
+        MachineSignals(options, "run-1", list)
+    after = MachineSignals(dataclasses.replace(options, takes_over=True), "run-1", list)
+    after.turned(observed, 0, [])
+    assert after.url == ""
+    before.close()
+    after.turned(observed, 0, [])
+    assert after.url == before.url
+    after.close()
