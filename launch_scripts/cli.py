@@ -317,7 +317,14 @@ def simulate(
 
 @app.command(rich_help_panel=RUN)
 def sweep(
-    study: Annotated[Path, typer.Argument(metavar="STUDY", help="A .toml file: scenarios, settings and seeds.")],
+    study: Annotated[
+        str,
+        typer.Argument(
+            metavar="STUDY",
+            help="A .toml file with scenarios, settings and seeds, or a built-in name.",
+            autocompletion=complete.studies,
+        ),
+    ],
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="A cluster of Dask that is there, such as tcp://127.0.0.1:8786."),

@@ -9,10 +9,10 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.grid import GridSpec, Window, walk
+from swarm.grid import GridSpec, Window, bounds_of, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.routes import Route, RouteOutline, RouteStatus
 
 _NOWHERE_BOUNDS = (0, 0, 0, 0)
 
@@ -125,8 +125,8 @@ class Followers:
             follower.cells, follower.bounds = [], _NOWHERE_BOUNDS
             return
         cells = follower.cells = walk(self._grid, route.start, route.directions)
-        rows, cols = [cell // self._grid.cols for cell in cells], [cell % self._grid.cols for cell in cells]
-        follower.bounds = (min(rows) - 1, min(cols) - 1, max(rows) + 2, max(cols) + 2)
+        row0, col0, row1, col1 = bounds_of(cells, self._grid.cols)
+        follower.bounds = (row0 - 1, col0 - 1, row1 + 2, col1 + 2)
 
     def forget_routes(self) -> None:
         """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
@@ -169,7 +169,7 @@ class Followers:
             due = sorted(due, key=lambda item: item[1].push_ns)[:MOST_PUSHES]
         return due
 
-    def is_news(self, follower: Follower, route: Route) -> bool:
+    def is_news(self, follower: Follower, route: RouteOutline) -> bool:
         """Whether a route says anything that the follower does not know: other steps, or that there is no way."""
         old = follower.route
         if old is None or old.status is not route.status:

@@ -362,8 +362,8 @@ class Planner:
             self._certify(routes, now_ns)
         routes = self._pulled(routes)
         self.counters.count("routes_served", len(routes))
-        for index, vehicle in enumerate(request.vehicles):
-            self.followers.given(vehicle, routes[index], request.max_cells, now_ns, now_ns + self._push_ns)
+        for vehicle, route in zip(request.vehicles, routes, strict=False):  # a person's comes last, of no vehicle
+            self.followers.given(vehicle, route, request.max_cells, now_ns, now_ns + self._push_ns)
         return RouteReply(
             target=self.target,
             incarnation=self._incarnation,
@@ -476,10 +476,11 @@ class Planner:
         for max_cells, batch in due.items():
             cells = [follower.cell for _, follower in batch]
             routes = self._pulled(self._read(cells, max_cells, now_ns))
-            for (id, follower), route in zip(batch, routes, strict=True):
+            for index, ((id, follower), outline) in enumerate(zip(batch, routes.outlines(), strict=True)):
                 follower.stale = False
-                if route.status not in _WORTH_PUSHING or not self.followers.is_news(follower, route):
+                if outline.status not in _WORTH_PUSHING or not self.followers.is_news(follower, outline):
                     continue
+                route = routes[index]
                 self.followers.sent(follower, route, now_ns + self._push_ns)
                 pushes.append(self._pushed(id, route, target_cell))
         self.counters.count("pushes", len(pushes))

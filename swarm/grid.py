@@ -7,7 +7,7 @@ x grows to the east, y to the north; `west_m` and `north_m` are the outer corner
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from swarm.errors import OutsideGridError
@@ -222,13 +222,22 @@ class GridSpec:
         return max(abs(row_a - row_b), abs(col_a - col_b))
 
 
+_CODES = bytes(range(8))
+
+
+def bounds_of(cells: Sequence[int], cols: int) -> tuple[int, int, int, int]:
+    """The smallest (row, col) and the greatest of some cells, one at least, of a grid of so many columns."""
+    within = [cell % cols for cell in cells]
+    return min(cells) // cols, min(within), max(cells) // cols, max(within)
+
+
 def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
     """The cells of a route: `start` and then one cell per direction code.
 
     Raises ValueError on a code outside 0..7 and OutsideGridError where the route leaves the grid.
     """
     row, col = grid.row_col(start)
-    if max(directions, default=0) > 7:
+    if directions.translate(None, _CODES):
         raise ValueError(f"direction code {max(directions)} is not in 0..7")
     rows, cols = grid.rows, grid.cols
     cells = [start]

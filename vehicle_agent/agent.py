@@ -6,7 +6,7 @@ import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice, zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
+from vehicle_agent.driving.route_bounds import RouteBounds
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.local_map import LocalMap, meet
@@ -119,6 +120,7 @@ class Agent:
             measures=scenario.map.learning,
         )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
+        self._routes = RouteBounds(grid.cols)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
@@ -208,7 +210,7 @@ class Agent:
     @property
     def places(self) -> list[int]:
         """The cells that our vehicles hold."""
-        return list(chain.from_iterable(map(self.holdings.path, self.vehicles)))
+        return list(chain.from_iterable(map(self.holdings.paths.__getitem__, self.vehicles)))
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -253,9 +255,10 @@ class Agent:
             return
         vehicles = list(self.vehicles.values())
         cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
-        cells = np.array([divmod(vehicle.cell, cols) for vehicle in vehicles], np.int64)
-        routes = np.array([vehicle.route.bounds(cols) for vehicle in vehicles], np.int64)
-        for index in np.flatnonzero(meet(routes, changed, 1) | meet(np.hstack((cells, cells)), changed, sight)):
+        rows, east = np.divmod(np.array([vehicle.motion.cell for vehicle in vehicles], np.int64), cols)
+        in_sight = meet(np.stack((rows, east, rows, east), 1), changed, sight)
+        on_route = meet(self._routes.bounds([vehicle.route for vehicle in vehicles]), changed, 1)
+        for index in np.flatnonzero(on_route | in_sight).tolist():
             vehicle = vehicles[index]
             ahead = vehicle.route.ahead()
             if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
@@ -411,14 +414,14 @@ class Agent:
             and 0 <= reply.target_cell < self._map.grid.cells
             and self._map.grid.distance_cells(pose.cell, reply.target_cell) > _STALE_CELLS
         )
-        for index, id in enumerate(asked.vehicles):
+        for id, route in zip_longest(asked.vehicles, islice(reply.routes, len(asked.vehicles))):
             vehicle = self.vehicles.get(id)
             if vehicle is None:
                 continue
-            if index >= len(reply.routes) or stale:
+            if route is None or stale:
                 vehicle.no_answer(now_ns)
             else:
-                begun += self._take(vehicle, asked.target, reply.routes[index], now_ns, pushed=False)
+                begun += self._take(vehicle, asked.target, route, now_ns, pushed=False)
         return begun
 
     def routes_ended(self, request: int, now_ns: int) -> None:

@@ -252,5 +252,29 @@ def search(
     show(report, as_json, tables)
 
 
+@app.command()
+def sweep(
+    trials: Annotated[int, typer.Option(min=2, help="Simulations of the scenario `synthetic`, 10 s each.")] = 200,
+    processes: Annotated[int, typer.Option(min=2, help="Of the loop, and workers of the sweep.")] = 2,
+    rounds: Annotated[int, typer.Option(min=1, help="Loop and sweep, in turn.")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """What `swarm sweep` costs beside a plain loop over the same simulations in as many processes. Ten minutes.
+
+    \b
+    swarm bench sweep --trials 40
+
+    With the cluster's start and end, results on the disk and the summary. On a busy machine look at the CPU.
+    """
+    from launch_scripts.sweep.needs import check_installed
+
+    check_installed()
+    from launch_scripts.bench.sweep_overhead import run
+
+    with progress_of("sweep") as progress:
+        report = run(trials, processes, rounds, progress)
+    show(report, as_json)
+
+
 app.add_typer(whole_swarm.app)
 app.add_typer(scaling.app)

@@ -35,6 +35,13 @@ def scenarios_and_worlds(ctx: typer.Context, incomplete: str) -> list[str]:
     return [*scenarios(ctx, incomplete), *(name for name in WORLDS if name.startswith(incomplete))]
 
 
+def studies(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Built-in studies, and .toml files below the folder that the word begins with."""
+    from launch_scripts.sweep.study import study_names
+
+    return [name for name in [*study_names(), *_files(incomplete, ".toml")] if name.startswith(incomplete)]
+
+
 def terrains(ctx: typer.Context, incomplete: str) -> list[str]:
     """Built-in terrains; files are the shell's own matter."""
     from swarm.config.load import BUILT_IN_TERRAINS

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.launcher.terminal import REPORTED, plain
+from launch_scripts.launcher.terminal import REPORTED
+from launch_scripts.plain_text import plain
 from launch_scripts.report.files import write_file
 from launch_scripts.report.results.compare import (
     LeftRun,

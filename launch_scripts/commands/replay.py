@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from launch_scripts.launcher.progress import progress
-from launch_scripts.launcher.terminal import plain
+from launch_scripts.plain_text import plain
 from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run, unreadable
 from launch_scripts.report.results.run_folder import find_run
 from swarm.runtime.recording.replaying import Difference

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from launch_scripts.sweep.needs import check_installed
+from swarm.config.input_files import shown
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,24 +21,22 @@ if TYPE_CHECKING:
     from launch_scripts.sweep.trial import Result, Trial
 
 
-def check_installed() -> None:
-    """Raises ConfigError if what this needs is not installed."""
-    for package in ("distributed", "pyarrow"):
-        if find_spec(package) is None:
-            raise ConfigError(
-                f"swarm sweep needs {package}, which is not installed: pip install 'terrain-swarm[sweep]'"
-            )
+_SCHEDULER = r"[a-z]+://[^\s/:]+:[0-9]{1,5}"
+_EXAMPLE = "tcp://127.0.0.1:8786"
 
 
-def sweep_study(path: Path, scheduler: str | None, workers: int | None, out: Path | None, as_json: bool) -> bool:
+def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path | None, as_json: bool) -> bool:
     """Run what a study lacks, and print its summary. True if every trial has a result and no law broke."""
     check_installed()
     if scheduler is not None and workers is not None:
         raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
+    if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:
+        raise ConfigError(f"--scheduler: found {shown(scheduler)}, expected an address such as {_EXAMPLE}")
     from launch_scripts.sweep.cluster import cores
     from launch_scripts.sweep.run import Sweep
+    from launch_scripts.sweep.study import study_path
 
-    sweep = Sweep(path, out)
+    sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     kept = sweep.trials - len(sweep.missing)
     if kept:

@@ -59,7 +59,7 @@ class PageServer:
             there = f"{port}" if address == LOOPBACK else f"{port} at {address}"
             raise BusError(f"{what} {there} cannot be opened: {getattr(error, 'strerror', error)}") from error
         self._server.pages = dict(pages)
-        self._server.guarded = address in (LOOPBACK, "::1")
+        self._server.guarded = address in (LOOPBACK, "::1", "localhost")
         threading.Thread(target=self._server.serve_forever, name=what, daemon=True).start()
         host = f"[{address}]" if ":" in address else address
         self.url = f"http://{host}:{self._server.port}"

@@ -14,6 +14,7 @@ import urllib.parse
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from launch_scripts.plain_text import plain
 from swarm.errors import BusError, ConfigError, SwarmError
 
 NOT_READY = 1
@@ -34,7 +35,7 @@ class Answer(NamedTuple):
         """For people."""
         missing = self.told.get("missing")
         lines = [self.told.get("status"), *(missing if isinstance(missing, list) else [])]
-        return ["".join(c if c.isprintable() else "?" for c in str(line))[:_LONGEST] for line in lines]
+        return [plain(str(line)[:_LONGEST]) for line in lines]
 
     def show(self, *, as_json: bool) -> int:
         """Prints it. Returns the exit code."""

@@ -9,7 +9,10 @@ import sys
 from datetime import UTC, datetime
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
+from types import TracebackType
 from typing import Literal, NamedTuple
+
+from launch_scripts.plain_text import plain
 
 LogFormat = Literal["text", "json"]
 LOG_FORMATS: tuple[LogFormat, ...] = ("text", "json")
@@ -18,14 +21,25 @@ MAX_BYTES = 16 << 20
 """A log that is longer is renamed to NAME.1, in the place of the one before, and begun anew."""
 
 
+_Raised = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
+
+
 class _Format(logging.Formatter):
-    """Begins a line with date, time and zone: logs of several machines are read side by side."""
+    """Begins a line with date, time and zone: logs of several machines are read side by side. A message is one
+    line, and nothing in it is obeyed by a terminal."""
 
     def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802
         return datetime.fromtimestamp(record.created).astimezone().isoformat(" ", "milliseconds")
 
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        record.message = plain(record.message)
+        return super().formatMessage(record)
 
-_FORMAT = _Format("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
+    def formatException(self, ei: _Raised) -> str:  # noqa: N802
+        return "\n".join(map(plain, super().formatException(ei).split("\n")))
+
+
+FORMAT = _Format("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
 class Speaker(NamedTuple):
@@ -101,5 +115,5 @@ def log_to(
 ) -> None:
     """Log to a file, or to standard error if there is none. `speaker`: who logs, where that is known."""
     handler = logging.StreamHandler(sys.stderr) if path is None else LogFile(path, takes_output=takes_output)
-    handler.setFormatter(JsonLines(speaker) if format == "json" else _FORMAT)
+    handler.setFormatter(JsonLines(speaker) if format == "json" else FORMAT)
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

@@ -16,6 +16,7 @@ from rich.text import Text
 from launch_scripts.launcher.busy_line import busy_line
 from launch_scripts.launcher.lasting_output import make_output_last
 from launch_scripts.launcher.live_table import live_table, plain_line
+from launch_scripts.plain_text import plain
 from launch_scripts.report.results.certified_gap import gap_text
 from launch_scripts.report.run_state.state import RunState
 
@@ -72,7 +73,7 @@ class Terminal:
         log.log(level, "%s", text)
         if self._lines is not None:
             text, style = self._lines.format(logging.LogRecord(__name__, level, "", 0, "%s", (text,), None)), None
-        self.print(Text(text, style=style or ""))
+        self.print(Text(plain(text), style=style or ""))
 
     def print(self, what: Any) -> None:
         """Prints, if that is possible: a full disk ends no run. For a reader who has left see `LastingOutput`."""
@@ -134,8 +135,3 @@ def _plain(value: Any) -> str:
     if isinstance(value, dict):
         return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
-
-
-def plain(text: str) -> str:
-    """A text of a file that may be anybody's, without what a terminal would obey."""
-    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)

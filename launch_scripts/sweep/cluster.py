@@ -18,7 +18,7 @@ from launch_scripts.sweep.trial import Result, Trial, run_trial
 from swarm.errors import BusError
 
 AHEAD = 3
-"""Trials per worker that the scheduler has: those behind the running one spare a way there and back."""
+"""Trials per worker that the scheduler has: those behind the running one spare a way from here."""
 MOST_DEATHS = 3
 """A trial whose worker has died more often than this is given up: it kills them itself."""
 _CONNECT_S = 10.0
@@ -29,6 +29,8 @@ _SETTINGS: dict[str, Any] = {
     "distributed.admin.system-monitor.gil.enabled": False,
     "distributed.scheduler.active-memory-manager.start": False,
     "distributed.scheduler.allowed-failures": MOST_DEATHS,
+    # A worker has the trial that it runs and no other: one that waits there would be blamed for a death, too.
+    "distributed.scheduler.worker-saturation": 1.0,
 }
 
 

@@ -29,10 +29,12 @@ _BYTES = 12
 class PlannedCase(msgspec.Struct, frozen=True, kw_only=True):
     """A case, the scenario that it means, and its trials.
 
+    path      of the scenario's file as the study names it, or its built-in name; that of a small world
     scenario  None: of a small world
     """
 
     case: Case
+    path: str
     scenario: Scenario | None
     trials: list[Trial]
 
@@ -47,7 +49,7 @@ def plan(study: Study, base: Path, source: str) -> list[PlannedCase]:
 
 
 def _planned(study: Study, case: Case, base: Path, source: str) -> PlannedCase:
-    scenario = None if case.scenario in (MIX, *WORLDS) else _scenario(case, base, source)
+    path, scenario = (case.scenario, None) if case.scenario in (MIX, *WORLDS) else _scenario(case, base, source)
     seconds = study.seconds or (SECONDS if study.faults or scenario is None else scenario.seconds)
     version = code_version()
     settled = "" if scenario is None else _digest(_settings(scenario))
@@ -66,16 +68,17 @@ def _planned(study: Study, case: Case, base: Path, source: str) -> PlannedCase:
                 version=version,
             )
         )
-    return PlannedCase(case=case, scenario=scenario, trials=trials)
+    return PlannedCase(case=case, path=path, scenario=scenario, trials=trials)
 
 
-def _scenario(case: Case, base: Path, source: str) -> Scenario:
-    """The scenario of a case. One that lies beside the study goes before a built-in one."""
+def _scenario(case: Case, base: Path, source: str) -> tuple[str, Scenario]:
+    """Path or name of a case's scenario, and the scenario. One beside the study goes before a built-in one."""
     beside = base / case.scenario
     path = beside if beside.is_file() else scenario_path(case.scenario)
     name = case.scenario if path.parent == SCENARIOS else str(path)
     where = f"{source}: {name} with {case.label}" if case.settings else name
-    return parse_scenario(read_text(path, FileKind.SCENARIO), where, path.parent.absolute(), case.settings)
+    text = read_text(path, FileKind.SCENARIO)
+    return name, parse_scenario(text, where, path.parent.absolute(), case.settings)
 
 
 def _settings(scenario: Scenario) -> Any:

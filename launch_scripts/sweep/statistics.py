@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 
 import msgspec
@@ -12,6 +14,8 @@ LEVEL = 0.95
 MOST_BOOTSTRAPPED = 1000
 """Of more values than this the mean is as good as normal, and Student's t says the same in no time."""
 _RESAMPLES = 9999
+_SAME = 1e-12
+"""Values that differ by less, relative to the largest, are one: rounding."""
 METHOD = (
     f"Intervals hold with 95 %: of means BCa bootstrap ({_RESAMPLES:,} resamples; Student's t above "
     f"{MOST_BOOTSTRAPPED:,} values), of medians order statistics, which assume nothing, of shares Wilson's. Of one "
@@ -33,15 +37,23 @@ def mean(values: Sequence[float]) -> Estimate:
     middle = float(data.mean())
     if len(data) < 3:
         return Estimate(middle)
-    if np.ptp(data) == 0.0:
+    if np.ptp(data) <= _SAME * np.abs(data).max():
         return Estimate(middle, middle, middle)
     if len(data) > MOST_BOOTSTRAPPED:
         low, high = stats.t.interval(LEVEL, len(data) - 1, middle, stats.sem(data))
         return Estimate(middle, float(low), float(high))
-    found = stats.bootstrap(
-        (data,), np.mean, n_resamples=_RESAMPLES, confidence_level=LEVEL, rng=np.random.default_rng(0), batch=1000
-    ).confidence_interval
-    return Estimate(middle, float(found.low), float(found.high))
+    # Of values at the limits of floats there is no interval.
+    with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore", category=stats.DegenerateDataWarning):
+        found = stats.bootstrap(
+            (data,),
+            np.mean,
+            n_resamples=_RESAMPLES,
+            confidence_level=LEVEL,
+            rng=np.random.default_rng(0),
+            batch=1000,
+        ).confidence_interval
+    low, high = float(found.low), float(found.high)
+    return Estimate(middle, low, high) if math.isfinite(low) and math.isfinite(high) else Estimate(middle)
 
 
 def median(values: Sequence[float]) -> Estimate:

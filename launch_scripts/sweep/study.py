@@ -14,12 +14,14 @@ from msgspec import Meta
 from launch_scripts.simulation.campaign import MIX, parse_seeds
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.dotted import flat
-from swarm.config.explain import explain
+from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, read_text, shown
 from swarm.config.values import Name, Options, Positive, Section
 from swarm.errors import ConfigError
 
 MOST_TRIALS = 1_000_000
+STUDIES = Path(__file__).parents[1] / "studies"
+"""The project's own."""
 
 
 class Study(Section, frozen=True, kw_only=True):
@@ -67,9 +69,25 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     settings: dict[str, Any]
 
 
+def study_path(name: str) -> Path:
+    """The file of a study of the project by its name, or the one named. Raises ConfigError where there is none."""
+    built_in = STUDIES / f"{name}.toml"
+    if "/" in name or Path(name).is_file() or not built_in.is_file():
+        if not name.endswith(".toml"):
+            names = study_names()
+            raise ConfigError(f"no study {shown(name)}{choice(name, names, ' give a .toml file or one of: ')}")
+        return Path(name)
+    return built_in
+
+
+def study_names() -> list[str]:
+    """Of the project's own."""
+    return sorted(file.stem for file in STUDIES.glob("*.toml"))
+
+
 def load_study(path: Path) -> Study:
     """Read and check a study. Raises ConfigError that names the file and the key."""
-    return parse_study(read_text(path, FileKind.SCENARIO), str(path), path.stem)
+    return parse_study(read_text(path, FileKind.STUDY), str(path), path.stem)
 
 
 def parse_study(text: str, source: str = "study", name: str = "study") -> Study:

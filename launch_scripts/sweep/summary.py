@@ -86,9 +86,7 @@ def summarise(
         values = {name: values_of(name, pairs) for name in names}
         base = first.setdefault(each.case.scenario, values)
         failures = [
-            _failure(each, trial, result, files.get(number, each.case.scenario))
-            for trial, result in pairs
-            if result.broken
+            _failure(each, trial, result, files.get(number, each.path)) for trial, result in pairs if result.broken
         ]
         cases.append(
             CaseSummary(

@@ -150,9 +150,7 @@ class HeldSets:
         """
         wanted = set(request.authors)
         tiles: Sequence[int] = sorted(set(request.tiles)) if request.tiles else self.tiles
-        return [
-            each
-            for tile in tiles
-            for each in self.of_tile(tile)
-            if (author is None or each.author == author) and (not wanted or each.author in wanted)
-        ]
+        if author is not None:
+            found = (self.get(tile, author) for tile in tiles if not wanted or author in wanted)
+            return [each for each in found if each is not None]
+        return [each for tile in tiles for each in self.of_tile(tile) if not wanted or each.author in wanted]

@@ -29,6 +29,7 @@ class FileKind(Enum):
 
     SCENARIO = ("scenario", 1 << 19, ConfigError)
     HOSTS = ("hosts", 1 << 19, ConfigError)
+    STUDY = ("study", 1 << 19, ConfigError)
     CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
     SLOPE_TABLE = ("slope table", 1 << 18, ConfigError)
     LABELS = ("labels", 4 << 20, TerrainError)

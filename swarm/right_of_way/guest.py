@@ -177,7 +177,7 @@ class Guest:
         ahead = list(path[after : after + max(MOST_AHEAD + 1 - len(held), 0)])
         self._since_ns = (self._since_ns or now_ns) if ahead else None
         wants = list(dict.fromkeys((*ahead[:1], *self._aside))) if len(held) == 1 else []
-        pushed = self._host.holdings.pushed(self.vehicle)
+        pushed = self._host.holdings.pushed.get(self.vehicle, 0)
         better = len(wants) if pushed else len(ahead[:1]) if wants else 0
         # In whole seconds, so that a wish is the same object while nothing happens.
         age_s = (now_ns - self._since_ns) // NS_PER_S if self._since_ns is not None else 0

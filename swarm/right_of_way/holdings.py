@@ -132,14 +132,20 @@ class Holdings:
         same object for as long as nothing has changed."""
         return self._paths.get(vehicle, ())
 
-    def pushed(self, vehicle: str) -> int:
-        """The age with which it is asked to make way into another plot; 0 if it is not."""
+    @property
+    def paths(self) -> Mapping[str, Sequence[int]]:
+        """Vehicle -> its path, of all that have a place."""
+        return self._paths
+
+    @property
+    def pushed(self) -> Mapping[str, int]:
+        """Vehicle -> the age with which it is asked to make way into another plot, of those that are."""
         if self._pushed is None:
             self._pushed = {}
             for view in self._views.values():
                 for id, age in view.pushed.items():
                     self._pushed[id] = max(age, self._pushed.get(id, 0))
-        return self._pushed.get(vehicle, 0)
+        return self._pushed
 
     def occupied(self) -> set[int]:
         """The cells that vehicles hold, of all to which one of ours at rest could go, as far as wardens tell."""

@@ -366,9 +366,10 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
     word = name_of(dtype)
     expected = f"{word} of {least:g} ... {most:g}" + (", without NaN" if dtype[1] == "f" else "")
     if code == "B":
+        allowed = bytes(range(int(least), int(most) + 1))
 
         def check_bytes(name: str, data: bytes) -> None:
-            if max(data, default=0) > most:
+            if data.translate(None, allowed):  # an eighth of the time of `max`
                 raise ValueError(f"{name} has {max(data)}, expected {expected}")
 
         return check_bytes

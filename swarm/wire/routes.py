@@ -7,9 +7,10 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
-from itertools import accumulate
-from typing import TYPE_CHECKING, Annotated, Any
+from functools import cache, cached_property, lru_cache
+from itertools import accumulate, pairwise
+from operator import sub
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from msgspec import Meta
 
@@ -94,6 +95,15 @@ class Route(Bounded, frozen=True, kw_only=True):
         return self.cost_s / self.lower_bound_s if self.lower_bound_s > 0 else math.inf
 
 
+class RouteOutline(NamedTuple):
+    """Some fields of a `Route`, unchecked: what somebody may know of it already."""
+
+    status: RouteStatus
+    start: int
+    directions: bytes
+    remaining_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class RouteBatch:
     """Many routes as arrays, with the fields of `Route`.
@@ -164,7 +174,30 @@ class RouteBatch:
         return [0, *ends.tolist()]
 
     def __iter__(self) -> Iterator[Route]:
-        return (self[index] for index in range(len(self)))
+        """As by index; columns are read at once, which takes half the time of many routes."""
+        legs, leg_ends = pack_column(self.legs, "<u4"), self._leg_ends if self.legs.size else [0] * (len(self) + 1)
+        columns = (self.cost_s, self.lower_bound_s, self.length_m)
+        numbers = zip(*(each.tolist() for each in columns), strict=True)
+        for index, (outline, (cost_s, lower_bound_s, length_m)) in enumerate(
+            zip(self.outlines(), numbers, strict=True)
+        ):
+            yield Route(
+                status=outline.status,
+                start=outline.start,
+                directions=outline.directions,
+                cost_s=cost_s,
+                lower_bound_s=lower_bound_s,
+                length_m=length_m,
+                remaining_s=outline.remaining_s,
+                legs=legs[4 * leg_ends[index] : 4 * leg_ends[index + 1]],
+            )
+
+    def outlines(self) -> Iterator[RouteOutline]:
+        """Of each route what tells it from others: many are looked at for few that are sent."""
+        directions, ends = self.directions.tobytes(), [0, *self.ends.tolist()]
+        each = (self.statuses.tolist(), self.starts.tolist(), pairwise(ends), self.remaining_s.tolist())
+        for status, start, (begin, end), remaining_s in zip(*each, strict=True):
+            yield RouteOutline(STATUSES[status], start, directions[begin:end], remaining_s)
 
     def places(self, grid: GridSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns of all cells of the routes, one route after the other: int64. Starts are of the grid."""
@@ -320,9 +353,22 @@ def _own_legs(routes: Sequence[Route]) -> Iterator[bytes]:
 
 def directions_of(cells: Sequence[int] | NDArray[np.int64], cols: int) -> bytes:
     """The direction code (0..7, clockwise from north) of each step between neighbouring cells, one byte each."""
+    if cols >= _TELLING_COLS and isinstance(cells, (list, tuple)):
+        return bytes(map(_codes_by_offset(cols).__getitem__, map(sub, cells[1:], cells)))
     rows, east = np.divmod(np.asarray(cells, np.int64), cols)
     codes: NDArray[np.uint8] = _codes()[np.diff(rows) + 1, np.diff(east) + 1]
     return codes.tobytes()
+
+
+_TELLING_COLS = 3
+"""In a grid of fewer columns two directions may add the same to a cell."""
+
+
+@lru_cache(maxsize=16)
+def _codes_by_offset(cols: int) -> dict[int, int]:
+    """What a step adds to a cell of a grid of so many columns -> its direction code."""
+    offsets = zip(STEP_ROW, STEP_COL, strict=True)
+    return {south * cols + east: code for code, (south, east) in enumerate(offsets)}
 
 
 @cache

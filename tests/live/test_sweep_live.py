@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.small_study import STUDY, write_study
+from support.small_study import STUDY, dies_of_seed_one, write_study
 
 from launch_scripts.sweep import cluster
 from launch_scripts.sweep.cluster import client_of, local_client, run_trials
@@ -42,7 +42,7 @@ def alive(pid: int) -> bool:
 
 def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: Path):
     trials = list(trials_of(plan(load_study(write_study(tmp_path)), tmp_path, "x")))
-    found = {}
+    found: dict[str, dict[str, float]] = {}
     with local_client(2) as client:
         assert client.scheduler_info()["address"].startswith("tcp://127.0.0.1:")
         pids = sorted(client.run(os.getpid).values())
@@ -51,9 +51,21 @@ def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: 
             found[trial.key] = result.figures
             if len(found) == 1:
                 os.kill(pids[0], signal.SIGKILL)
-    assert found.keys() == {trial.key for trial in trials}
-    assert found[trials[-1].key] == run_trial(trials[-1]).figures
+    assert found == {trial.key: run_trial(trial).figures for trial in trials}
     assert not any(alive(pid) for pid in pids)
+
+
+@pytest.mark.thorough
+def test_a_trial_that_kills_its_workers_is_given_up_and_the_others_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trials = plan(load_study(write_study(tmp_path)), tmp_path, "x")[0].trials
+    monkeypatch.setattr(cluster, "run_trial", dies_of_seed_one)
+    monkeypatch.setitem(cluster._SETTINGS, "distributed.scheduler.allowed-failures", 1)
+    with local_client(1) as client:
+        found = {trial.seed: result for trial, result in run_trials(client, trials)}
+    assert found.keys() == {0, 1, 2}
+    assert [seed for seed, result in found.items() if result is None] == [1]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.thorough)])

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
+
+from launch_scripts.sweep.trial import Result, Trial, run_trial
 
 SCENARIO = """
 name = "hill"
@@ -32,6 +36,13 @@ outcomes = ["captures", "marks", "by_group.all.distance_m"]
 [parameters]
 vehicles.sense_range_m = [60, 120]
 """
+
+
+def dies_of_seed_one(trial: Trial) -> Result:
+    """As `run_trial`, but the process ends by one of the seeds."""
+    if trial.seed == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run_trial(trial)
 
 
 def write_study(folder: Path, text: str = STUDY) -> Path:

@@ -192,7 +192,7 @@ class Process:
         here = path[0]
         wants = sorted(world.next_to(here), key=lambda cell: (cost[cell], cell))[:8]
         better = sum(cost[cell] < cost[here] for cell in wants)
-        pushed = self.rights.holdings.pushed(vehicle)
+        pushed = self.rights.holdings.pushed.get(vehicle, 0)
         if pushed:
             better = len(wants)
         return Wish(ahead, wants, better, max(self.ages[vehicle], pushed))

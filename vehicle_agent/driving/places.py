@@ -27,9 +27,9 @@ class Places:
         motions = [vehicle.motion for vehicle in self.vehicles]
         self.cells: NDArray[np.int64] = np.array([motion.cell for motion in motions], np.int64)
         stretches = [motion.stretch() for motion in motions]
-        begins = np.array([begin for begin, *_ in stretches], np.float64).reshape(-1, 2)
-        ends = np.array([end for _, end, _ in stretches], np.float64).reshape(-1, 2)
+        points = np.array([(*begin, *end) for begin, end, _ in stretches], np.float64).reshape(-1, 4)
         shares = np.array([share for *_, share in stretches], np.float64).reshape(-1, 1)
+        begins, ends = points[:, :2], points[:, 2:]
         self.south_m: NDArray[np.float64]
         self.east_m: NDArray[np.float64]
         self.south_m, self.east_m = (begins + shares * (ends - begins) + 0.5).T * grid.resolution_m

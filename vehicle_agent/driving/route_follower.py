@@ -6,6 +6,8 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
+from swarm.grid import bounds_of
+
 _SKIPPED_CELLS = 24
 """A vehicle that others push may come back to its route so far on."""
 _LEAST_PART = 1e-9
@@ -62,10 +64,8 @@ class Follower:
         """The smallest (row, col) and the greatest of all its cells in a grid of so many columns; of no cells a
         rectangle that holds nothing."""
         if self._bounds is None:
-            rows = [cell // cols for cell in self._cells or (0,)]
-            east = [cell % cols for cell in self._cells or (0,)]
-            self._bounds = (min(rows), min(east), max(rows), max(east))
-        return self._bounds if self._cells else (1, 1, 0, 0)
+            self._bounds = bounds_of(self._cells, cols) if self._cells else (1, 1, 0, 0)
+        return self._bounds
 
     def moved(self, cell: int) -> None:
         """The vehicle has entered a cell: the next one of its route, or one further on, or none."""

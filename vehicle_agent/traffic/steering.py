@@ -89,15 +89,17 @@ class Steering:
         if len(cells) < 2:
             return 0
         at = np.array(cells, np.int64)
-        lethal = np.isinf(self._pace[at[1:]])
+        tails, heads = at[:-1], at[1:]
+        lethal = np.isinf(self._pace[heads])
         if not self._corner_cutting:
             rows, cols = np.divmod(at, self._grid.cols)
-            south, east = np.diff(rows), np.diff(cols)
-            beside = np.isinf(self._pace[at[:-1] + east]) | np.isinf(self._pace[at[:-1] + south * self._grid.cols])
+            south, east = rows[1:] - rows[:-1], cols[1:] - cols[:-1]
+            beside = np.isinf(self._pace[tails + east]) | np.isinf(self._pace[tails + south * self._grid.cols])
             lethal |= beside & (south != 0) & (east != 0)
         if self._climb is not None:
-            lethal |= np.isinf(self._climb.along(at[:-1], at[1:]))
-        return int(lethal.argmax()) if lethal.any() else len(cells) - 1
+            lethal |= np.isinf(self._climb.along(tails, heads))
+        first = int(lethal.argmax())
+        return first if lethal[first] else len(cells) - 1
 
     def wish(
         self,

@@ -99,23 +99,24 @@ class Wishes:
         self._held = held
         self._forget_near(vehicles)
         ways_out, known, beside = steering.ways_out, self._made_of, self._beside
+        paths, pushed, phases_ns, since_all_ns = holdings.paths, holdings.pushed, self._phases_ns, self._since_ns
         for vehicle in vehicles:
             id, target, near = vehicle.id, vehicle.target, vehicle.in_reach
-            path = holdings.path(id)
+            path = paths[id]
             still = len(path) == 1
             idle = (near or target is None) and path[0] not in ways_out
             turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
-            phase_ns = self._phases_ns.get(id)
+            phase_ns = phases_ns.get(id)
             if phase_ns is None:
-                phase_ns = self._phases_ns[id] = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
+                phase_ns = phases_ns[id] = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
             turn = (now_ns + phase_ns) // turn_ns
             since_ns = None
             if not idle:
-                since_ns = self._since_ns.setdefault(id, now_ns)
-            elif id in self._since_ns:
-                del self._since_ns[id]
+                since_ns = since_all_ns.setdefault(id, now_ns)
+            elif id in since_all_ns:
+                del since_all_ns[id]
             place = self._target_cell(target) if near else None
-            pushed_ms = holdings.pushed(id)
+            pushed_ms = pushed.get(id, 0)
             made_of = path, vehicle.route.version, target, near, place, pushed_ms, turn, since_ns
             if known.get(id) == made_of and (not still or changed.isdisjoint(beside[id])):
                 continue

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from launch_scripts.commands.run_frame import frame_of_members
 from launch_scripts.launcher.live_table import columns, targets_table
+from launch_scripts.plain_text import plain
 from launch_scripts.report.results.certified_gap import gaps_to
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.model import HEARD, RunModel
@@ -131,7 +132,7 @@ def print_status(status: Status, console: Console) -> None:
     else:
         time = facts.fact("elapsed_s")
         head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
-        console.print(head, highlight=False, soft_wrap=True)
+        console.print(plain(head), highlight=False, soft_wrap=True)
         console.print(f"{time.label} {time.shown(state)}", highlight=False)
         if frame is not None and frame.grid.crs != "local":
             console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
@@ -157,7 +158,7 @@ def print_status(status: Status, console: Console) -> None:
             f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}, "
             f"wire version {info.wire_version}"
         )
-        console.print(text, style="yellow", highlight=False, soft_wrap=True)
+        console.print(plain(text), style="yellow", highlight=False, soft_wrap=True)
 
 
 def _belongs(info: RunInfo, run: tuple[str, str], wire: int) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from launch_scripts.plain_text import plain
 from launch_scripts.report.latest_state import Observed
 from launch_scripts.report.run_state.plan import RunPlan
 from launch_scripts.report.tracked_targets import TrackedTargets
@@ -156,9 +157,9 @@ def _in_run(told: Told, known: bool, began_ns: int) -> Alarm:
         return max(stamp_ns - began_ns, 0) / NS_PER_S
 
     return Alarm(
-        told.kind,
-        told.about,
-        told.text,
+        plain(told.kind),
+        plain(told.about),
+        plain(told.text),
         seconds(told.since_ns) if known else None,
         None if told.over_ns is None else seconds(told.over_ns),
         told.cell,

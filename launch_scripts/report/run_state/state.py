@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from launch_scripts.plain_text import plain
 from launch_scripts.report.latest_state import Observed
 from launch_scripts.report.results.certified_gap import CertifiedGap, certified_gap, gaps_to
 from launch_scripts.report.run_state.alarms import Alarm, alarms_of, starts
@@ -157,7 +158,7 @@ def state_of(
         certified_gap=certified_gap(observed),
         learned=_learned(observed),
         alarms=alarms_of(observed, tracked, plan, targets, now_ns),
-        orders=tuple(book.standing),
+        orders=tuple(map(plain, book.standing)),
         grid=observed.grid,
     )
 

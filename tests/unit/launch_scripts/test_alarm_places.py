@@ -1,4 +1,4 @@
-"""An alarm may name any cell that a tracker or planner tells of its target."""
+"""An alarm may name any cell that a tracker or planner tells of its target, and say anything."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from launch_scripts.report.run_state.alarms import Alarm
+from launch_scripts.report.run_state.model import RunModel
+from launch_scripts.report.run_state.plan import RunPlan
 from swarm.grid import GridSpec
+from swarm.wire.messages.processes import Alarm as Told
+from swarm.wire.messages.processes import Stats
 
 GRID = GridSpec(4, 7, 10.0)
 
@@ -24,3 +28,20 @@ def test_an_alarm_is_told_wherever_it_says_that_it_is_and_has_a_place_if_that_is
     assert alarm.where(GRID) == ("" if place is None else f"row {row}, col {col}")
     assert (alarm.fields(GRID)["row"], alarm.fields(GRID)["col"]) == (row, col)
     assert "since 3 s" in alarm.line(GRID)
+
+
+@given(st.text(max_size=20), st.text(max_size=20), st.text(max_size=60))
+@example("down", "\x1b]0;x\x07", "a\nb\x9b2J")
+def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
+    kind: str, about: str, text: str
+) -> None:
+    model = RunModel(RunPlan((), (), 0, 1), GRID)
+    told = Told(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
+    model.heard(
+        Stats(role="agent", id="a0", incarnation=1, stamp_ns=2, counts={}, gauges={}, histograms={}, alarms=[told]),
+        2,
+    )
+    [alarm] = model.state(3).alarms
+    assert alarm.line(GRID).isprintable()
+    if text.isprintable():
+        assert alarm.text == text

@@ -213,6 +213,16 @@ def test_only_an_address_beyond_this_machine_serves_others_by_name(health: Healt
         server.close()
 
 
+def test_an_address_of_ip_6_is_served_and_asked(health: Health) -> None:
+    try:
+        server = PageServer("health port", 0, health_pages(lambda: [Process("a", health.board.read())]), "::1")
+    except BusError as error:
+        pytest.skip(f"no IPv6 here: {error}")
+    assert server.url.startswith("http://[::1]:")
+    assert ask(server.url, live=True).ok
+    server.close()
+
+
 def test_a_port_or_address_that_cannot_be_had_is_named(server: PageServer) -> None:
     with pytest.raises(BusError, match=f"health port {place(server)[1]} cannot be opened: Address already in use"):
         PageServer("health port", place(server)[1], {})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import logging
 import re
@@ -12,7 +14,8 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.launcher.log_file import JsonLines, Speaker
+from launch_scripts.launcher.log_file import FORMAT, JsonLines, Speaker
+from launch_scripts.launcher.terminal import Terminal
 
 WRITER = """
 import logging, os, resource, signal, sys
@@ -105,3 +108,26 @@ def test_a_line_of_json_is_one_line_that_no_terminal_obeys_whatever_is_logged(te
         "logger": "a.b",
         "message": f"heard {text}",
     }
+
+
+@given(st.text(), st.text(max_size=30))
+def test_no_text_begins_a_line_of_a_log_for_people_or_is_obeyed_by_a_terminal(text: str, raised: str) -> None:
+    record = logging.LogRecord("a.b", logging.WARNING, "", 0, "heard %s", (text,), None)
+    line = FORMAT.format(record)
+    assert line.isprintable()
+    if text.isprintable():
+        assert line.endswith(f"a.b: heard {text}")
+    try:
+        raise ValueError(raised)
+    except ValueError:
+        record.exc_info = sys.exc_info()
+    assert all(line.isprintable() for line in FORMAT.format(record).split("\n"))
+
+
+@given(st.text())
+def test_what_a_launcher_says_of_others_is_one_line_that_no_terminal_obeys(text: str) -> None:
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        Terminal(as_json=False, plain=True).say(text)
+    assert said.getvalue().endswith("\n")
+    assert said.getvalue()[:-1].isprintable()

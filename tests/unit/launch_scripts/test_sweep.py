@@ -15,13 +15,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
+from launch_scripts.bench.learning_runs import wrong_prior
+from launch_scripts.commands.sweep import sweep_study
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.trial import BrokenLaw, try_seed
 from launch_scripts.sweep import statistics
 from launch_scripts.sweep.plan import plan
 from launch_scripts.sweep.run import Sweep
 from launch_scripts.sweep.store import ResultStore
-from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study
+from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study, study_names, study_path
 from launch_scripts.sweep.summary import Summary
 from launch_scripts.sweep.trial import Result, Trial, numbers, run_trial
 from swarm.config.dotted import flat, with_settings
@@ -180,6 +182,35 @@ def test_a_file_that_a_scenario_names_counts_by_what_is_in_it(tmp_path):
     assert found[0] == found[2] != found[1]
 
 
+@pytest.mark.parametrize("name", study_names())
+def test_each_study_of_the_project_can_be_read_and_its_trials_run(name):
+    path = study_path(name)
+    study = load_study(path)
+    planned = plan(study, path.parent, name)
+    assert study.outcomes
+    for each in planned:
+        briefly = msgspec.structs.replace(each.trials[0], seconds=8.0 if study.faults else 1.0)
+        result = run_trial(briefly)
+        assert not result.broken or study.faults  # the quiet at the end of so short a run may be too short
+        told = [outcome for outcome in study.outcomes if outcome in result.figures]
+        assert told == list(study.outcomes), f"{name}: the report has {sorted(result.figures)}"
+
+
+def test_the_study_of_learning_is_that_of_the_benchmark():
+    path = study_path("learning")
+    found = {each.case.variant: each.scenario for each in plan(load_study(path), path.parent, "x")}
+    assert found == {"without": wrong_prior(False), "learning": wrong_prior(True)}
+
+
+def test_a_study_is_found_by_its_name_and_a_name_that_is_none_is_told_with_the_nearest(tmp_path):
+    assert study_path("laws").is_file()
+    assert study_path("some/laws.toml") == Path("some/laws.toml")
+    with pytest.raises(ConfigError, match="no study 'lows'; did you mean 'laws'"):
+        study_path("lows")
+    with pytest.raises(ConfigError, match=r"cannot read study nowhere\.toml: No such file"):
+        load_study(study_path("nowhere.toml"))
+
+
 # --- one trial ---------------------------------------------------------------------------------------------------
 
 
@@ -329,10 +360,41 @@ def test_a_world_is_run_again_by_its_name(tmp_path):
     assert failure.scenario == "wide"
 
 
+def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws_held(tmp_path, capsys):
+    path, out = write_study(tmp_path), tmp_path / "out"
+    sweep, _ = finished(path, out, {0: 1.0, 1: 2.0, 2: 6.0})
+    assert sweep_study(str(path), None, 1, out, as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert told["cases"][0]["outcomes"]["captures"]["values"] == {"0": 1.0, "1": 2.0, "2": 6.0}
+    sweep.store.add(result_of(sweep.planned[0].trials[1], (BrokenLaw("l", "it broke", 1.0),), captures=2.0))
+    sweep.store.flush()
+    assert not sweep_study(str(path), None, 1, out, as_json=False)
+    shown = capsys.readouterr()
+    assert "6 of 6 trials are kept from before" in shown.err
+    assert "sense_range_m = 120" in shown.out
+    assert "failed: swarm simulate" in shown.out
+    assert "1 of 6 trials broke a law" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "said"),
+    [
+        ("nonsense", None, "--scheduler: found 'nonsense', expected an address such as tcp://127.0.0.1:8786"),
+        ("tcp://127.0.0.1:8786", 2, "--workers goes without --scheduler"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(tmp_path, scheduler, workers, said):
+    with pytest.raises(ConfigError) as error:
+        sweep_study(str(write_study(tmp_path)), scheduler, workers, tmp_path / "out", as_json=False)
+    assert said in str(error.value)
+
+
 # --- intervals ---------------------------------------------------------------------------------------------------
 
 
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40))
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40) | st.lists(st.integers(0, 2), min_size=1, max_size=9)
+)
 def test_an_interval_holds_its_value_and_lies_among_the_data(values):
     for estimate, middle in ((statistics.mean(values), plain.fmean(values)),
                              (statistics.median(values), plain.median(values))):  # fmt: skip

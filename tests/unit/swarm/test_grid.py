@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.errors import OutsideGridError
-from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec, Window, walk
+from swarm.grid import REGION_TILES, STEP_COL, STEP_ROW, TILE_CELLS, GridSpec, Window, bounds_of, walk
 
 sizes = st.integers(1, 700)
 grids = st.builds(
@@ -115,3 +115,20 @@ def test_a_walk_off_the_grid_raises():
 def test_a_grid_without_cells_or_size_cannot_be_made(rows, cols, resolution_m):
     with pytest.raises(ValueError):
         GridSpec(rows, cols, resolution_m)
+
+
+@given(grid_and_cell(), st.lists(st.integers(0, 7), max_size=40))
+def test_a_walk_goes_cell_by_cell_and_never_over_a_border(given_cell, codes):
+    grid, cell = given_cell
+    row, col = grid.row_col(cell)
+    cells = [cell]
+    for code in codes:
+        row, col = row + STEP_ROW[code], col + STEP_COL[code]
+        if not grid.inside(row, col):
+            with pytest.raises(OutsideGridError):
+                walk(grid, cell, bytes(codes))
+            return
+        cells.append(grid.cell(row, col))
+    assert walk(grid, cell, bytes(codes)) == cells
+    rows, cols = zip(*map(grid.row_col, cells), strict=True)
+    assert bounds_of(cells, grid.cols) == (min(rows), min(cols), max(rows), max(cols))

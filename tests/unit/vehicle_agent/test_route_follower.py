@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import directions_of
 from vehicle_agent.driving.motion import Motion
+from vehicle_agent.driving.route_bounds import RouteBounds
 from vehicle_agent.driving.route_follower import Follower
 
 GRID = GridSpec(10, 10, 10.0)
@@ -67,10 +69,25 @@ def test_a_dropped_route_has_nothing_ahead() -> None:
     assert route.left == 0
 
 
-@given(st.integers(0, 99), st.binary(max_size=12))
-def test_directions_from_the_network_become_cells_and_back_or_nothing(start: int, codes: bytes) -> None:
+@given(st.integers(1, 10), st.integers(0, 99), st.lists(st.integers(0, 8), max_size=12).map(bytes))
+def test_directions_from_the_network_become_cells_and_back_or_nothing(cols: int, start: int, codes: bytes) -> None:
+    grid = GridSpec(10, cols, 10.0)
     with contextlib.suppress(ValueError):
-        assert directions_of(walk(GRID, start, codes), GRID.cols) == codes
+        cells = walk(grid, start, codes)
+        assert directions_of(cells, cols) == directions_of(np.array(cells), cols) == codes
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(0, 99), max_size=4)), max_size=20))
+def test_bounds_of_many_routes_are_those_of_each_whatever_has_changed(changes: list[tuple[int, list[int]]]) -> None:
+    routes, columns = [Follower() for _ in range(3)], RouteBounds(GRID.cols)
+    for which, cells in changes:
+        if which == len(routes):
+            routes.append(Follower())  # a vehicle is placed, or leaves
+        elif cells:
+            assert routes[which].begin(cells, cells)
+        else:
+            routes[which].drop()
+        assert columns.bounds(routes).tolist() == [list(route.bounds(GRID.cols)) for route in routes]
 
 
 # --- motion -------------------------------------------------------------------------------------------------

@@ -30,14 +30,8 @@ class Held:
 
     def __init__(self) -> None:
         self.paths: dict[str, list[int]] = {}
-        self.ages: dict[str, int] = {}
+        self.pushed: dict[str, int] = {}
         self.others: set[int] = set()
-
-    def path(self, vehicle: str) -> list[int]:
-        return self.paths[vehicle]
-
-    def pushed(self, vehicle: str) -> int:
-        return self.ages.get(vehicle, 0)
 
     def occupied(self) -> set[int]:
         return self.others.union(*self.paths.values())
@@ -122,7 +116,7 @@ class Place:
         self.bodies.hear(report, self.now_ns)
 
     def push(self) -> None:
-        self.held.ages[self.chance.choice(self.vehicles).id] = self.chance.choice((0, 900))
+        self.held.pushed[self.chance.choice(self.vehicles).id] = self.chance.choice((0, 900))
 
     def reach(self) -> None:
         vehicle = self.chance.choice(self.vehicles)
