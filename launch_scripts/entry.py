@@ -7,12 +7,21 @@ import sys
 from launch_scripts.health.probe import fast
 
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
+_RUNS = ("demo", "up")
+"""Commands that start processes."""
+_SAYS_MORE = ("-h", "--help", "--only")
+"""With words that begin so it is for the command to say which processes, if any."""
 
 
 def main() -> int:
     if sys.argv[1:2] == ["health"] and (code := fast(sys.argv[1:])) is not None:
         return code
     try:
+        if sys.argv[1:2] and sys.argv[1] in _RUNS and not any(word.startswith(_SAYS_MORE) for word in sys.argv[2:]):
+            # It takes longest of all that a start waits for, so it begins before the command itself is loaded.
+            from launch_scripts.launcher.preload import ROLES_AND_KERNELS, start_forkserver
+
+            start_forkserver(ROLES_AND_KERNELS)
         from launch_scripts.cli import main as run
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in _OURS:

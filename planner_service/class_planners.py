@@ -72,8 +72,8 @@ class ClassPlanners:
     def must_wait(self, name: str, now_ns: int) -> bool:
         """Whether a query had better wait: there is nothing to answer from yet, and soon there will be."""
         planner = self._by_class[name]
-        begins = name in self._begun_ns and now_ns - self._begun_ns[name] < _BEGINS_NS
-        return planner.must_wait or (begins and not planner.tree.ready)
+        is_new = name in self._begun_ns and now_ns - self._begun_ns[name] < _BEGINS_NS
+        return planner.must_wait or (is_new and planner.begins)
 
     def drop_unused(self, now_ns: int) -> None:
         """Forget what nobody has asked for a minute."""

@@ -39,7 +39,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     load_classes(setup, terrain)
     kernels = KernelLoader(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
-    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
+    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, lambda: kept_key(scenario))
     clock = MonotonicClock()
     inbox = Inbox()
     network = scenario.network

@@ -233,6 +233,11 @@ class Planner:
         return not self.tree.ready and self._growing_since_ns is not None
 
     @property
+    def begins(self) -> bool:
+        """Whether it is about to take in the map for the first time, or where its target is."""
+        return not self.tree.ready and (self.tree.map_version < 0 or self._watch.pose is not None)
+
+    @property
     def knows_map(self) -> bool:
         """Whether routes go by the map as it is now."""
         return self._told is None or self._told[1] == self._cost_map.version

@@ -10,7 +10,7 @@ import contextlib
 import fcntl
 import hashlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,16 +39,22 @@ PREPARED_COSTS = Outside(
 
 
 _DIGEST_BYTES = 16
+Kept = Callable[[], str | None]
+
+
+def _not_kept() -> None:
+    return None
 
 
 class PreparedCosts:
     """Cell costs before any mark, and a `StrideShelf` beside them.
 
     cell_cost  float32, padded, s: what a `CostGrid` loads; mapped read-only
-    kept       of the terrain, if it is kept from run to run; its networks of strides are then, too
+    kept       the name under which the terrain is kept from run to run, and its networks of strides then, too; None
+               if it is not. Asked once there is a network: the name takes longer to find than all else here
     """
 
-    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: str | None = None) -> None:
+    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: Kept = _not_kept) -> None:
         cost_grid = CostGrid(terrain.grid, config, terrain.climb)
         of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.metres}"
         rules = f"{cost_grid.length_weight_s} {cost_grid.rule} {cost_grid.corners}"
@@ -86,8 +92,8 @@ class PreparedCosts:
     def leave(self, packed: Bytes) -> None:
         try:
             save_array(self._strides, np.concatenate((packed, _digest_of(packed))))
-            if self._kept is not None:
-                keep_beside(self._kept, self._strides)
+            if (kept := self._kept()) is not None:
+                keep_beside(kept, self._strides)
         except OSError as error:
             log.warning("cannot share networks of strides in %s: %s", self._folder, error.strerror or error)
         if self._claimed is not None:
@@ -96,7 +102,7 @@ class PreparedCosts:
 
 
 def prepared_costs(
-    folder: Path | None, terrain: Terrain, config: PlannerConfig, kept: str | None = None
+    folder: Path | None, terrain: Terrain, config: PlannerConfig, kept: Kept = _not_kept
 ) -> PreparedCosts | None:
     """None where there is no folder or it cannot be written: then a planner computes its own."""
     if folder is None:

@@ -303,29 +303,33 @@ class PlannerService:
             self._bus.unsubscribe(FLEET)
 
     def _answer(self, now_ns: int) -> None:
-        """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""
+        """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long.
+
+        What is asked for one class never waits for the tree of another.
+        """
+        waiting: deque[tuple[int, Asked]] = deque()
         while self._held:
-            asked_ns, event = self._held[0]
+            asked_ns, event = self._held.popleft()
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
             name = request.vehicle_class
             fault = self._planners.fault(name)
             if fault is not None:
-                self._held.popleft()
                 event.refuse(fault)
                 event.end()
                 continue
             planner = self._planners.used(name, now_ns)
-            waits = self._planners.must_wait(name, now_ns) and len(self._held) <= _MOST_HELD
-            if waits and now_ns - asked_ns < _HOLD_NS:
-                return
-            self._held.popleft()
+            crowded = len(waiting) + len(self._held) >= _MOST_HELD
+            if self._planners.must_wait(name, now_ns) and not crowded and now_ns - asked_ns < _HOLD_NS:
+                waiting.append((asked_ns, event))
+                continue
             reply = planner.answer(request, now_ns)
             if isinstance(reply, Refusal):
                 event.refuse(reply.reason)
             else:
                 event.answer(reply, target=self._target)
             event.end()
+        self._held = waiting
 
     def _obey(self) -> None:
         """Go by what is ordered."""

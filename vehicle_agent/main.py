@@ -9,6 +9,7 @@ from shared_map.prepared_classes import load_classes
 from shared_map.terrain.prepared import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
+from swarm.runtime.health import LIFE_BEFORE
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with, tick_phase
 from swarm.runtime.recording.recording import recorded
@@ -26,6 +27,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     terrain = load_terrain(setup)
     load_classes(setup, terrain)
     truth = load_truth(setup, terrain)
+    if setup.takes_over and setup.health is not None:
+        setup.health.starts(LIFE_BEFORE)
     store: PromiseStore = (
         MemoryPromiseStore(secrets.randbits(60))
         if setup.run_dir is None

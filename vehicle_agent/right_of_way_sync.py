@@ -77,6 +77,8 @@ class RightOfWaySync:
         self._asking = False
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
+        self._unasked = False
+        """Whether an agent has come up that we have not asked what it knows of us."""
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
         """Plot without a warden -> when that is said again."""
@@ -117,6 +119,7 @@ class RightOfWaySync:
                 self._perform(core.hear_known(known))
             case Appeared(peer=Peer(role="agent") as peer):
                 core.hear_token(peer, up=True)
+                self._unasked = True
             case Disappeared(peer=Peer(role="agent") as peer):
                 core.hear_token(peer, up=False)
             case AskEnded(topic=topic) if topic is KNOWN:
@@ -135,7 +138,7 @@ class RightOfWaySync:
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
         own_ns = self._own_time.tick(now_ns)
-        if not self._asking and not self.core.settled and now_ns >= self._ask_due_ns:
+        if not self._asking and not self.core.settled and (self._unasked or now_ns >= self._ask_due_ns):
             self._ask_known()
         self._look_after_store(now_ns)
         for heard in self._bus.collected(STANDING):
@@ -168,7 +171,7 @@ class RightOfWaySync:
 
     def _ask_known(self) -> None:
         request = KnownRequest(agent=self._id, disk=self._store.own.disk, layer=self.core.plots.layer)
-        self._asking = True
+        self._asking, self._unasked = True, False
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 
     def _known_ended(self, now_ns: int) -> None:

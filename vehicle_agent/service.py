@@ -216,6 +216,7 @@ class AgentService:
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="planner")
+        self._right_of_way.start(now_ns)  # whoever sees our token asks at once what we know
         self._member.join()
         self._sync.start(now_ns)
         self._obedience.start(now_ns)
@@ -230,7 +231,6 @@ class AgentService:
         self._bus.collect(PUSHED_ROUTE, agent=self._setup.id)
         if self._group_costs is not None:
             self._bus.collect(SHARED_COSTS, group=self._agent.plan.group.name)
-        self._right_of_way.start(now_ns)
         self._bus.serve(LEAVE, self._post, agent=self._setup.id)
 
     def handle(self, event: Event, now_ns: int) -> None:

@@ -88,8 +88,6 @@ class Running:
     """What its first start waits for; None once it has been started, or where it waits for nothing."""
     takes_over: bool = False
     """Whether its first start is beside a life that still runs here."""
-    incarnation: int = 0
-    """Of the life that was started last."""
     dismissed_s: float | None = None
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
@@ -282,7 +280,6 @@ class LocalSwarm:
             process.start()
         tell.close()
         running.process, running.pipe = process, listen
-        running.incarnation = setup.incarnation
         running.began_s, running.due_s, running.hung = time.monotonic(), None, False
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:

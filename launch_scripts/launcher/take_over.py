@@ -17,12 +17,9 @@ from pathlib import Path
 
 from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.run_processes import has_ended, holding, processes
-from swarm.bus.bus import Bus, Event, Heard
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
-from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat
-from swarm.wire.topics import LEAD, STATUS
+from swarm.runtime.health import LIFE_BEFORE
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +42,6 @@ class TakeOver:
     def __init__(
         self, run_dir: Path, running: list[Running], targets: Collection[str], say: Callable[[str], None]
     ) -> None:
-        self._run_dir = run_dir
         self._running = running
         self._say = say
         self._launcher = _launcher_of(run_dir)
@@ -57,8 +53,6 @@ class TakeOver:
                 f"--take-over: the launcher in {run_dir} runs {', '.join(sorted(left))} too, which this one would "
                 "end and not start again: give it the same part"
             )
-        self._ready: set[tuple[str, int]] = set()
-        """(id, incarnation) of planners that can answer."""
         self._began_s: float | None = None
         self._planners_ready = False
         """Once they are, agents begin beside theirs."""
@@ -74,18 +68,6 @@ class TakeOver:
             else:
                 each.begins_when = partial(has_ended, pid)
 
-    def begin(self, bus: Bus) -> None:
-        """Listen to who is ready."""
-        bus.subscribe(STATUS, self._hear)
-        bus.subscribe(LEAD, self._hear)
-
-    def _hear(self, event: Event) -> None:
-        match event:
-            case Heard(message=PlannerStatus(target=id, incarnation=life, growths=growths)) if growths:
-                self._ready.add((id, life))
-            case Heard(message=Beat(role=role, id=id, incarnation=life, ready=True)) if role == _BESIDE:
-                self._ready.add((id, life))
-
     @property
     def done(self) -> bool:
         """Whether all of this machine's part has been taken over."""
@@ -95,11 +77,12 @@ class TakeOver:
         """Do what has become possible. `now_s`: of a clock that only goes on."""
         if self._asked:
             return
-        self._began_s = self._began_s or now_s
+        if self._began_s is None:
+            self._began_s = now_s
         impatient = now_s - self._began_s >= _PATIENCE_S
         if not self._planners_ready:
-            self._planners_ready = impatient or all(map(self._plans, self._running))
-        elif impatient or all(map(self._waits, self._running)):
+            self._planners_ready = impatient or all(map(_plans, self._running))
+        elif impatient or all(map(_waits, self._running)):
             self._ask_to_end()
 
     def _ask_to_end(self) -> None:
@@ -109,16 +92,21 @@ class TakeOver:
         with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
             os.kill(self._launcher, signal.SIGTERM)
 
-    def _plans(self, running: Running) -> bool:
-        """Whether a process can answer, if it is a planner."""
-        return running.spec.role != _BESIDE or (running.spec.id, running.incarnation) in self._ready
 
-    def _waits(self, running: Running) -> bool:
-        """Whether a process has come as far as the file of its promises, if it is an agent that follows another."""
-        if not running.takes_over:
-            return True
-        pid = None if running.process is None else running.process.pid
-        return pid is not None and pid in holding(self._run_dir / f"promises-{running.spec.id}.lock")
+def _lacks(running: Running) -> tuple[str, ...] | None:
+    """What a process lacks to do its job, by its own word; None where it has not said anything."""
+    vitals = running.seen().vitals
+    return None if vitals is None else vitals.lacks
+
+
+def _plans(running: Running) -> bool:
+    """Whether a process can answer, if it is a planner."""
+    return running.spec.role != _BESIDE or _lacks(running) == ()
+
+
+def _waits(running: Running) -> bool:
+    """Whether a process has come as far as the file of its promises, if it is an agent that follows another."""
+    return not running.takes_over or _lacks(running) == (LIFE_BEFORE,)
 
 
 def _was_ordered(name: str, targets: Collection[str]) -> bool:

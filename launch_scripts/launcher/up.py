@@ -115,6 +115,8 @@ class _Run:
         self.begun = False
         """Whether all that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
+        self._routed = False
+        """Whether a route was served."""
         self._up_at_s: float | None = None
         self._web_port = 0
         """When the swarm was whole, on the run's clock."""
@@ -171,8 +173,6 @@ class _Run:
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
-                if self._take_over is not None:
-                    self._take_over.begin(bus)
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
@@ -268,6 +268,9 @@ class _Run:
             watcher.listen(_TURN_S)
             self._tell(watcher)
             now_s = time.monotonic()
+            if watcher.routes_served and not self._routed:
+                self._routed = True
+                log.info("the first route is served, %.2f s after launch", now_s - self._options.began_s)
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 self._up_at_s = (watcher.now_ns() - self._started_ns) / NS_PER_S

@@ -16,7 +16,7 @@ from launch_scripts.parent_death import end_with_parent
 from swarm.errors import SwarmError
 
 _END_S = 60.0
-_COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
+_COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.entry import main; sys.exit(main())"]
 
 
 class UpProcess:

@@ -12,9 +12,11 @@ import importlib
 import logging
 
 importlib.import_module("launch_scripts.launcher.warm_roles")
+gc.disable()
 try:
     importlib.import_module("planner_service.main")
     importlib.import_module("planner_service.kernel_build").load_what_is_there()
 except Exception:  # a role that cannot be loaded says so better in its own log
     logging.getLogger(__name__).exception("cannot warm up")
 gc.freeze()
+gc.enable()

@@ -27,6 +27,8 @@ _HEAD = struct.Struct("<IQQBH")
 _CHECKED = 4
 _WRITE_NS = NS_PER_S // 10
 _LONGEST_NEED = 100
+LIFE_BEFORE = "the end of the life before it"
+"""What a process waits for that is started to follow one which still runs."""
 
 
 class Phase(IntEnum):

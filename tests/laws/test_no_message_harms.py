@@ -301,12 +301,14 @@ def route_reply(payload: bytes) -> RouteReply | None:
 @pytest.mark.parametrize("run", TEXTS)
 @pytest.mark.parametrize("state", STATES)
 def test_no_service_raises_on_what_passes_the_door_in_any_state(run: str, state: str) -> None:
+    by_listening: dict[bool, int] = {}
     for altered in (False, True):
         swarm = lied_to(run, state, 1, few(20), altered)
         assert swarm.liar.told > 250
-        assert (swarm.liar.altered > 100) == altered
+        by_listening[altered] = swarm.liar.altered
         swarm.run(3)
         swarm.close()
+    assert by_listening[True] > 1.3 * by_listening[False]
 
 
 @pytest.mark.parametrize(

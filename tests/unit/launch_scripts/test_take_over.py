@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,34 +23,13 @@ from launch_scripts.launcher.take_over import TakeOver
 from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.report.latest_state import Observed
-from swarm.bus.bus import Event, Heard, Post
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat
-from swarm.wire.topics import LEAD, STATUS, Topic
+from swarm.runtime.health import BOARD_BYTES, LIFE_BEFORE, Board, Health
 
 LAUNCHER = 100
 PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}
-STATUS_OF_T0 = PlannerStatus(
-    target="t0", incarnation=8, stamp_ns=0, strategy="auto", target_cell=None, map_version=0, tree_age_ms=0.0,
-    window=[], growths=1, window_growths=0, growth_ms=0.0, routes_served=0, following=0,
-)  # fmt: skip
-BEAT_OF_T1 = Beat(role="planner", id="t1.r1", incarnation=8, ready=True, leads=False)
-
-
-class Ear:
-    """What a `TakeOver` has of a bus."""
-
-    def __init__(self) -> None:
-        self.posts: dict[Topic, Post] = {}
-
-    def subscribe(self, topic: Topic, post: Post) -> None:
-        self.posts[topic] = post
-
-    def tell(self, topic: Topic, event: Event) -> None:
-        self.posts[topic](event)
 
 
 class Process:
@@ -62,27 +42,26 @@ class Machine:
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.alive = {*PREDECESSORS.values(), LAUNCHER}
-        self.waiting: set[int] = set()
         self.asked: list[tuple[int, int]] = []
         self.said: list[str] = []
         self.now_s = 50.0
         patch.setattr(take_over, "processes", lambda _: dict(PREDECESSORS))
         patch.setattr(take_over, "has_ended", lambda pid: pid not in self.alive)
-        patch.setattr(take_over, "holding", self._holding)
+        patch.setattr(take_over, "holding", lambda _: [LAUNCHER, os.getpid()])
         patch.setattr(take_over.os, "kill", lambda pid, number: self.asked.append((pid, number)))
         self.running = [
             Running(ProcessSpec(role, id, "m:f")) for role, _, id in (name.partition("-") for name in PREDECESSORS)
         ]
         self.over = TakeOver(Path("run"), self.running, ["t0", "t1"], self.said.append)
-        self.ear = Ear()
-        self.over.begin(self.ear)  # type: ignore[arg-type]
         self.turn()
 
-    def _holding(self, file: Path) -> list[int]:
-        return [LAUNCHER, os.getpid()] if file.name == "launcher.log" else sorted(self.waiting)
+    def one(self, name: str) -> Running:
+        return next(each for each in self.running if each.spec.name == name)
 
-    def one(self, role: str) -> Running:
-        return next(each for each in self.running if each.spec.role == role)
+    def says(self, name: str, what: Callable[[Health], None]) -> None:
+        """A successor writes on its board, if it runs."""
+        if (running := self.one(name)).process is not None:
+            what(Health(Board(running.health)))
 
     def turn(self) -> None:
         """What the launcher does in each turn: look, then start what may begin."""
@@ -91,17 +70,20 @@ class Machine:
             if each.process is None and (each.begins_when is None or each.begins_when()):
                 each.begins_when = None
                 each.process = Process(200 + index)  # type: ignore[assignment]
-                each.incarnation = 8
+                each.health = bytearray(BOARD_BYTES)
 
     def happens(self, what: str) -> None:
         match what:
             case "t0 answers":
-                self.ear.tell(STATUS, Heard(STATUS, {"target": "t0"}, STATUS_OF_T0))
+                self.says("planner-t0", lambda health: health.turned([]))
             case "t1 answers":
-                self.ear.tell(LEAD, Heard(LEAD, {"role": "planner", "id": "t1.r1"}, BEAT_OF_T1))
+                self.says("planner-t1.r1", lambda health: health.turned([]))
+            case "t1 has no map":
+                self.says("planner-t1.r1", lambda health: health.turned(["the shared map"]))
+            case "agent starts":
+                self.says("agent-a0", lambda health: health.starts("its start"))
             case "agent waits":
-                if (process := self.one("agent").process) is not None:
-                    self.waiting.add(process.pid or 0)
+                self.says("agent-a0", lambda health: health.starts(LIFE_BEFORE))
             case "ten seconds pass":
                 self.now_s += 10.0
             case "one ends":
@@ -110,7 +92,15 @@ class Machine:
         self.turn()
 
 
-EVENTS = ("t0 answers", "t1 answers", "agent waits", "ten seconds pass", "one ends")
+EVENTS = (
+    "t0 answers",
+    "t1 answers",
+    "t1 has no map",
+    "agent starts",
+    "agent waits",
+    "ten seconds pass",
+    "one ends",
+)
 
 
 @settings(max_examples=few(200), deadline=None)
@@ -120,13 +110,15 @@ def test_nobody_is_asked_before_successors_are_ready_and_no_two_lives_write_one_
         machine = Machine(patch)
         seen: set[str] = set()
         for what in history:
-            began = machine.one("agent").process is not None
+            began = machine.one("agent-a0").process is not None
             machine.happens(what)
             seen |= {what} if what != "agent waits" or began else set()
+            seen -= {"t1 answers"} if what == "t1 has no map" and not began else set()
+            seen -= {"agent waits"} if what == "agent starts" and not machine.asked else set()
             patient = machine.now_s < 110.0
             planners = {"t0 answers", "t1 answers"} <= seen
             if patient:
-                assert (machine.one("agent").process is not None) <= planners
+                assert (machine.one("agent-a0").process is not None) <= planners
                 assert bool(machine.asked) <= (planners and "agent waits" in seen)
             assert machine.asked in ([], [(LAUNCHER, signal.SIGTERM)])
             for each in machine.running:
@@ -142,7 +134,7 @@ def test_all_are_followed_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
         machine.happens(what)
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
     assert machine.over.done
-    assert machine.one("agent").takes_over
+    assert machine.one("agent-a0").takes_over
     assert machine.said == ["successors are ready: the launcher before is asked to end"]
 
 

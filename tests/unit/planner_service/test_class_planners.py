@@ -24,6 +24,7 @@ from shared_map.keeper.zones import rows_of
 from shared_map.learning.words import ONE, Said
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.bus.bus import AskEnded, Event
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -285,6 +286,26 @@ def test_while_the_kernels_of_classes_are_compiled_a_class_is_refused_at_once_an
     compiled = True
     reply = world.ask(RouteRequest(cells=[world.target], vehicle_class="walker"))
     assert (reply.vehicle_class, world.trees()) == ("walker", ["ground", "walker"])
+
+
+def test_nobody_waits_for_the_tree_of_another_class() -> None:
+    world = _World()
+    world.run(2.0)
+    ended: list[str] = []
+
+    def ask(name: str) -> None:
+        def post(event: Event) -> None:
+            if isinstance(event, AskEnded):
+                ended.append(name)
+
+        world.ear.bus.ask(ROUTE, RouteRequest(cells=[world.target], vehicle_class=name), post, tag=name, target="t")
+
+    for name in ("walker", "ground", "low", "ground"):
+        ask(name)
+    world.run(0.01)
+    assert ended == ["ground", "ground"]
+    world.run(1.0)
+    assert sorted(ended[2:]) == ["low", "walker"]
 
 
 def test_an_unknown_class_is_refused_with_those_there_are(world: _World) -> None:

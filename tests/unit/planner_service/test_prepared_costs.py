@@ -103,11 +103,13 @@ def test_strides_are_kept_with_the_terrain_for_the_next_run(
     terrain = mapped(tmp_path / "one")
     keep("key", (tmp_path / "one").glob("*.npy"))
     packed = np.arange(92 * 82, dtype=np.uint8)
-    PreparedCosts(tmp_path / "one", terrain, CONFIG, "key").leave(packed)
+    PreparedCosts(tmp_path / "one", terrain, CONFIG, lambda: "key").leave(packed)
     assert fetch_kept("key", tmp_path / "two")
-    found = PreparedCosts(tmp_path / "two", mapped(tmp_path / "two"), CONFIG, "key").load()
+    found = PreparedCosts(tmp_path / "two", mapped(tmp_path / "two"), CONFIG, lambda: "key").load()
     np.testing.assert_array_equal(found, packed)
-    PreparedCosts(tmp_path / "one", terrain, CONFIG, "missing").leave(packed)  # not kept, and nothing is wrong
+    PreparedCosts(tmp_path / "one", terrain, CONFIG, lambda: "missing").leave(
+        packed
+    )  # not kept, and nothing is wrong
     with caplog.at_level(logging.WARNING):
         (kept,) = (tmp_path / "cache" / "terrain-swarm" / "terrain" / "key").glob("strides*")
         kept.unlink()

@@ -157,3 +157,13 @@ def test_a_planner_tells_what_it_believes_while_it_searches_and_once_that_it_doe
     many = len(heard)
     world.run(3)
     assert len(heard) == many
+
+
+def test_a_class_is_answered_from_the_search_at_once_where_nobody_has_seen_the_target() -> None:
+    """No tree is about to be grown, so that there is nothing to wait for but that the class takes in the map."""
+    world = World()
+    world.run(2)
+    began_ns = world.now_ns
+    cell = int(np.flatnonzero(np.isfinite(world.ground.pace_s_per_m))[0])
+    world.route("v0", cell, "low")
+    assert world.now_ns - began_ns <= NS_PER_S // 5

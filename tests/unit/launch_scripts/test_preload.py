@@ -1,0 +1,76 @@
+"""What the processes of a run share is loaded before they part, and the command starts that first."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from launch_scripts import entry
+from launch_scripts.launcher import preload
+
+_ALL_ROLES = """
+import json, sys
+from shared_map.terrain import homes
+homes.largest_part = lambda passable: passable
+import launch_scripts.launcher.warm_kernels
+from launch_scripts.simulation import simulate
+simulate.build_truth = lambda scenario, terrain: terrain.pace_s_per_m
+# A live run has both of them prepared, and imports nothing to find them.
+from launch_scripts.simulation.worlds import crowd
+from swarm.bus.endpoints import listening
+
+scenario, terrain = crowd("open", 1, 8, 4)
+simulation = simulate.Simulation(scenario, terrain=terrain)
+before = set(sys.modules)
+simulation.run_until(4.0)
+listening("tcp/127.0.0.1:9")
+print(json.dumps([simulation.report(4.0)["vehicles_routed"], sorted(set(sys.modules) - before)]))
+"""
+
+
+def _python(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+def test_no_role_imports_for_itself_what_all_of_its_kind_need() -> None:
+    routed, imported = json.loads(_python(_ALL_ROLES).splitlines()[-1])
+    assert routed == 8
+    assert imported == []
+
+
+def test_what_one_process_or_none_needs_is_not_loaded_for_all() -> None:
+    loaded = json.loads(
+        _python(
+            "import json, sys\nimport launch_scripts.launcher.warm_kernels\n"
+            "print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+        )
+    )
+    assert "numba" in loaded
+    assert {"rerun", "rasterio", "matplotlib", "PIL", "pyarrow", "typer"}.isdisjoint(loaded)
+
+
+@pytest.mark.parametrize(
+    ("words", "starts"),
+    [
+        (["up", "jacksboro", "--port", "0"], True),
+        (["demo"], True),
+        (["up", "jacksboro", "--only", "agent"], False),
+        (["up", "jacksboro", "--only=router"], False),
+        (["up", "--help"], False),
+        (["demo", "-h"], False),
+        (["status", "up"], False),
+        ([], False),
+    ],
+)
+def test_a_command_that_starts_a_swarm_begins_with_what_takes_longest(
+    words: list[str], starts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    monkeypatch.setattr(preload, "start_forkserver", lambda module: order.append(module))
+    monkeypatch.setattr("launch_scripts.cli.main", lambda: order.append("cli") or 0)
+    monkeypatch.setattr(sys, "argv", ["swarm", *words])
+    assert entry.main() == 0
+    assert order == [*([preload.ROLES_AND_KERNELS] if starts else []), "cli"]
