@@ -280,7 +280,7 @@ WORK: tuple[Work, ...] = (
     ),
     Work(
         "targets",
-        ("targets processes", "planners x rate", "vehicles x rate"),
+        ("targets processes", "planners x rate", "vehicles x rate", "messages"),
         ("targets processes", "cells"),
         "moves targets; the referee hears all positions",
     ),
