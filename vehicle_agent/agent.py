@@ -385,7 +385,7 @@ class Agent:
                 if vehicle.target == pose.target:
                     self._check_reach(vehicle)
                     vehicle.target_jumped(now_ns)
-            self._assignment.ask_soon(now_ns)
+            self._assignment.target_jumped(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
         """Which planners live: target -> incarnation."""

@@ -21,6 +21,9 @@ from vehicle_agent.matching import HYSTERESIS, need_first, spread
 
 _RETRY_NS = NS_PER_S // 2
 _STRANDED_RETRY_NS = 3 * NS_PER_S
+_JUMPS_APART_NS = NS_PER_S // 50
+"""For each target: so long after a request a jump of a target may cause the next. With many targets one always
+jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
 _LEASE_PERIODS = 3
 """An agent of the group that has told no costs for so many periods is gone."""
 
@@ -246,6 +249,8 @@ class Assignment:
         self._reassign_ns = int(reassign_s * NS_PER_S)
         self._stagger_ns = int(stagger * self._reassign_ns)
         self._due_ns = 0
+        self._asked_ns = 0
+        """When it was asked last."""
         self._open: AskCosts | None = None
         self._costs_s: dict[str, NDArray[np.float32]] = {}
         """Target -> the costs that its planner answered to the open request."""
@@ -267,11 +272,17 @@ class Assignment:
         self._open = AskCosts(request, tuple(vehicles), tuple(vehicle.cell for vehicle in vehicles.values()))
         first = self._due_ns == 0
         self._due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
+        self._asked_ns = now_ns
         return self._open
 
     def ask_soon(self, now_ns: int) -> None:
-        """A target has jumped or has a planner again, so that costs are not what they were, or vehicles are new."""
+        """A target has a planner again, so that costs are not what they were, or vehicles are new."""
         self._due_ns = min(self._due_ns, now_ns + _RETRY_NS)
+
+    def target_jumped(self, now_ns: int) -> None:
+        """A target is elsewhere all at once, or known for the first time: its costs are not what they were."""
+        rested_ns = self._asked_ns + len(self._targets) * _JUMPS_APART_NS
+        self._due_ns = min(self._due_ns, max(now_ns + _RETRY_NS, rested_ns))
 
     def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:
         """One planner's answer; one of the wrong length is ignored."""

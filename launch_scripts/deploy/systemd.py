@@ -37,9 +37,9 @@ RestartSec=1
 # It is up once its processes are started, and may wait for other machines before that.
 TimeoutStartSec=infinity
 WatchdogSec=30
-# The launcher ends its processes role by role; what is left after that is killed.
+# The launcher ends its processes role by role and writes its report; what is left after that is killed.
 KillMode=mixed
-TimeoutStopSec=30
+TimeoutStopSec=180
 # A process that is killed for want of memory is started again by the launcher.
 OOMPolicy=continue
 
@@ -78,7 +78,8 @@ ProtectKernelTunables=yes
 ProtectProc=invisible
 ProcSubset=pid
 RemoveIPC=yes
-RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX
+# Zenoh asks the kernel for the addresses of this machine, over AF_NETLINK.
+RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK
 RestrictNamespaces=yes
 RestrictRealtime=yes
 RestrictSUIDSGID=yes
@@ -119,6 +120,7 @@ if [ -z "$root" ]; then
         mkdir -p /opt/swarm/bin
         ln -sf "$found" {program}
     fi
+    runuser -u swarm -- {program} --version >/dev/null 2>&1 || fail "the user swarm cannot run {program}"
     systemctl stop {unit} 2>/dev/null || true
 fi
 
@@ -140,8 +142,10 @@ chmod 644 "$root/etc/systemd/system/{unit}"
 
 chown -R root:swarm "$home"
 systemctl daemon-reload
-systemctl enable --now {unit}
-echo "{host}: {unit} is started; journalctl -u {unit} shows what it says"
+systemctl enable --quiet {unit}
+# It may have to wait for a keeper on a machine that is installed after this one.
+systemctl restart --no-block {unit}
+echo "{host}: {unit} starts; journalctl -u {unit} shows what it says"
 """
 
 _RUN = """\

@@ -26,9 +26,9 @@ from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.marks import DIGEST_ROW, Digest
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Beat
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
 from swarm.wire.routes import RouteStatus
-from swarm.wire.topics import DIGEST, FLEET, LEAD, PUSHED_ROUTE, ROUTE
+from swarm.wire.topics import DIGEST, FLEET, FOLLOWED, LEAD, PUSHED_ROUTE, ROUTE
 
 ROUTED = (VehicleState.FOLLOWING, VehicleState.ARRIVED)
 ASK_S = 0.05
@@ -43,10 +43,12 @@ class Notes:
         """Vehicle -> when it last told that it is on a route."""
         self.targets: dict[str, str] = {}
         """Vehicle -> its target."""
-        self.pushed: dict[str, dict[int, float]] = {}
-        """Vehicle -> life of a planner -> when that first pushed a route to it."""
+        self.pushed: dict[str, list[tuple[float, int]]] = {}
+        """Vehicle -> when a route was pushed to it, and by which life of a planner."""
+        self.followed: dict[str, list[float]] = {}
+        """Vehicle -> when it began a route."""
         self.answered: dict[str, dict[int, tuple[float, float]]] = {}
-        """Target -> life of a planner -> when that first and last answered for a route."""
+        """Target -> life of a planner -> when that first and last answered, since it was silent for a second."""
         self.leads: dict[str, float] = {}
         """Planner -> when it last told that it leads."""
         self.acknowledged: dict[str, dict[str, tuple[int, int]]] = {}
@@ -63,7 +65,9 @@ class Notes:
                     if target != NO_TARGET:
                         self.targets[id] = fleet.target_ids[target]
             case Heard(message=PushedRoute() as pushed):
-                self.pushed.setdefault(pushed.vehicle, {}).setdefault(pushed.incarnation, now_s)
+                self.pushed.setdefault(pushed.vehicle, []).append((now_s, pushed.incarnation))
+            case Heard(message=Followed() as followed):
+                self.followed.setdefault(followed.vehicle, []).append(now_s)
             case Heard(message=Beat(role="planner", leads=True) as beat):
                 self.leads[beat.id] = now_s
             case Heard(message=Digest(role="keeper") as digest):
@@ -75,12 +79,13 @@ class Notes:
             case Replied(tag=target, message=RouteReply() as reply):
                 if reply.routes[0].status is not RouteStatus.NO_TARGET:
                     lives = self.answered.setdefault(target, {})
-                    lives[reply.incarnation] = lives.get(reply.incarnation, (now_s, now_s))[0], now_s
+                    first_s, last_s = lives.get(reply.incarnation, (now_s, now_s))
+                    lives[reply.incarnation] = (first_s if now_s - last_s < 1.0 else now_s), now_s
 
 
 def look_on(bus: ZenohBus, targets: list[str], seconds: float) -> None:
     notes, inbox = Notes(), Inbox()
-    for topic in (FLEET, PUSHED_ROUTE, LEAD, DIGEST):
+    for topic in (FLEET, PUSHED_ROUTE, FOLLOWED, LEAD, DIGEST):
         bus.subscribe(topic, inbox.post)
     ask_at_s = tell_at_s = time.monotonic()
     until_s = ask_at_s + seconds

@@ -9,12 +9,19 @@ from dataclasses import dataclass, field
 from launch_scripts.bench.scaling.check import Compared, without_each
 from launch_scripts.bench.scaling.cost_model import Fitted
 from launch_scripts.bench.scaling.model import ROLES, Model, Row
-from launch_scripts.bench.scaling.needs import Machine, Needs, crossings_of, fewest_machines, needs, too_much
+from launch_scripts.bench.scaling.needs import (
+    Machine,
+    Needs,
+    TooMuchError,
+    crossings_of,
+    fewest_machines,
+    needs,
+    too_much,
+)
 from launch_scripts.bench.scaling.quantities import Quantities, quantities_of
-from launch_scripts.bench.scaling.terms import SENT, WORK
+from launch_scripts.bench.scaling.terms import ALL_CHANGES, CHANGES, SENT, WORK
 from launch_scripts.bench.tables import number
 from launch_scripts.bench.whole_swarm.size import Size, size_of
-from swarm.errors import ConfigError
 
 MACHINE = Machine(cores=16, memory_gb=64, link_mbit_per_s=1000)
 """The kind of machine that the page reckons with."""
@@ -23,7 +30,7 @@ GOAL = size_of(100_000, 1000, per_agent=200)
 GOAL_MACHINES = 100
 _SIZES = ((1000, 10, 1), (10_000, 100, 1), (10_000, 100, 10), (100_000, 1000, 10), (100_000, 1000, 100))
 _SHARDS = (1, 4, 10, 25, 50, 100, 200)
-NAMES = ("check", "sent", "work", "needs", "growth", "first", "shards")
+NAMES = ("check", "sent", "work", "needs", "growth", "first", "changes", "shards")
 """Of all tables, in the order of the page."""
 _KIND = f"{MACHINE.cores} cores, {MACHINE.memory_gb:g} GB and {MACHINE.link_mbit_per_s:,.0f} Mbit/s"
 _FIRST = (
@@ -216,6 +223,30 @@ def growth_block(model: Model) -> Block:
     )
 
 
+def changes_block(model: Model) -> Block:
+    """What the goal's swarm would need if the protocol were changed."""
+    lines = []
+    for name, change in [*CHANGES.items(), ("all of these", ALL_CHANGES)]:
+        found = needs(model, GOAL, GOAL_MACHINES, change=change)
+        lines.append(
+            [
+                name,
+                number(found.cores),
+                *(number(found.cpu_cores[role]) for role in ("agent", "planner", "router", "launcher")),
+                number(found.crossings_per_s),
+                number(found.link_mbit_per_s),
+            ]
+        )
+    return Block(
+        "changes",
+        "The goal's swarm if the protocol were changed",
+        ("change", "cores", "agents", "planners", "routers", "launchers", "messages/s", "Mbit/s"),
+        lines,
+        ["Messages from machine to machine, and Mbit/s into each."],
+        wide=True,
+    )
+
+
 def shards_block(model: Model) -> Block:
     """The goal's swarm cut into swarms of regions that know nothing of each other, at the same density."""
     lines = []
@@ -223,8 +254,9 @@ def shards_block(model: Model) -> Block:
         size = size_of(GOAL.vehicles // shards, GOAL.targets // shards, per_agent=GOAL.per_agent)
         try:
             found = fewest_machines(model, size, MACHINE)
-        except ConfigError:
-            lines.append([f"{shards:,}", f"{size.vehicles:,}", f"{size.targets:,}", "-", "-", "-", "-", "-"])
+        except TooMuchError as error:
+            why = "; ".join(error.full)
+            lines.append([f"{shards:,}", f"{size.vehicles:,}", f"{size.targets:,}", *["-"] * 4, why])
             continue
         worst = max((share, role) for role, share in found.process.items() if role != "router")
         lines.append(
@@ -254,6 +286,7 @@ def shards_block(model: Model) -> Block:
         ),
         lines,
         [_PARTS],
+        wide=True,
     )
 
 
@@ -266,6 +299,7 @@ def blocks(model: Model, compared: Sequence[Compared], rows: Sequence[Row]) -> l
         needs_block(model, rows),
         growth_block(model),
         first_block(model),
+        changes_block(model),
         shards_block(model),
     ]
 
@@ -313,11 +347,7 @@ def extrapolated(found: Needs, rows: Sequence[Row]) -> bool:
 
 
 def _sum(fitted: Fitted) -> str:
-    shown = [
-        f"{number(each)} {name}" if name not in ("one",) else number(each)
-        for name, each in fitted.coefficients.items()
-        if each > 0
-    ]
+    shown = [f"{each:.3g} {name}" for name, each in fitted.coefficients.items() if each > 0]
     return " + ".join(shown) or "0"
 
 

@@ -79,6 +79,7 @@ def scaling(
                 shown.add_row(*line)
             yield shown
             yield from block.remarks
+        yield f"Too wide for here: {', '.join(block.name for block in found if block.wide)}; see docs/scaling.md."
         yield from remarks
 
     report = {

@@ -11,7 +11,18 @@ import msgspec
 from launch_scripts.bench.scaling.cost_model import Fitted, Terms, fit
 from launch_scripts.bench.scaling.design import Run
 from launch_scripts.bench.scaling.quantities import Quantities, quantities_of
-from launch_scripts.bench.scaling.terms import HEARERS, KINDS_OF_BYTES, SENT, TERMS, WORK, Sent
+from launch_scripts.bench.scaling.terms import (
+    HEARERS,
+    KINDS_OF_BYTES,
+    NO_CHANGE,
+    PUT,
+    SENT,
+    TERMS,
+    WORK,
+    Change,
+    Sent,
+    one,
+)
 
 ROLES = tuple(work.role for work in WORK)
 
@@ -56,16 +67,26 @@ class Model:
     cpu: Mapping[str, Fitted]
     memory: Mapping[str, Fitted]
 
-    def flows(self, q: Quantities) -> list[Flow]:
+    def flows(self, q: Quantities, change: Change = NO_CHANGE) -> list[Flow]:
         values = term_values(q)
+
+        def scale(sent: Sent, to: str) -> float:
+            return change.get((sent.topic, sent.source, to), one)(q)
+
         return [
-            Flow(sent, to, messages.at(values), size.at(values), HEARERS[many](q))
+            Flow(
+                sent,
+                to,
+                messages.at(values) * scale(sent, PUT),
+                size.at(values) * scale(sent, PUT),
+                HEARERS[many](q) * scale(sent, to),
+            )
             for sent, (messages, size) in zip(SENT, self.sent, strict=True)
             for to, many in sent.to.items()
         ]
 
-    def cpu_ms_per_s(self, q: Quantities) -> dict[str, float]:
-        flows = self.flows(q)
+    def cpu_ms_per_s(self, q: Quantities, change: Change = NO_CHANGE) -> dict[str, float]:
+        flows = self.flows(q, change)
         return {role: each.at(work_values(q, flows, role)) for role, each in self.cpu.items()}
 
     def memory_mb(self, q: Quantities) -> dict[str, float]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from launch_scripts.bench.scaling.model import Flow, Model, term_values, work_values
 from launch_scripts.bench.scaling.quantities import Quantities, quantities_of
-from launch_scripts.bench.scaling.terms import HEARERS, Sent
+from launch_scripts.bench.scaling.terms import NO_CHANGE, Change, Sent
 from launch_scripts.bench.whole_swarm.size import Size
 from swarm.errors import ConfigError
 
@@ -22,11 +22,22 @@ LINK_SHARE = 0.5
 """Of a link's capacity."""
 OVERHEAD_BYTES = 100
 """Of a message on a link: key, Zenoh's and TCP/IP's headers. Assumed, not measured."""
-MOST_MACHINES = 10_000
+MOST_MACHINES = 2000
 MOST_SESSIONS = 8192
 """`transport/unicast/max_sessions` of a router (swarm/bus/zenoh_config.py)."""
 SINGLE = ("targets", "keeper", "monitor")
 """Roles of one process, all on the first machine."""
+
+
+class TooMuchError(ConfigError):
+    """No number of machines carries a swarm.
+
+    full  what is full on each of the most machines
+    """
+
+    def __init__(self, full: Sequence[str]) -> None:
+        super().__init__(f"no number of machines up to {MOST_MACHINES} carries this swarm: {'; '.join(full)}")
+        self.full = full
 
 
 @dataclass(frozen=True)
@@ -73,14 +84,16 @@ class Needs:
         return sum(self.cpu_cores.values())
 
 
-def needs(model: Model, size: Size, machines: int, *, standbys: int = 0, monitors: int = 1) -> Needs:
-    """What the model says of a swarm on so many machines."""
+def needs(
+    model: Model, size: Size, machines: int, *, standbys: int = 0, monitors: int = 1, change: Change = NO_CHANGE
+) -> Needs:
+    """What the model says of a swarm on so many machines, with the protocol as it is or changed."""
     q = quantities_of(size, standbys=standbys, monitors=monitors, machines=machines)
-    flows = model.flows(q)
+    flows = model.flows(q, change)
     crossings = list(crossings_of(flows, q, machines))
     crossed = sum(messages for _, messages, _ in crossings)
     crossed_bytes = sum(each for _, _, each in crossings)
-    cpu = {role: each / 1000 for role, each in model.cpu_ms_per_s(q).items()}
+    cpu = {role: each / 1000 for role, each in model.cpu_ms_per_s(q, change).items()}
     cpu["router"] += _router_cores(model, crossed, crossed_bytes)
     count = {
         "agent": q.agents,
@@ -100,7 +113,7 @@ def needs(model: Model, size: Size, machines: int, *, standbys: int = 0, monitor
     )
     mbit = 8e-6 * (crossed_bytes + OVERHEAD_BYTES * crossed) / machines
     first_in = 8e-6 * sum(
-        (flow.put_bytes + OVERHEAD_BYTES * flow.puts) * HEARERS[flow.sent.to[flow.to]](q)
+        (flow.put_bytes + OVERHEAD_BYTES * flow.puts) * flow.copies
         for flow in flows
         if flow.to in SINGLE and flow.sent.source in ("agent", "planner")
     )
@@ -186,7 +199,7 @@ def _memory_gb(model: Model, q: Quantities, machines: int) -> tuple[float, float
 
 
 def fewest_machines(model: Model, size: Size, machine: Machine, *, standbys: int = 0) -> Needs:
-    """The fewest machines of a kind that carry a swarm. Raises ConfigError if no number does, with what is full."""
+    """The fewest machines of a kind that carry a swarm. Raises TooMuchError if no number does."""
     machines = 1
     while machines <= MOST_MACHINES:
         found = needs(model, size, machines, standbys=standbys)
@@ -194,7 +207,7 @@ def fewest_machines(model: Model, size: Size, machine: Machine, *, standbys: int
         if not full:
             return found
         machines += max(1, machines // 50)
-    raise ConfigError(f"no number of machines up to {MOST_MACHINES} carries this swarm: {'; '.join(full)}")
+    raise TooMuchError(full)
 
 
 def too_much(found: Needs, machine: Machine) -> list[str]:

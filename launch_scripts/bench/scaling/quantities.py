@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.bench.whole_swarm.size import CELLS_PER_VEHICLE, Size
 from swarm.grid import REGION_CELLS
+from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY
 
 INTEREST_CELLS = 75
 """Within so many cells of a vehicle its agent holds the map: `map.interest_m` of the scenario, in cells."""
@@ -25,7 +26,9 @@ _ROAM_CELLS = 4
 REASSIGN_S = 5.0
 """`vehicles.reassign_s`."""
 _AFTER_CAPTURE_S = 0.5
-"""What `vehicle_agent/assignment.py` waits after a capture, so that several become one request."""
+_APART_S = 1 / 50
+"""What `vehicle_agent/assignment.py` waits after a capture, so that several become one request; and after a
+request, for each target."""
 _CAPTURES_PER_TARGET_S = 0.05
 """At the density of `thousand`: 30 a minute of 10 targets."""
 _SEED = 1
@@ -40,9 +43,11 @@ class Quantities:
     cells         of the map
     side          cells a side of the map
     rate          ticks a second
-    plots         regions that the map has; each is a plot of right of way
+    plots         plots of right of way, one for each region; 0 of fewer than three agents, as their plots have
+                  one member, which tells nobody
     shared        pairs of an agent and a region in which it has vehicles
-    hearers       agents that hold the region of a vehicle, on average over vehicles: those who hear its marks
+    hearers       agents that hold the region of a vehicle, on average; they hear its marks
+    near          share of all regions that an agent holds, on average
     chases        pairs of an agent and a target which one of its vehicles chases, where each takes any target
     asks          requests a second, of all agents, for what their vehicles need to every target
     """
@@ -59,13 +64,14 @@ class Quantities:
     plots: float
     shared: float
     hearers: float
+    near: float
     chases: float
     asks: float
 
 
 def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines: int = 1) -> Quantities:
     """The numbers of a swarm of one size, with so many standbys of each planner."""
-    shared, hearers = _spread(size.vehicles, size.agents, size.side)
+    shared, hearers, near = _spread(size.vehicles, size.agents, size.side)
     per_agent = size.vehicles / size.agents
     return Quantities(
         vehicles=size.vehicles,
@@ -77,11 +83,12 @@ def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines:
         cells=size.side**2,
         side=size.side,
         rate=size.tick_hz,
-        plots=math.ceil(size.side / REGION_CELLS) ** 2,
+        plots=math.ceil(size.side / REGION_CELLS) ** 2 if size.agents >= FEWEST_FOR_MAJORITY else 0,
         shared=shared,
         hearers=hearers,
+        near=near,
         chases=size.agents * size.targets * -math.expm1(-per_agent / size.targets),
-        asks=size.agents * _asks_per_s(_captures_per_s(size)),
+        asks=size.agents * _asks_per_s(_captures_per_s(size), size.targets),
     )
 
 
@@ -92,26 +99,30 @@ def _captures_per_s(size: Size) -> float:
     return _CAPTURES_PER_TARGET_S * size.targets * math.sqrt(CELLS_PER_VEHICLE) / apart
 
 
-def _asks_per_s(captures_per_s: float) -> float:
-    """Requests of one agent. It asks every `vehicles.reassign_s`, or half a second after a target was captured,
-    whichever is first: the mean of that, of captures which are independent of each other."""
+def _asks_per_s(captures_per_s: float, targets: int) -> float:
+    """Requests of one agent. It asks every `vehicles.reassign_s`; or half a second after a target was captured, and
+    a 50th of a second for each target after it asked last; whichever is first: the mean of that, of captures which
+    are independent of each other."""
+    rests_s = min(max(targets * _APART_S, _AFTER_CAPTURE_S), REASSIGN_S)
     if not captures_per_s:
         return 1 / REASSIGN_S
-    waits_s = -math.expm1(-captures_per_s * (REASSIGN_S - _AFTER_CAPTURE_S)) / captures_per_s
-    return 1 / (_AFTER_CAPTURE_S + waits_s)
+    none_yet = math.exp(-captures_per_s * (rests_s - _AFTER_CAPTURE_S))
+    none_at_all = math.exp(-captures_per_s * (REASSIGN_S - _AFTER_CAPTURE_S))
+    return 1 / (rests_s + (none_yet - none_at_all) / captures_per_s)
 
 
 @functools.lru_cache(1024)
-def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float]:
-    """`shared` and `hearers` of `Quantities`, of vehicles anywhere on an empty square map."""
+def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float, float]:
+    """`shared`, `hearers` and `near` of `Quantities`, of vehicles anywhere on an empty square map."""
     rng = np.random.default_rng(_SEED)
     rows, cols = rng.integers(0, side, (2, vehicles))
     order = np.argsort(_morton(rows, cols), kind="stable")
     rows, cols = rows[order], cols[order]
     agent = np.arange(vehicles) * agents // vehicles
     driven = _regions_within(_ROAM_CELLS, rows, cols, agent, side)
-    held = _regions_within(INTEREST_CELLS, rows, cols, agent, side).sum(0)
-    return float(driven.sum()), float(held[rows // REGION_CELLS, cols // REGION_CELLS].mean())
+    held = _regions_within(INTEREST_CELLS, rows, cols, agent, side)
+    hearers = held.sum(0)[rows // REGION_CELLS, cols // REGION_CELLS].mean()
+    return float(driven.sum()), float(hearers), float(held.mean())
 
 
 def _regions_within(

@@ -22,6 +22,7 @@ TERMS: Mapping[str, Callable[[Quantities], float]] = {
     "agents x rate": lambda q: q.agents * q.rate,
     "planners x rate": lambda q: q.planners * q.rate,
     "vehicles x rate": lambda q: q.vehicles * q.rate,
+    "vehicles in tables x rate": lambda q: q.vehicles * q.rate if q.plots else 0.0,
     "shared regions x rate": lambda q: q.shared * q.rate,
     "plots x rate": lambda q: q.plots * q.rate,
     "chases": lambda q: q.chases,
@@ -36,15 +37,6 @@ TERMS: Mapping[str, Callable[[Quantities], float]] = {
     "processes": lambda q: q.agents + q.planners + q.keepers + q.monitors + 1 + q.launchers,
 }
 """Term -> its value. Messages and bytes by role are terms, too: see `Work`."""
-
-TERM_MEANINGS: Mapping[str, str] = {
-    "shared regions x rate": "pairs of an agent and a region in which it has vehicles, each tick",
-    "plots x rate": "regions of the map, each tick",
-    "chases": "pairs of an agent and a target that one of its vehicles chases",
-    "asks": "requests of agents for what their vehicles need to each target: every 5 s, and after each capture",
-    "asked vehicles": "vehicles in those requests",
-    "planners x side": "trees follow their targets in windows that grow with the side of the map",
-}
 
 
 def one(_: Quantities) -> float:
@@ -112,7 +104,7 @@ SENT: tuple[Sent, ...] = (
         "table",
         "agent",
         ("plots x rate",),
-        ("plots x rate", "vehicles x rate"),
+        ("plots x rate", "vehicles in tables x rate"),
         {"agent": "one"},
         "a warden's table, to the two other members of its plot",
     ),
@@ -270,15 +262,15 @@ class Work:
 WORK: tuple[Work, ...] = (
     Work(
         "agent",
-        ("agents x rate", "vehicles x rate", "messages", "map bytes", "costs bytes"),
+        ("agents x rate", "vehicles x rate", "plots x rate", "messages", "map bytes", "costs bytes"),
         ("agents", "vehicles", "cells"),
-        "ticks, vehicles in each, messages; marks and digests that are merged; costs of all targets",
+        "ticks, vehicles, members of plots, messages; marks and digests that are merged; costs of all targets",
     ),
     Work(
         "planner",
-        ("planners x rate", "planners x side", "vehicles", "messages", "map bytes"),
+        ("planners x rate", "planners x side", "vehicles", "messages"),
         ("planners", "planners x cells", "cells"),
-        "ticks, a tree that follows its target, vehicles that are led, messages; marks and digests that are merged",
+        "ticks, a tree that follows its target, vehicles that are led, messages",
     ),
     Work(
         "router",
@@ -288,7 +280,7 @@ WORK: tuple[Work, ...] = (
     ),
     Work(
         "targets",
-        ("targets processes", "planners x rate", "vehicles x rate"),
+        ("targets processes", "planners x rate", "vehicles x rate", "messages"),
         ("targets processes", "cells"),
         "moves targets; the referee hears all positions",
     ),
@@ -301,3 +293,41 @@ WORK: tuple[Work, ...] = (
         "watches its processes, records what all say",
     ),
 )
+
+
+Change = Mapping[tuple[str, str, str], Callable[[Quantities], float]]
+"""(topic, role that sends, role that hears or PUT) -> by what the copies that the role hears, or what is put, would
+be multiplied if the protocol were changed."""
+NO_CHANGE: Change = {}
+PUT = "put"
+
+
+def _near(q: Quantities) -> float:
+    return q.near
+
+
+def _one_of(q: Quantities) -> float:
+    return 1 / max(q.launchers, 1)
+
+
+CHANGES: Mapping[str, Change] = {
+    "as it is": NO_CHANGE,
+    "one launcher records, the others look after their own": {
+        (sent.topic, sent.source, "launcher"): _one_of
+        for sent in SENT
+        if sent.to.get("launcher") and sent.topic in ("fleet", "followed", "marks", "stats", "status", "pose")
+    },
+    "agents ask for the costs of targets near": {
+        ("cost", "agent", "planner"): _near,
+        ("cost", "planner", PUT): _near,
+    },
+    "planners hold what is near": {
+        ("marks", "agent", "planner"): _near,
+        ("digest", "agent", "planner"): _near,
+        ("digest", "keeper", "planner"): _near,
+    },
+    "digests go to agents near": {("digest", "agent", "agent"): _near, ("digest", "keeper", "agent"): _near},
+    "agents hear the targets near": {("pose", "targets", "agent"): _near},
+}
+"""What could be changed -> what that would save, where near is as large as what an agent holds."""
+ALL_CHANGES: Change = {key: by for change in CHANGES.values() for key, by in change.items()}

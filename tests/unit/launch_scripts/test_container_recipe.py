@@ -61,6 +61,9 @@ def test_the_image_runs_as_nobody_and_compiles_nothing(steps: list[Step]) -> Non
     (probe,) = values(steps, "HEALTHCHECK", 2)
     assert '"swarm", "health"' in probe
     last = " ".join(values(steps, "RUN", 2))
+    assert "--mode=1777 /var/lib/swarm" in last, (
+        "runc gives a tmpfs there the mode of the folder, but not its owner"
+    )
     assert not re.search(r"gcc|build-essential|pip |uv ", last)
     assert all(value.startswith("--from=build /opt/") for value in values(steps, "COPY", 2))
 

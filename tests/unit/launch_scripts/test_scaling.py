@@ -30,6 +30,7 @@ from launch_scripts.bench.scaling.traffic import MACHINES, Traffic, run
 from launch_scripts.bench.whole_swarm.size import Size, size_of
 from launch_scripts.commands.deploy import app as deploy
 from swarm.errors import ConfigError, SwarmError
+from swarm.grid import REGION_CELLS
 
 PAGE = Path(__file__).parents[3] / "docs" / "scaling.md"
 
@@ -146,7 +147,10 @@ sizes = st.builds(
 @given(sizes)
 def test_agents_share_regions_and_hear_marks_within_bounds(size: Size) -> None:
     q = quantities_of(size)
-    assert q.agents <= q.shared <= min(q.agents * q.plots, 9 * q.vehicles)
+    regions = math.ceil(size.side / REGION_CELLS) ** 2
+    assert q.plots == (regions if size.agents >= 3 else 0)
+    assert q.agents <= q.shared <= min(q.agents * regions, 9 * q.vehicles)
+    assert 0 < q.near <= 1
     assert 1 <= q.hearers <= q.agents
     assert 0 < q.chases <= min(size.agents * size.targets, size.vehicles) + 1e-9
 
@@ -156,21 +160,23 @@ def test_on_one_region_every_agent_hears_every_mark() -> None:
     assert (q.plots, q.shared, q.hearers) == (1, 10, 10)
 
 
-@pytest.mark.parametrize("captures_per_s", [0.01, 0.2, 1.0, 5.0])
-def test_the_rate_of_asks_is_the_mean_of_a_drawn_history(captures_per_s: float) -> None:
+@pytest.mark.parametrize(
+    ("captures_per_s", "targets"), [(0.01, 1), (0.2, 4), (1.0, 20), (1.0, 100), (5.0, 100), (50.0, 1000)]
+)
+def test_the_rate_of_asks_is_the_mean_of_a_drawn_history(captures_per_s: float, targets: int) -> None:
     rng = np.random.default_rng(3)
     captures = np.cumsum(rng.exponential(1 / captures_per_s, max(200, int(10_000 * captures_per_s))))
     asks, now = 0, 0.0
     while now < captures[-1] - 10:
         following = captures[np.searchsorted(captures, now, side="right")]
-        now = min(now + 5.0, following + 0.5)
+        now = min(now + 5.0, max(following + 0.5, now + targets / 50))
         asks += 1
-    assert _asks_per_s(captures_per_s) == pytest.approx(asks / now, rel=0.05)
+    assert _asks_per_s(captures_per_s, targets) == pytest.approx(asks / now, rel=0.05)
 
 
 def test_without_captures_agents_ask_every_five_seconds() -> None:
-    assert _asks_per_s(0.0) == pytest.approx(0.2)
-    assert _asks_per_s(1e-9) == pytest.approx(0.2)
+    assert _asks_per_s(0.0, 10) == pytest.approx(0.2)
+    assert _asks_per_s(1e-9, 10) == pytest.approx(0.2)
 
 
 # --- fits --------------------------------------------------------------------------------------------------------
