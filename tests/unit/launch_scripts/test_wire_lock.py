@@ -81,8 +81,8 @@ REFUSED: dict[str, tuple[Change, str]] = {
         lambda now: now["messages"]["fleet"]["layouts"].update(Fleet="map, no other fields"), "Fleet was",
     ),
     "an enumeration gets one more value": (
-        lambda now: now["messages"]["followed"]["values"]["RouteStatus"].append("lost"),
-        r"RouteStatus was .*: followed needs",
+        lambda now: now["messages"]["pushed-route"]["values"]["RouteStatus"].append("lost"),
+        r"RouteStatus was .*: pushed-route needs",
     ),
     "what introduces a build takes a step": (lambda now: stepped(now, "run"), "run has taken a step: it never"),
 }  # fmt: skip
