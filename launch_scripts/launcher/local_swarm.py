@@ -92,8 +92,8 @@ class Running:
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
     """Memory of a `Board` that its lives write and the launcher reads; None before the first."""
-    hung: bool = False
-    """Whether this life was asked to say where it hangs, and to end."""
+    hung_s: float | None = None
+    """Since when this life has been asked to say where it hangs, and to end; None if it has not."""
 
     @property
     def alive(self) -> bool:
@@ -210,14 +210,22 @@ class LocalSwarm:
 
     def _end_hung(self) -> None:
         """End processes whose loop stands still: at first by SIGABRT, at which they write into their log where all
-        of their threads are, and one that does not even do that, as it was stopped, at the next look."""
-        still = self._hang_watch.look(self.seen, time.monotonic())
+        of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
+        SIGKILL."""
+        now_s = time.monotonic()
+        still = self._hang_watch.look(self.seen, now_s)
         for running in self.running if still else ():
-            if running.spec.name in still and running.process is not None and running.process.pid is not None:
+            process = running.process
+            if running.spec.name not in still or process is None:
+                continue
+            if running.hung_s is None:
+                running.hung_s = now_s
                 log.error("%s hangs: its loop stands still for %.0f s", running.spec.name, STILL_S)
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(running.process.pid, signal.SIGKILL if running.hung else signal.SIGABRT)
-                running.hung = True
+                if process.pid is not None:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(process.pid, signal.SIGABRT)
+            elif now_s - running.hung_s > STOP_GRACE_S:
+                process.kill()
 
     def stop(
         self,
@@ -280,7 +288,7 @@ class LocalSwarm:
             process.start()
         tell.close()
         running.process, running.pipe = process, listen
-        running.began_s, running.due_s, running.hung = time.monotonic(), None, False
+        running.began_s, running.due_s, running.hung_s = time.monotonic(), None, None
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
         """Decides what follows an unexpected end."""
@@ -317,7 +325,7 @@ class LocalSwarm:
                 reason = running.pipe.recv()
                 assert isinstance(reason, ExitReason)
                 return reason
-        if running.hung:
+        if running.hung_s is not None:
             return ExitReason("its loop stood still, so it was killed; its log says where", 1, refused=False)
         if code == -KILLED_BY:
             return ExitReason("a plug-in did not come back from native code; its log says where", 1, refused=False)

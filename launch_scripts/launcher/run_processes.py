@@ -4,6 +4,8 @@ files."""
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,34 +28,39 @@ class Usage:
 _ROLES = tuple(f"{role}-" for role in ROLES)
 
 
-def processes(run_dir: Path) -> dict[str, int]:
+def processes(run_dir: Path, other_than: Collection[int] = ()) -> dict[str, int]:
     """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
     found: dict[str, int] = {}
-    for pid in os.listdir(_PROC):
-        if not pid.isdigit():
-            continue
+    for pid in map(int, filter(str.isdigit, os.listdir(_PROC))):
         try:
-            log = Path(os.readlink(_PROC / pid / "fd" / "1"))
+            log = Path(os.readlink(_PROC / str(pid) / "fd" / "1"))
         except OSError:  # ended meanwhile, or somebody else's
             continue
-        if log.parent == run_dir and log.name.startswith(_ROLES) and not has_ended(int(pid)):
-            found[log.name.partition(".log")[0]] = int(pid)
+        named = log.parent == run_dir and log.name.startswith(_ROLES)
+        if named and pid not in other_than and not has_ended(pid):
+            found[log.name.partition(".log")[0]] = pid
     return found
 
 
-def holding(file: Path) -> list[int]:
-    """The processes of this user that have a file open."""
-    found: list[int] = []
+def writing(file: Path) -> list[int]:
+    """The processes of this user that may write to a file; one who only reads it is not among them."""
     if not _PROC.is_dir():
-        return found
-    for pid in filter(str.isdigit, os.listdir(_PROC)):
-        try:
-            opened = [os.readlink(entry.path) for entry in os.scandir(_PROC / pid / "fd")]
-        except OSError:  # ended meanwhile, or somebody else's
-            continue
-        if str(file) in opened and not has_ended(int(pid)):
-            found.append(int(pid))
-    return found
+        return []
+    every = [int(pid) for pid in os.listdir(_PROC) if pid.isdigit()]
+    return [pid for pid in every if _writes(_PROC / str(pid), str(file)) and not has_ended(pid)]
+
+
+def _writes(process: Path, file: str) -> bool:
+    """Whether a process, a folder of /proc, has a file open so that it may write to it."""
+    with suppress(OSError):  # ended meanwhile, or somebody else's
+        for name in os.listdir(process / "fd"):
+            with suppress(OSError):  # closed meanwhile
+                if os.readlink(process / "fd" / name) == file:
+                    lines = (process / "fdinfo" / name).read_text().splitlines()
+                    flags = next((line.split()[1] for line in lines if line.startswith("flags:")), "0")
+                    if int(flags, 8) & os.O_ACCMODE != os.O_RDONLY:
+                        return True
+    return False
 
 
 def has_ended(pid: int) -> bool:

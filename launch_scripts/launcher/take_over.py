@@ -12,11 +12,10 @@ import logging
 import os
 import signal
 from collections.abc import Callable, Collection
-from functools import partial
 from pathlib import Path
 
 from launch_scripts.launcher.local_swarm import Running
-from launch_scripts.launcher.run_processes import has_ended, holding, processes
+from launch_scripts.launcher.run_processes import has_ended, processes, writing
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
 from swarm.runtime.health import LIFE_BEFORE
@@ -45,6 +44,7 @@ class TakeOver:
         self._running = running
         self._say = say
         self._launcher = _launcher_of(run_dir)
+        self._run_dir = run_dir
         self.predecessors = processes(run_dir)
         """Name -> pid of the processes that are followed."""
         left = set(self.predecessors) - {each.spec.name for each in running}
@@ -59,14 +59,13 @@ class TakeOver:
         self._asked = False
         """Whether the predecessor has been asked to end."""
         for each in running:
-            pid = self.predecessors.get(each.spec.name)
-            if pid is None or each.spec.role == _BESIDE:
+            if each.spec.role == _BESIDE:
                 continue
-            if each.spec.role == _WAITS:
+            if each.spec.role == _WAITS and each.spec.name in self.predecessors:
                 each.takes_over = True
                 each.begins_when = lambda: self._planners_ready
             else:
-                each.begins_when = partial(has_ended, pid)
+                each.begins_when = lambda name=each.spec.name: self._is_free(name)
 
     @property
     def done(self) -> bool:
@@ -76,6 +75,11 @@ class TakeOver:
     def look(self, now_s: float) -> None:
         """Do what has become possible. `now_s`: of a clock that only goes on."""
         if self._asked:
+            return
+        if has_ended(self._launcher):
+            self._asked = True
+            self._say("the launcher before has ended by itself")
+            self._look_again()
             return
         if self._began_s is None:
             self._began_s = now_s
@@ -91,6 +95,17 @@ class TakeOver:
         log.info("asks the launcher before to end, pid %d", self._launcher)
         with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
             os.kill(self._launcher, signal.SIGTERM)
+        self._look_again()
+
+    def _look_again(self) -> None:
+        """See who is to be followed: one that has crashed meanwhile runs in a new life, or comes no more."""
+        own = [each.process.pid for each in self._running if each.process is not None]
+        self.predecessors = processes(self._run_dir, [pid for pid in own if pid is not None])
+
+    def _is_free(self, name: str) -> bool:
+        """Whether nobody holds what a process needs for itself. The launcher before starts a life that has crashed
+        again until it ends, so the end of a life before that says nothing."""
+        return self._asked and has_ended(self.predecessors.get(name, self._launcher))
 
 
 def _lacks(running: Running) -> tuple[str, ...] | None:
@@ -105,8 +120,9 @@ def _plans(running: Running) -> bool:
 
 
 def _waits(running: Running) -> bool:
-    """Whether a process has come as far as the file of its promises, if it is an agent that follows another."""
-    return not running.takes_over or _lacks(running) == (LIFE_BEFORE,)
+    """Whether a process has come as far as the file of its promises, if it is an agent that follows another; or
+    further, where the life before it has crashed."""
+    return not running.takes_over or _lacks(running) in ((LIFE_BEFORE,), ())
 
 
 def _was_ordered(name: str, targets: Collection[str]) -> bool:
@@ -116,8 +132,14 @@ def _was_ordered(name: str, targets: Collection[str]) -> bool:
 
 
 def _launcher_of(run_dir: Path) -> int:
-    """The pid of the launcher that runs a run's part from this folder. Raises ConfigError where there is none."""
-    found = [pid for pid in holding(run_dir / "launcher.log") if pid != os.getpid()]
+    """The pid of the launcher that runs a run's part from this folder. Raises ConfigError where there is none, or
+    one is being taken over from already."""
+    found = [pid for pid in writing(run_dir / "launcher.log") if pid != os.getpid()]
     if not found:
         raise ConfigError(f"--take-over: no launcher of this user runs in {run_dir}; start without it")
+    if len(found) > 1:
+        raise ConfigError(
+            f"--take-over: {len(found)} launchers run in {run_dir}, pids {', '.join(map(str, sorted(found)))}: "
+            "wait until one has taken over from the other"
+        )
     return found[0]

@@ -3,9 +3,10 @@ versions unnoticed (decision 87)."""
 
 from __future__ import annotations
 
+import enum
 import json
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ NEVER_STEP = ("run", "nothing")
 """Messages by which builds of any two versions say which they are."""
 
 Lock = Mapping[str, Any]
-"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes` and `structs`,
-each of which is a list of fields: name, type, default."""
+"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes`, `structs`,
+each of which is a list of fields: name, type, default, `layouts` of these, and `values` of enumerations."""
 
 
 def lock() -> Lock:
@@ -47,11 +48,32 @@ def lock() -> Lock:
 
 
 def _locked(kind: type[Message]) -> dict[str, Any]:
+    structs = (kind, *parts(kind))
     return {
         "reads": sorted(name_and_version(schema)[1] for schema in read_schemas(kind)),
         "writes": name_and_version(written_schema(kind))[1],
-        "structs": {struct.__name__: _fields(struct) for struct in (kind, *parts(kind))},
+        "structs": {struct.__name__: _fields(struct) for struct in structs},
+        "layouts": {struct.__name__: _layout(struct) for struct in structs},
+        "values": {each.__name__: [member.value for member in each] for each in _enumerations(structs)},
     }
+
+
+def _layout(struct: type[msgspec.Struct]) -> str:
+    """How fields are written, and whether what a later build adds is read past."""
+    config = struct.__struct_config__
+    return ("list" if config.array_like else "map") + (", no other fields" if config.forbid_unknown_fields else "")
+
+
+def _enumerations(structs: Iterable[type[msgspec.Struct]]) -> list[type[enum.Enum]]:
+    """Those whose members are written, each once, in the order of the fields."""
+    found: dict[type[enum.Enum], None] = {}
+    for struct in structs:
+        hints: list[Any] = list(typing.get_type_hints(struct, include_extras=True).values())
+        for hint in hints:  # grows
+            hints.extend(typing.get_args(hint))
+            if isinstance(hint, type) and issubclass(hint, enum.Enum):
+                found[hint] = None
+    return list(found)
 
 
 def _fields(struct: type[msgspec.Struct]) -> list[list[str]]:
@@ -109,6 +131,14 @@ def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator
         yield f"{name} is written in version {now['writes']}, which the build before does not read"
     if max(now["reads"]) == max(before["reads"]):
         yield from _broken_fields(name, before["structs"], now["structs"])
+        for what in ("layouts", "values"):
+            for part, was in before.get(what, {}).items():
+                is_now = now[what].get(part)
+                if is_now != was and (what == "values" or is_now is not None):
+                    yield (
+                        f"{part} was {json.dumps(was)} and is {json.dumps(is_now)}: {name} needs a step to its "
+                        "next version (swarm/wire/versions.py)"
+                    )
     elif name in NEVER_STEP:
         yield f"{name} has taken a step: it never does"
     elif not moved:

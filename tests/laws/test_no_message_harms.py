@@ -12,6 +12,7 @@ import rerun as rr
 from support.effort import few
 from support.liar import Liar, asked, published
 from support.swarm_model import SwarmModel
+from support.wire_strategies import types_of_the_wire
 
 from launch_scripts.chaos.lies import NAMES, ROLES, Lies
 from launch_scripts.launcher.router import RouterService
@@ -32,7 +33,6 @@ from swarm.liveness import Peer
 from swarm.wire.authentication import Authenticator
 from swarm.wire.codec import decode
 from swarm.wire.fields import unbounded
-from swarm.wire.messages.base import Message
 from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
@@ -275,7 +275,7 @@ def lied_to(run: str, state: str, seed: int, steps: int, altered: bool) -> Lied:
 
 
 def test_no_field_of_any_message_is_without_bounds() -> None:
-    assert [lack for kind in Message.__subclasses__() for lack in unbounded(kind)] == []
+    assert [lack for kind in types_of_the_wire() for lack in unbounded(kind)] == []
 
 
 def test_the_whole_run_searches_pulls_and_flies_and_lies_reach_classes_and_what_is_learned() -> None:

@@ -453,3 +453,8 @@ EXAMPLES: tuple[Message, ...] = (
     Beat(role="planner", id="t0.r1", incarnation=7, ready=True, leads=False),
     Note(role="agent", id="a0", stamp_ns=10, kind="closure", text="road closed", cell=9),
 )  # fmt: skip
+
+
+def types_of_the_wire() -> list[type[Message]]:
+    """All types of messages but those that tests make for themselves, which share a process with other tests."""
+    return [kind for kind in Message.__subclasses__() if kind.__module__.startswith("swarm.")]

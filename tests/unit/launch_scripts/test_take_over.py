@@ -18,7 +18,7 @@ from support.effort import few
 from launch_scripts.launcher import take_over
 from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.machine_signals import MachineSignals
-from launch_scripts.launcher.run_processes import holding
+from launch_scripts.launcher.run_processes import writing
 from launch_scripts.launcher.take_over import TakeOver
 from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.process_table import ProcessSpec
@@ -45,9 +45,15 @@ class Machine:
         self.asked: list[tuple[int, int]] = []
         self.said: list[str] = []
         self.now_s = 50.0
-        patch.setattr(take_over, "processes", lambda _: dict(PREDECESSORS))
+        self.predecessors = dict(PREDECESSORS)
+        """Name -> pid of the newest life that the launcher before has started."""
+        patch.setattr(
+            take_over,
+            "processes",
+            lambda *_: {name: pid for name, pid in self.predecessors.items() if pid in self.alive},
+        )
         patch.setattr(take_over, "has_ended", lambda pid: pid not in self.alive)
-        patch.setattr(take_over, "holding", lambda _: [LAUNCHER, os.getpid()])
+        patch.setattr(take_over, "writing", lambda _: [LAUNCHER, os.getpid()])
         patch.setattr(take_over.os, "kill", lambda pid, number: self.asked.append((pid, number)))
         self.running = [
             Running(ProcessSpec(role, id, "m:f")) for role, _, id in (name.partition("-") for name in PREDECESSORS)
@@ -89,6 +95,12 @@ class Machine:
             case "one ends":
                 if self.asked and len(self.alive) > 1:
                     self.alive.remove(min(self.alive))
+            case "keeper crashes":
+                self.alive.discard(self.predecessors["keeper-0"])
+            case "keeper starts again":
+                if not self.asked and self.predecessors["keeper-0"] not in self.alive:
+                    self.predecessors["keeper-0"] += 10
+                    self.alive.add(self.predecessors["keeper-0"])
         self.turn()
 
 
@@ -100,6 +112,8 @@ EVENTS = (
     "agent waits",
     "ten seconds pass",
     "one ends",
+    "keeper crashes",
+    "keeper starts again",
 )
 
 
@@ -123,7 +137,8 @@ def test_nobody_is_asked_before_successors_are_ready_and_no_two_lives_write_one_
             assert machine.asked in ([], [(LAUNCHER, signal.SIGTERM)])
             for each in machine.running:
                 if each.spec.role not in ("planner", "agent") and each.process is not None:
-                    assert PREDECESSORS[each.spec.name] not in machine.alive
+                    assert machine.asked, "until then the launcher before starts it again"
+                    assert machine.predecessors[each.spec.name] not in machine.alive
 
 
 def test_all_are_followed_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,33 +160,81 @@ def test_a_planner_that_never_has_a_tree_holds_nothing_up_for_ever(monkeypatch: 
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
 
 
+def test_who_crashed_before_is_begun_once_the_launcher_before_starts_it_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine = Machine(monkeypatch)
+    for what in ("keeper crashes", "t0 answers", "t1 answers", "agent waits"):
+        machine.happens(what)
+        assert not machine.one("keeper-0").alive
+    for _ in range(6):
+        assert not machine.one("keeper-0").alive
+        machine.happens("one ends")
+    machine.alive.discard(LAUNCHER)
+    machine.turn()
+    assert machine.one("keeper-0").alive
+
+
+def test_an_agent_whose_life_before_crashed_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Machine(monkeypatch)
+    for what in ("t0 answers", "t1 answers"):
+        machine.happens(what)
+    machine.says("agent-a0", lambda health: health.turned([]))
+    machine.turn()
+    assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
+
+
+def test_a_launcher_that_was_killed_is_followed_and_nobody_is_sent_a_signal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine = Machine(monkeypatch)
+    machine.alive = {PREDECESSORS["router-0"]}  # it has not noticed yet
+    machine.turn()
+    assert machine.asked == []
+    assert machine.said == ["the launcher before has ended by itself"]
+    assert machine.one("keeper-0").alive
+    assert not machine.one("router-0").alive
+    machine.alive.clear()
+    machine.turn()
+    assert machine.one("router-0").alive
+
+
+def test_of_two_that_take_over_at_once_the_later_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(take_over, "writing", lambda _: [os.getpid(), LAUNCHER, 101])
+    with pytest.raises(ConfigError, match=r"2 launchers run in .*, pids 100, 101: wait until one has taken over"):
+        TakeOver(tmp_path, [], [], print)
+
+
 def test_where_there_is_nobody_to_follow_or_a_role_would_be_lost_it_is_refused_in_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match=r"--take-over: no launcher of this user runs in .*; start without it"):
         TakeOver(tmp_path, [], [], print)
-    monkeypatch.setattr(take_over, "holding", lambda _: [LAUNCHER])
-    monkeypatch.setattr(take_over, "processes", lambda _: {"agent-a0": 6, "agent-a1": 7, "planner-added": 2})
+    monkeypatch.setattr(take_over, "writing", lambda _: [LAUNCHER])
+    monkeypatch.setattr(take_over, "processes", lambda *_: {"agent-a0": 6, "agent-a1": 7, "planner-added": 2})
     part = [Running(ProcessSpec("agent", "a0", "m:f"))]
     with pytest.raises(ConfigError, match="runs agent-a1 too, which this one would end and not start again"):
         TakeOver(tmp_path, part, ["t0"], print)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_who_has_a_file_open_is_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", ["a", "r"])
+def test_who_writes_a_file_is_found_and_who_reads_it_is_not(tmp_path: Path, mode: str) -> None:
     path = tmp_path.resolve() / "launcher.log"
-    assert holding(path) == []
+    assert writing(path) == []
     with path.open("w"):
-        assert holding(path) == [os.getpid()]
-        code = "import sys; file = open(sys.argv[1]); print(flush=True); sys.stdin.read()"
+        assert writing(path) == [os.getpid()]
+        code = "import sys; file = open(sys.argv[1], sys.argv[2]); print(flush=True); sys.stdin.read()"
         with subprocess.Popen(
-            [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [sys.executable, "-c", code, str(path), mode], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         ) as other:
             assert other.stdout is not None
             other.stdout.readline()
-            assert sorted(holding(path)) == sorted([os.getpid(), other.pid])
+            assert sorted(writing(path)) == sorted([os.getpid(), *([other.pid] if mode == "a" else [])])
             other.communicate()
-    assert holding(path) == []
+    assert writing(path) == []
 
 
 @pytest.mark.network

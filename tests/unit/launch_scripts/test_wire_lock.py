@@ -73,6 +73,17 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "a step that forgets the version before": (
         lambda now: stepped(now, reads=(9,)), "fleet of version 8, which the build before writes, is no longer",
     ),
+    "a part is written in another way": (
+        lambda now: now["messages"]["standing"]["layouts"].update(Stand="map"),
+        'Stand was "list" and is "map": standing',
+    ),
+    "what is added later is refused from now on": (
+        lambda now: now["messages"]["fleet"]["layouts"].update(Fleet="map, no other fields"), "Fleet was",
+    ),
+    "an enumeration gets one more value": (
+        lambda now: now["messages"]["pushed-route"]["values"]["RouteStatus"].append("lost"),
+        r"RouteStatus was .*: pushed-route needs",
+    ),
     "what introduces a build takes a step": (lambda now: stepped(now, "run"), "run has taken a step: it never"),
 }  # fmt: skip
 
