@@ -24,6 +24,7 @@ from swarm.errors import ConfigError
 MOST_TRIALS = 1_000_000
 _LONGEST = 200
 """Letters of a name: pictures are called by it."""
+_LONGEST_PATH = 4096
 STUDIES = Path(__file__).parents[1] / "studies"
 """The project's own."""
 
@@ -157,12 +158,11 @@ def _check(study: Study) -> None:
     for what, given in (("scenarios", study.scenarios), ("outcomes", study.outcomes)):
         if (same := _twice(given)) is not None:
             raise ConfigError(f"{what}: found {shown(same[0])} twice")
-    for what, names in (
-        ("scenarios", study.scenarios), ("outcomes", study.outcomes), ("variants", study.variants)
-    ):  # fmt: skip
+    for what, names in (("scenarios", study.scenarios), ("outcomes", study.outcomes), ("variants", study.variants)):
+        longest = _LONGEST_PATH if what == "scenarios" else _LONGEST
         for name in names:
-            if not name.isprintable() or not 0 < len(name) <= _LONGEST:
-                raise ConfigError(f"{what}: found {shown(name)}, expected 1 to {_LONGEST} characters that print")
+            if not name.isprintable() or not 0 < len(name) <= longest:
+                raise ConfigError(f"{what}: found {shown(name)}, expected 1 to {longest} characters that print")
     if not study.about.replace("\n", "").isprintable():
         raise ConfigError(f"about: found {shown(study.about)}, expected printable text")
     varied = dict(flat(study.parameters))
