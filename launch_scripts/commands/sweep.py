@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from launch_scripts.sweep.trial import Result, Trial
 
 
-_SCHEDULER = r"[a-z]+://[^\s/:]+:[0-9]{1,5}"
+_SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
 _EXAMPLE = "tcp://127.0.0.1:8786"
 
 
@@ -37,7 +37,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     from launch_scripts.sweep.study import study_path
 
     sweep = Sweep(study_path(name), out)
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
     kept = sweep.trials - len(sweep.missing)
     if kept:
         console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
@@ -60,7 +60,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
 
 def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None) -> None:
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
@@ -75,11 +75,11 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None) ->
             nonlocal failed
             failed += bool(result is not None and result.broken)
             for law in result.broken[:1] if result is not None else ():
-                console.print(f"{trial.world} seed {trial.seed} broke a law: {law}", markup=False)
+                console.print(f"{trial.world} seed {trial.seed} broke a law: {law}")
             if result is None:
                 console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
             while sweep.warned:
-                console.print(sweep.warned.pop(0), markup=False)
+                console.print(sweep.warned.pop(0))
             bar.update(task, advance=1, failed=failed)
 
         sweep.run(workers, scheduler, told)
@@ -90,7 +90,7 @@ def _print(summary: Summary, folder: Path) -> None:
     from launch_scripts.sweep.page import between, number
     from launch_scripts.sweep.run import PAGE, RESULTS
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False, emoji=False)
     several = len({case.scenario for case in summary.cases}) > 1
     for name in summary.cases[0].outcomes:
         shown = table(name, "<case", "n", "mean", "95 %", "to the first", "95 %")
@@ -106,7 +106,7 @@ def _print(summary: Summary, folder: Path) -> None:
             )
         console.print(shown)
     for failure in summary.failing[:20]:
-        console.print(f"failed: {failure.replay}", soft_wrap=True, markup=False)
+        console.print(f"failed: {failure.replay}", soft_wrap=True)
     missing = f"; {summary.missing:,} have no result" if summary.missing else ""
     console.print(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
     console.print(f"summary: {folder / PAGE}, results: {folder / RESULTS}", soft_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,9 +19,15 @@ from swarm.config.values import Section
 from swarm.errors import ConfigError
 from swarm.ranks import HIGHEST_RANK
 
-HostName = Annotated[str, Meta(pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?$")]
+HostName = Annotated[
+    str,
+    Meta(
+        pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?\Z", description="of 32 small letters, digits and '-' at most"
+    ),
+]
 """A label of DNS, so that it can be part of a host's name, a unit's and a certificate's."""
 HostRole = Literal["router", "keeper", "monitor", "planner", "targets", "agent"]
+_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 HOST_ROLES: tuple[HostRole, ...] = ("router", "keeper", "monitor", "planner", "targets", "agent")
 
 
@@ -34,8 +41,8 @@ class HostConfig(Section, frozen=True, kw_only=True):
     """
 
     name: HostName
-    address: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_.:-]{1,253}$")]
-    cores: Annotated[float, Meta(gt=0, le=4096)] = 1.0
+    address: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_.:-]{1,253}\Z", description="a name or an address")]
+    cores: Annotated[float, Meta(ge=0.01, le=4096)] = 1.0
     roles: Annotated[tuple[HostRole, ...], Meta(min_length=1)] = HOST_ROLES
 
     def endpoint(self, port: int) -> str:
@@ -82,22 +89,39 @@ def parse_hosts(text: str, source: str = "hosts") -> HostsConfig:
 
 def _faults(config: HostsConfig) -> Iterator[str]:
     """Where machines that are valid each do not fit together."""
-    for key in ("name", "address"):
-        found, times = Counter(getattr(host, key) for host in config.hosts).most_common(1)[0]
+    for key, of in (("name", lambda host: host.name), ("address", lambda host: _plain(host.address))):
+        found, times = Counter(map(of, config.hosts)).most_common(1)[0]
         if times > 1:
             yield f"hosts: found {times} machines of {key} {found!r}, expected one"
     for n, host in enumerate(config.hosts):
         where = f"hosts[{n}].address"
-        if ":" in host.address and not _is_address(host.address):
+        if ":" in host.address and _ip(host.address) is None:
             yield f"{where}: found {host.address!r}, expected a name or an address; the port is `port`, for all"
+        if not _can_be_reached(host.address):
+            yield f"{where}: found {host.address!r}, expected a name or an address under which others reach it"
         check_endpoint(host.endpoint(config.port), True, where)
         if len(config.hosts) > 1 and is_loopback(host.address):
             yield f"{where}: found {host.address!r}, which is another machine to each; expected an address for all"
+        if len(set(host.roles)) < len(host.roles):
+            yield f"hosts[{n}].roles: found a role twice, expected each once"
 
 
-def _is_address(text: str) -> bool:
+def _can_be_reached(address: str) -> bool:
+    """Whether it is one machine's address, or what can be a name of DNS: its last label is no number."""
+    ip = _ip(address)
+    if ip is None:
+        labels = address.split(".")
+        return all(map(_LABEL.fullmatch, labels)) and not labels[-1].isdigit()
+    return not (ip.is_unspecified or ip.is_multicast or str(ip) == "255.255.255.255")
+
+
+def _plain(address: str) -> str:
+    """An address as all of its spellings are."""
+    return str(_ip(address) or address.lower())
+
+
+def _ip(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        ipaddress.ip_address(text)
+        return ipaddress.ip_address(text)
     except ValueError:
-        return False
-    return True
+        return None

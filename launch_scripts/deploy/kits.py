@@ -31,6 +31,13 @@ Render = Callable[[Plan, PlannedHost], Mapping[str, str]]
 """Name -> text of the files that start a machine's processes. Names without an ending are scripts."""
 _PRIVATE, _OPEN, _SCRIPT = 0o600, 0o644, 0o755
 PLAN = "plan.json"
+CONTENTS = "contents"
+"""The file that names all others of an archive, a line each."""
+FORGET = f"""\
+# What an earlier archive has left in this folder goes: another plan has other keys, ground and plug-ins.
+find certs ground plugins wheels -type f ! -name revoked 2>/dev/null | while IFS= read -r path; do
+    grep -qxF -e "$path" {CONTENTS} || rm -f -- "$path"
+done"""
 
 
 class _ProcessBefore(msgspec.Struct):
@@ -166,9 +173,10 @@ def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str,
     path = _archive_of(out, name)
     try:
         with private_file(path) as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
-            for place, text in texts.items():
+            places = [*texts, *(place for place, _ in with_parts(files))]
+            for place, text in {**texts, CONTENTS: "".join(f"{place}\n" for place in places)}.items():
                 data = text.encode()
-                mode = _SCRIPT if "." not in Path(place).name and "/" not in place else _OPEN
+                mode = _SCRIPT if "." not in place and "/" not in place and place != CONTENTS else _OPEN
                 archive.addfile(_entry(name, place, len(data), mode), io.BytesIO(data))
             for place, source in with_parts(files):
                 with source.open("rb") as content:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import shlex
 
+from launch_scripts.deploy.kits import FORGET
 from launch_scripts.deploy.plan import Plan, PlannedHost
 
 UNIT = "swarm.service"
@@ -32,7 +33,7 @@ ExecStart={command}
 User=swarm
 Group=swarm
 WorkingDirectory={home}
-Restart=always
+Restart=on-failure
 RestartSec=1
 # It is up once its processes are started, and may wait for other machines before that.
 TimeoutStartSec=infinity
@@ -102,6 +103,7 @@ set -eu
 cd "$(dirname "$0")"
 root=${{DESTDIR:-}}
 fail() {{ echo "install: $*" >&2; exit 1; }}
+{forget}
 [ -n "$root" ] || [ "$(id -u)" = 0 ] || fail "expected root, found $(id -un); use sudo"
 
 if [ -z "$root" ]; then
@@ -111,7 +113,9 @@ if [ -z "$root" ]; then
     fi
     if [ -f "$(echo wheels/*.whl)" ]; then
         [ -x /opt/swarm/bin/python ] || python3 -m venv /opt/swarm
-        /opt/swarm/bin/python -m pip install --quiet --disable-pip-version-check "$(echo wheels/*.whl)[all]"
+        pip="/opt/swarm/bin/python -m pip install --quiet --disable-pip-version-check"
+        $pip "$(echo wheels/*.whl)[all]"
+        $pip --force-reinstall --no-deps "$(echo wheels/*.whl)" # it may have the version of the one before
     elif [ ! -x {program} ]; then
         found=$(command -v swarm) || fail "there is no program swarm: plan with --wheel, or make a venv /opt/swarm"
         case $found in
@@ -183,6 +187,6 @@ def systemd_files(plan: Plan, host: PlannedHost) -> dict[str, str]:
     without an ending."""
     return {
         UNIT: unit_text(plan, host),
-        "install": _INSTALL.format(home=_HOME, program=_PROGRAM, unit=UNIT, host=host.name),
+        "install": _INSTALL.format(forget=FORGET, home=_HOME, program=_PROGRAM, unit=UNIT, host=host.name),
         "run": _RUN.format(arguments=shlex.join(up_arguments(plan, host, "scenario.toml"))),
     }

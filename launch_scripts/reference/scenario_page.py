@@ -80,8 +80,13 @@ def schema(root: Section = Scenario) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value with whole numbers as such. `typing` keeps one of two bounds that are equal, 10000 and 1e4, by
-    which module is imported first."""
+    """The value with whole numbers as such, and with patterns as JSON Schema writes them.
+
+    `typing` keeps one of two bounds that are equal, 10000 and 1e4, by which module is imported first. The end of a
+    text is `$` in JSON Schema, which matches before no line end there.
+    """
+    if isinstance(value, str):
+        return value[:-2] + "$" if value.endswith(r"\Z") else value
     if isinstance(value, dict):
         return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, list):

@@ -24,8 +24,8 @@ ROS_ENDPOINT = "tcp/127.0.0.1:7447"
 MOST_HZ = 100.0
 
 DistributionName = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
-NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}$")]
-FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,79}(?<!/)$")]
+NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}\Z")]
+FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,79}(?<!/)\Z")]
 Rate = Annotated[float, Meta(ge=0, le=MOST_HZ)]
 
 

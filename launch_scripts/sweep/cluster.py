@@ -75,7 +75,7 @@ def client_of(address: str) -> Iterator[Client]:
     """A cluster that is there. Raises BusError where no scheduler answers."""
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # also bytes that are not its protocol, and TLS without a certificate
         raise BusError(f"--scheduler {address}: no scheduler of Dask answers within {_CONNECT_S:g} s") from error
     with client:
         yield client

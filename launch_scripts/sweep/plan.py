@@ -15,7 +15,7 @@ from launch_scripts.simulation.campaign import MIX, world_of
 from launch_scripts.simulation.trial import SECONDS
 from launch_scripts.simulation.worlds import WORLDS
 from launch_scripts.sweep.code_version import code_version
-from launch_scripts.sweep.study import Case, Study, cases_of
+from launch_scripts.sweep.study import Case, Study, cases_of, is_file
 from launch_scripts.sweep.trial import Trial
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.load import parse_scenario
@@ -74,7 +74,7 @@ def _planned(study: Study, case: Case, base: Path, source: str) -> PlannedCase:
 def _scenario(case: Case, base: Path, source: str) -> tuple[str, Scenario]:
     """Path or name of a case's scenario, and the scenario. One beside the study goes before a built-in one."""
     beside = base / case.scenario
-    path = beside if beside.is_file() else scenario_path(case.scenario)
+    path = beside if is_file(beside) else scenario_path(case.scenario)
     name = case.scenario if path.parent == SCENARIOS else str(path)
     where = f"{source}: {name} with {case.label}" if case.settings else name
     text = read_text(path, FileKind.SCENARIO)

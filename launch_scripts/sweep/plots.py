@@ -39,7 +39,7 @@ def draw(cases: Sequence[CaseSummary], outcome: str) -> bytes:
     several = len({case.scenario for case in cases}) > 1
     labels = [f"{case.scenario}: {case.label}" if several else case.label for case in cases]
     chance = np.random.default_rng(0)
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context({**STYLE, "text.parse_math": False}):  # names may hold a $
         figure = Figure(figsize=(8.0, 1.3 + 0.42 * len(cases)), dpi=_DPI, facecolor="white", layout="constrained")
         axes = figure.subplots()
         for row, case in enumerate(cases):

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from launch_scripts.report.files import write_file
-from launch_scripts.simulation.trial import BrokenLaw
 from launch_scripts.sweep.trial import Result
 from swarm.errors import StoreError
 
@@ -104,19 +104,17 @@ def _read(path: Path) -> list[Result]:
         return [_result(row) for row in rows]
     except FileNotFoundError:  # another sweep of the same folder has put parts together
         return []
-    except (pa.ArrowException, KeyError, TypeError, ValueError) as error:
+    except (pa.ArrowException, msgspec.MsgspecError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise StoreError(f"{path} is damaged; remove it, and its trials are simulated again") from error
 
 
 def _result(row: Mapping[str, Any]) -> Result:
-    return Result(
-        key=row["key"],
-        figures={
-            name.removeprefix(FIGURE): value
-            for name, value in row.items()
-            if name.startswith(FIGURE) and value is not None
-        },
-        broken=[BrokenLaw(law, sentence, at_s) for law, sentence, at_s in json.loads(row["broken"])],
-        wall_s=row["wall_s"],
-        cpu_s=row["cpu_s"],
-    )
+    figures = {
+        name.removeprefix(FIGURE): value
+        for name, value in row.items()
+        if name.startswith(FIGURE) and value is not None
+    }
+    laws = msgspec.convert(json.loads(row["broken"]), list[tuple[str, str, float | None]])
+    broken = [{"law": law, "sentence": sentence, "at_s": at_s} for law, sentence, at_s in laws]
+    times = {name: row[name] for name in ("wall_s", "cpu_s")}
+    return msgspec.convert({"key": row["key"], "figures": figures, "broken": broken, **times}, Result)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +22,9 @@ from swarm.config.values import Name, Options, Positive, Section
 from swarm.errors import ConfigError
 
 MOST_TRIALS = 1_000_000
+_LONGEST = 200
+"""Letters of a name: pictures are called by it."""
+_LONGEST_PATH = 4096
 STUDIES = Path(__file__).parents[1] / "studies"
 """The project's own."""
 
@@ -72,7 +77,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 def study_path(name: str) -> Path:
     """The file of a study of the project by its name, or the one named. Raises ConfigError where there is none."""
     built_in = STUDIES / f"{name}.toml"
-    if "/" in name or Path(name).is_file() or not built_in.is_file():
+    if "/" in name or is_file(Path(name)) or not is_file(built_in):
         if not name.endswith(".toml"):
             names = study_names()
             raise ConfigError(f"no study {shown(name)}{choice(name, names, ' give a .toml file or one of: ')}")
@@ -87,7 +92,19 @@ def study_names() -> list[str]:
 
 def load_study(path: Path) -> Study:
     """Read and check a study. Raises ConfigError that names the file and the key."""
-    return parse_study(read_text(path, FileKind.STUDY), str(path), path.stem)
+    return parse_study(read_text(path, FileKind.STUDY), str(path), _name_of(path))
+
+
+def _name_of(path: Path) -> str:
+    """A name as studies have them, from that of a file."""
+    return re.sub("[^A-Za-z0-9_.-]+", "-", path.stem).lstrip(".-")[:41] or "study"
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; no file has a name that the system refuses."""
+    with suppress(OSError, ValueError):
+        return path.is_file()
+    return False
 
 
 def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
@@ -133,16 +150,21 @@ def _check(study: Study) -> None:
     for key, values in flat(study.parameters):
         if not isinstance(values, list) or not values:
             raise ConfigError(f"parameters.{key}: found {shown(values)}, expected a list of values")
-        for first, second in itertools.combinations(values, 2):
-            if _same(first, second):
-                raise ConfigError(f"parameters.{key}: found {shown(first)} twice")
+        if (twice := _twice(values)) is not None:
+            raise ConfigError(f"parameters.{key}: found {shown(twice[0])} twice")
         count *= len(values)
     if count > MOST_TRIALS:
         raise ConfigError(f"it has {count:,} trials, expected at most {MOST_TRIALS:,}")
     for what, given in (("scenarios", study.scenarios), ("outcomes", study.outcomes)):
-        for name in given:
-            if given.count(name) > 1:
-                raise ConfigError(f"{what}: found {name!r} twice")
+        if (same := _twice(given)) is not None:
+            raise ConfigError(f"{what}: found {shown(same[0])} twice")
+    for what, names in (("scenarios", study.scenarios), ("outcomes", study.outcomes), ("variants", study.variants)):
+        longest = _LONGEST_PATH if what == "scenarios" else _LONGEST
+        for name in names:
+            if not name.isprintable() or not 0 < len(name) <= longest:
+                raise ConfigError(f"{what}: found {shown(name)}, expected 1 to {longest} characters that print")
+    if not study.about.replace("\n", "").isprintable():
+        raise ConfigError(f"about: found {shown(study.about)}, expected printable text")
     varied = dict(flat(study.parameters))
     for name, settings in study.variants.items():
         for key, _ in flat(settings):
@@ -153,15 +175,27 @@ def _check(study: Study) -> None:
             raise ConfigError(f"scenarios: {name!r} is a small world, which goes with faults = true")
         if varied or any(study.variants.values()):
             raise ConfigError(f"scenarios: {name!r} is a small world, which takes no parameters and no variants")
+    settled = {key for settings in study.variants.values() for key, _ in flat(settings)} | varied.keys()
+    if "seed" in settled:
+        raise ConfigError("seed: it is no setting of a study, whose `seeds` are those of each case")
+    if "seconds" in settled and (study.faults or study.seconds is not None):
+        raise ConfigError(
+            "seconds: it does nothing where `faults` or `seconds` of the study say how long trials are"
+        )
 
 
 def _worlds(study: Study) -> Iterator[str]:
     return (name for name in study.scenarios if name in (MIX, *WORLDS))
 
 
-def _same(first: object, second: object) -> bool:
-    """1 and true are not the same in TOML."""
-    return type(first) is type(second) and first == second
+def _twice(values: Iterable[Any]) -> tuple[Any] | None:
+    """A value that is there twice. 1, 1.0 and true are three in TOML, as they are written."""
+    seen: set[str] = set()
+    for value in values:
+        if (written := repr(value)) in seen:
+            return (value,)
+        seen.add(written)
+    return None
 
 
 def _short_names(keys: Iterable[str]) -> dict[str, str]:
@@ -174,6 +208,6 @@ def _short_names(keys: Iterable[str]) -> dict[str, str]:
 def _label(variant: str, varied: Mapping[str, Any]) -> str:
     parts = [variant] if variant else []
     for name, value in varied.items():
-        text = value if isinstance(value, str) else shown(value)
+        text = value if isinstance(value, str) and value.isprintable() else shown(value)
         parts.append(f"{name} = {text if len(text) <= 40 else f'{text[:37]}...'}")
     return ", ".join(parts) or "as it is"

@@ -66,6 +66,8 @@ def expected(hint: Any) -> str:
 
 def _bounds(meta: msgspec.Meta) -> list[str]:
     low, high = _limit(meta.ge), _limit(meta.le)
+    if meta.description is not None:
+        return [meta.description]
     if meta.pattern is not None:
         return ["digits"] if meta.pattern.startswith("^[0-9]{") else ["of letters, digits, '_', '.' and '-'"]
     if meta.min_length is not None:

@@ -13,10 +13,10 @@ Positive = Annotated[float, Meta(gt=0, le=1e12)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Standbys = Annotated[int, Meta(ge=0, le=HIGHEST_RANK)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
-GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
-ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
-CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?$")]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}\Z")]
+GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})\Z")]
+ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}\Z")]
+CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?\Z")]
 Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
 Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
@@ -53,7 +53,7 @@ def plugin_name(built_in: Any = None) -> Meta:
     """Names of one kind: those that are built in, and those of plug-ins (`swarm.config.plugin_names`)."""
     names = list(get_args(built_in))
     return Meta(
-        pattern=r"^[\w.+-]{1,100}(:[\w.]{1,100})?$",
+        pattern=r"^[\w.+-]{1,100}(:[\w.]{1,100})?\Z",
         extra={"built_in": names},
         extra_json_schema={"examples": [*names, "module:Name"]},
     )
@@ -69,7 +69,7 @@ ClassName = Literal[
 CoverGround = Literal[ClassName, "lethal"] | Positive
 """What a code of a land-cover map stands for: a class, or a pace relative to open ground."""
 
-CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
+CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}\Z")]
 
 ElevationEncoding = Literal["metres", "terrain-rgb", "terrarium"]
 

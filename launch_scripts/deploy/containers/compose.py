@@ -28,7 +28,7 @@ from launch_scripts.deploy.containers.container import (
     yaml_text,
 )
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, PLUGINS, host_scenario, plugin_files
-from launch_scripts.deploy.kits import router_name
+from launch_scripts.deploy.kits import FORGET, router_name
 from launch_scripts.deploy.plan import Plan, PlannedHost
 from swarm.config.write import scenario_text
 
@@ -45,6 +45,7 @@ _INSTALL = """\
 # COMPOSE names another program than docker compose, such as podman-compose.
 set -eu
 cd "$(dirname "$0")"
+{forget}
 # Keys are read by the user of the containers, and by nobody else.
 chown {user}:{user} certs/*.key
 chmod 400 certs/*.key
@@ -64,7 +65,7 @@ def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Seque
     return {
         COMPOSE_FILE: yaml_text([_compose(plan, host, image)], about),
         SCENARIO_FILE: scenario_text(scenario, Path()),
-        "install": _INSTALL.format(user=USER),
+        "install": _INSTALL.format(forget=FORGET, user=USER),
     }
 
 

@@ -17,10 +17,10 @@ from swarm.wire.messages.planning import GROUND
 ROBOT, TARGET = "{robot}", "{target}"
 MOST_HZ = 50.0
 
-RosName = Annotated[str, Meta(pattern=r"^[a-zA-Z][a-zA-Z0-9_]{0,60}$")]
+RosName = Annotated[str, Meta(pattern=r"^[a-zA-Z][a-zA-Z0-9_]{0,60}\Z")]
 Topic = Annotated[str, Meta(min_length=1, max_length=200)]
 _TOPIC = re.compile(r"(?:/[a-zA-Z_][a-zA-Z0-9_]*)+")
-Frame = Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/{}-]{0,200}$")]
+Frame = Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/{}-]{0,200}\Z")]
 PoseType = Literal["odometry", "pose", "pose_with_covariance"]
 POSE_TYPES: dict[PoseType, str] = {
     "odometry": "nav_msgs/msg/Odometry",

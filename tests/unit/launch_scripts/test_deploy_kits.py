@@ -212,6 +212,10 @@ def test_install_puts_files_where_the_unit_looks_for_them_and_takes_over_a_new_p
     for _ in range(2):
         folder = unpacked(plan, tmp_path)[0]
         home = root / "etc/swarm"
+        # Unpacked over the archive of an earlier plan.
+        for left in ("certs/planner.old.key", "plugins/old.py", "wheels/old.whl"):
+            (folder / left).parent.mkdir(exist_ok=True)
+            (folder / left).write_text("of an earlier plan")
         if home.exists():
             (home / "certs" / "agent.all.old.key").write_text("of an earlier plan")
             (home / "certs" / "revoked").write_text("agent.all.a9\n")
@@ -221,6 +225,9 @@ def test_install_puts_files_where_the_unit_looks_for_them_and_takes_over_a_new_p
         )  # fmt: skip
         assert (done.returncode, done.stderr) == (0, "")
         revoke(tmp_path / "certs", ["agent.all.a3"])
+    names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert names == {*(folder / "contents").read_text().split(), "contents"}
+    assert not list((home / "plugins").glob("*"))
     assert {path.name for path in (home / "certs").iterdir()} == {
         *(path.name for path in (folder / "certs").iterdir()), "revoked",
     }  # fmt: skip
@@ -260,7 +267,7 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
 def test_systemd_finds_a_fault_that_is_made(tmp_path: Path) -> None:
     """So that the test above can fail."""
     plan = planned()
-    text = unit_text(plan, plan.hosts[0]).replace("Restart=always", "Restart=sometimes")
+    text = unit_text(plan, plan.hosts[0]).replace("Restart=on-failure", "Restart=sometimes")
     if shutil.which("systemd-analyze") is None:
         pytest.skip("there is no systemd-analyze (package systemd)")
     path = tmp_path / UNIT

@@ -23,6 +23,15 @@ THREE = "".join(f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (
         ('[[hosts]]\nname = "a"\naddress = "a"\nroles = []', "hosts[0].roles"),
         ('[[hosts]]\nname = "a"\naddress = "a"\ncores = 0', "hosts[0].cores"),
         ('[[hosts]]\nname = "a"\naddress = "10.0.0.1:7447"', "the port is `port`, for all"),
+        ('[[hosts]]\nname = "A"\naddress = "a"', "of 32 small letters, digits and '-' at most"),
+        ('[[hosts]]\nname = "a\\n"\naddress = "a"', "hosts[0].name"),
+        ('[[hosts]]\nname = "a"\naddress = "a\\n"', "hosts[0].address"),
+        ('[[hosts]]\nname = "a"\naddress = "a"\nroles = ["router", "router"]', "found a role twice"),
+        ('[[hosts]]\nname = "a"\naddress = "A"\n[[hosts]]\nname = "b"\naddress = "a"', "2 machines of address 'a'"),
+        (
+            '[[hosts]]\nname = "a"\naddress = "fd00::1"\n[[hosts]]\nname = "b"\naddress = "fd00:0::1"',
+            "2 machines of address 'fd00::1'",
+        ),
         ('[[hosts]]\nname = "a"\naddress = "a"\n[[hosts]]\nname = "a"\naddress = "b"', "2 machines of name 'a'"),
         ('[[hosts]]\nname = "a"\naddress = "a"\n[[hosts]]\nname = "b"\naddress = "a"', "2 machines of address 'a'"),
         ('[[hosts]]\nname = "a"\naddress = "127.0.0.1"\n[[hosts]]\nname = "b"\naddress = "b"', "hosts[0].address"),
@@ -60,3 +69,23 @@ def test_an_address_of_version_6_is_written_in_brackets() -> None:
     plan = make_plan(Scenario(), parse_hosts('[[hosts]]\nname = "a"\naddress = "fd00::1"\n' + THREE), "run")
     assert "tls/[fd00::1]:7447" in plan.hosts[1].connect
     assert plan.hosts[0].listen == ("tls/[::]:7447",)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "0.0.0.0",
+        "::",
+        "224.0.0.1",
+        "255.255.255.255",
+        "...",
+        "-oProxy",
+        "10.0.0.300",
+        "010.0.0.1",
+        "a" * 64,
+        "a..b",
+    ],
+)
+def test_an_address_that_nobody_can_reach_is_refused(address: str) -> None:
+    with pytest.raises(ConfigError, match="under which others reach it"):
+        parse_hosts(f'[[hosts]]\nname = "a"\naddress = "{address}"')

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import msgspec
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -136,6 +137,37 @@ def test_a_study_that_cannot_be_is_refused_with_the_key_and_what_was_expected(te
         parse_study(text, "s.toml")
     assert str(error.value).startswith("s.toml: ")
     assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('outcomes = ["a", "a"]', "outcomes: found 'a' twice"),
+        ('outcomes = [""]', "outcomes: found ''"),
+        (f'outcomes = ["{"x" * 300}"]', "expected 1 to 200 characters that print"),
+        ('about = "\\u001b[31mred"', "about: found"),
+        ('[variants."\\u001b[31mred"]', "variants: found"),
+        ("[parameters]\nseed = [1, 2]", "seed: it is no setting of a study"),
+        ("seconds = 3\n[parameters]\nseconds = [1, 2]", "seconds: it does nothing where"),
+        ("faults = true\n[variants.a]\nseconds = 2", "seconds: it does nothing where"),
+    ],
+)
+def test_names_that_do_not_print_and_settings_that_do_nothing_are_refused(text, said):
+    with pytest.raises(ConfigError) as error:
+        parse_study(f'scenarios = ["a"]\n{text}', "s.toml")
+    assert said in str(error.value)
+
+
+def test_many_values_are_compared_in_no_time():
+    """Each with each would be half an hour."""
+    text = f"scenarios = ['a']\nseeds = '0:1'\n[parameters]\nx = [{','.join(map(str, range(60_000)))}]"
+    assert len(cases_of(parse_study(text))) == 60_000
+
+
+def test_a_study_in_a_file_with_spaces_in_its_name_has_a_name(tmp_path):
+    path = tmp_path / ".my study.toml"
+    path.write_text(STUDY, encoding="utf-8")
+    assert load_study(path).name == "my-study"
 
 
 def test_one_and_true_are_two_values():
@@ -302,6 +334,26 @@ def test_a_part_that_is_damaged_is_named_and_half_a_file_is_none(tmp_path):
         ResultStore(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"key": [1]},
+        {"key": pa.array([None], pa.string())},
+        {"broken": ['["abc"]']},
+        {"broken": ["[" * 100_000]},
+        {"wall_s": ["x"]},
+        {"figure.x": ["text"]},
+        {"figure.x": [[1.0]]},
+    ],
+)
+def test_a_part_of_another_program_is_no_result(tmp_path, wrong):
+    store = ResultStore(tmp_path)
+    row = {"key": ["a"], "broken": ["[]"], "wall_s": [1.0], "cpu_s": [1.0], **wrong}
+    pq.write_table(pa.table(row), store.folder / "1.parquet")
+    with pytest.raises(StoreError, match=r"1\.parquet is damaged; remove it"):
+        ResultStore(tmp_path)
+
+
 def test_what_is_there_is_not_run_again_whatever_else_changes_in_the_study(tmp_path):
     path, out = write_study(tmp_path), tmp_path / "out"
     finished(path, out, {0: 1.0, 1: 2.0, 2: 3.0})
@@ -332,6 +384,21 @@ def test_the_folder_of_a_study_holds_its_results_its_summary_and_its_pictures(tm
     assert "![captures](captures.png)" in page
     assert (out / "captures.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["trials"] == 6
+
+
+def test_names_are_shown_as_they_are_whatever_they_mean_elsewhere(tmp_path, capsys):
+    name = "[/red] :warning: $\\foo{$"
+    text = STUDY.replace('"captures"', f"'{name}'")
+    path = write_study(tmp_path, f"{text}[variants.'{name}']\n")
+    out = tmp_path / "out [/b]"
+    sweep = Sweep(path, out)
+    for trial in sweep.missing:
+        sweep.store.add(Result(key=trial.key, figures={name: 1.0}, broken=[], wall_s=1.0, cpu_s=1.0))
+    sweep.store.flush()
+    assert sweep_study(str(path), None, 1, out, as_json=False)
+    said = capsys.readouterr()
+    assert name in said.out
+    assert "out [/b]" in said.err.replace("\n", "")
 
 
 def test_a_trial_that_broke_a_law_is_told_with_the_command_that_runs_it_again(tmp_path):
@@ -380,6 +447,7 @@ def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws
     ("scheduler", "workers", "said"),
     [
         ("nonsense", None, "--scheduler: found 'nonsense', expected an address such as tcp://127.0.0.1:8786"),
+        ("inproc://127.0.0.1:8786", None, "--scheduler: found 'inproc://127.0.0.1:8786'"),
         ("tcp://127.0.0.1:8786", 2, "--workers goes without --scheduler"),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
@@ -181,3 +183,12 @@ def test_a_row_goes_on_in_the_lines_below_it_and_ends_before_the_next_sentence()
         full: bool = False
 
     assert meanings(Tank) == {"size_l": "how much it holds, in litres", "full": "whether it is"}
+
+
+def test_no_pattern_of_a_setting_lets_a_line_end_through() -> None:
+    """`$` matches before the last line end, too: `\\Z` does not."""
+    packages = ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts")
+    sources = [path for each in packages for path in (Path(__file__).parents[3] / each).rglob("*.py")]
+    ends = re.compile(r"""pattern=r?["'][^\n]*\$["']""")
+    found = [str(path) for path in sources if ends.search(path.read_text("utf-8"))]
+    assert (found, len(sources) > 500) == ([], True)
