@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import ipaddress
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
@@ -15,6 +17,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from launch_scripts.report.files import replacing
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
 from swarm.wire.fields import check_id
@@ -157,6 +160,20 @@ def called_of(path: Path) -> str:
     return name if isinstance(name, str) else str(name.value)
 
 
+def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
+    """Whether a certificate is of its folder's authority, goes with its key, has this common name and at least these
+    hosts, and a third of its time or more is left."""
+    try:
+        check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))
+    except StoreError:
+        return False
+    certificate = _read(path)
+    start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    lasts = end - datetime.datetime.now(datetime.UTC) >= (end - start) / 3
+    wanted = {str(_general_name(host).value) for host in hosts}
+    return lasts and called_of(path) == called and hosts_of(path) >= wanted
+
+
 def _read(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE))
@@ -194,10 +211,18 @@ def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.Ellip
     )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        partial = folder / f"{name}.key.part"
-        with open(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        with private_file(folder / f"{name}.key") as file:
             file.write(secret)
-        partial.rename(folder / f"{name}.key")
-        (folder / f"{name}.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+        with replacing(folder / f"{name}.pem") as partial:
+            partial.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
     except OSError as error:
         raise StoreError(f"cannot write to {folder}: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def private_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write, readable by its owner only, which then takes the place of another. Raises OSError."""
+    with replacing(path) as partial:
+        partial.unlink(missing_ok=True)  # one that was left may be open to others
+        with open(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            yield file

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import sys
 import tarfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,13 +13,15 @@ from pathlib import Path
 
 import msgspec
 
-from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, called_of, hosts_of, issue
+from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, issue, may_stay, private_file
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
+from launch_scripts.deploy.hosts import HostName
 from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.deploy.shown_plan import as_json
 from launch_scripts.process_table import OPERATOR
+from launch_scripts.report.files import write_file
 from swarm.bus.access_control import common_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.write import scenario_text
@@ -43,7 +46,7 @@ class _ProcessBefore(msgspec.Struct):
 
 
 class _HostBefore(msgspec.Struct):
-    name: str
+    name: HostName
     processes: tuple[_ProcessBefore, ...]
 
 
@@ -60,9 +63,9 @@ def write_kits(
     """An archive for each machine, `out/NAME.tar.gz`, which unpacks into `swarm-NAME/`. Returns the archives.
 
     Certificates lie in `out/certs` with the authority's key, which leaves it for no archive. What is there already
-    is kept, so that a second plan replaces no key that needs none. `launcher`: whether a launcher starts the
-    processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be read or
-    written.
+    is kept while it is good, so that a second plan replaces no key that needs none. `launcher`: whether a launcher
+    starts the processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be
+    read or written.
     """
     folder, revoked = out / CERTIFICATES, for_operators(out, days)
     written = []
@@ -96,11 +99,19 @@ def for_operators(out: Path, days: int) -> tuple[str, ...]:
 
 
 def keep_plan(plan: Plan, out: Path) -> None:
-    """Writes the plan for `keepers_before`. Raises StoreError where it cannot."""
+    """Writes the plan for `keepers_before`, and removes archives of machines that only the plan before has: they
+    hold keys. Raises StoreError where it cannot."""
+    names = {host.name for host in plan.hosts}
+    gone = [_archive_of(out, host.name) for host in _before(out).hosts if host.name not in names]
     try:
-        (out / PLAN).write_text(_shown(plan), encoding="utf-8")
+        for archive in filter(Path.exists, gone):
+            archive.unlink()
+            print(f"{archive}: removed, as the plan has no machine of this name", file=sys.stderr)
+        write_file(out / PLAN, _shown(plan).encode())
     except OSError as error:
-        raise StoreError(f"cannot write {out / PLAN}: {error.strerror or error}") from error
+        raise StoreError(
+            f"cannot write {out / PLAN}: {error.filename or out}: {error.strerror or error}"
+        ) from error
 
 
 def _shown(plan: Plan) -> str:
@@ -110,16 +121,20 @@ def _shown(plan: Plan) -> str:
 def keepers_before(out: Path, run_id: str) -> dict[str, str]:
     """Keeper -> machine, in the plan of the same run whose archives were written to a folder before; empty if there
     is none. Raises StoreError where it cannot be read."""
-    path = out / PLAN
-    if not path.exists():
-        return {}
-    try:
-        before = msgspec.json.decode(read_bytes(path, FileKind.RUN), type=_Before)
-    except msgspec.DecodeError as error:
-        raise StoreError(f"{path} is no plan of `swarm deploy plan`: {error}; write to another folder") from error
+    before = _before(out)
     if before.run_id != run_id:
         return {}
     return {process.id: host.name for host in before.hosts for process in host.processes if process.role == KEEPER}
+
+
+def _before(out: Path) -> _Before:
+    path = out / PLAN
+    if not path.exists():
+        return _Before("", ())
+    try:
+        return msgspec.json.decode(read_bytes(path, FileKind.RUN), type=_Before)
+    except msgspec.DecodeError as error:
+        raise StoreError(f"{path} is no plan of `swarm deploy plan`: {error}; write to another folder") from error
 
 
 def certificates_of(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:
@@ -142,21 +157,22 @@ def _files_of(certificate: Path, name: str) -> dict[str, Path]:
 
 
 def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked: tuple[str, ...]) -> Path:
-    """The certificate of a name: the one that is there, or a new one if it lacks a host or its name was revoked."""
+    """The certificate of a name: the one that is there, or a new one if it has to be another or ends soon."""
     path, called = folder / f"{name}.pem", common_name(name, revoked)
-    renew = path.exists()
-    if renew and hosts_of(path) >= set(hosts) and called_of(path) == called:
+    if may_stay(path, hosts, called):
         return path
-    return issue(folder, name, hosts, days, renew=renew, called=called)
+    return issue(folder, name, hosts, days, renew=True, called=called)
+
+
+def _archive_of(out: Path, name: str) -> Path:
+    return out / f"{name}.tar.gz"
 
 
 def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str, Path]) -> Path:
     """Only its owner may read it: it holds private keys."""
-    path = out / f"{name}.tar.gz"
-    partial = path.with_name(f".{path.name}.part")
+    path = _archive_of(out, name)
     try:
-        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, _PRIVATE)
-        with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
+        with private_file(path) as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
             places = [*texts, *(place for place, _ in with_parts(files))]
             for place, text in {**texts, CONTENTS: "".join(f"{place}\n" for place in places)}.items():
                 data = text.encode()
@@ -167,9 +183,8 @@ def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str,
                     size = os.fstat(content.fileno()).st_size
                     mode = _PRIVATE if place.endswith(".key") else _OPEN
                     archive.addfile(_entry(name, place, size, mode), content)
-        partial.replace(path)
     except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.filename or partial}: {error.strerror or error}") from error
+        raise StoreError(f"cannot write {path}: {error.filename or out}: {error.strerror or error}") from error
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 import stat
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from launch_scripts.deploy.certificates import authority, issue
+from launch_scripts.deploy import certificates
+from launch_scripts.deploy.certificates import authority, issue, may_stay
 from swarm.errors import ConfigError, StoreError
 
 
@@ -77,3 +79,52 @@ def test_a_damaged_authority_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "ca.key").unlink()
     with pytest.raises(StoreError, match=r"ca\.key: No such file"):
         issue(tmp_path, "a1", [], 30)
+
+
+def test_a_certificate_may_stay_until_a_third_of_its_time_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert may_stay(issue(tmp_path, "a0", [], 1), [], "a0")
+    assert not may_stay(issue(tmp_path, "a1", [], 0), [], "a1")
+    monkeypatch.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
+    assert may_stay(issue(tmp_path, "a2", [], 11), [], "a2")
+    assert not may_stay(issue(tmp_path, "a3", [], 9), [], "a3")
+
+
+@pytest.mark.parametrize(
+    "host", ["fd00:0:0:0::1", "FD00::1", "fd00:0000:0000:0000:0000:0000:0000:0001", "::ffff:10.0.0.1", "Base.local"]
+)
+def test_a_host_is_the_same_however_it_is_written(tmp_path: Path, host: str) -> None:
+    path = issue(tmp_path, "router.0", [host, "127.0.0.1"], 30)
+    assert may_stay(path, [host], "router.0")
+    assert not may_stay(path, [host, "fd00::2"], "router.0")
+    assert not may_stay(path, [host], "router.0~2")
+
+
+def test_what_does_not_go_together_may_not_stay(tmp_path: Path) -> None:
+    """As an interrupted renewal or another authority leaves it."""
+    path, other = issue(tmp_path, "a0", [], 30), issue(tmp_path, "a1", [], 30)
+    path.with_suffix(".key").write_bytes(other.with_suffix(".key").read_bytes())
+    assert not may_stay(path, [], "a0")
+    other.with_suffix(".key").unlink()
+    assert not may_stay(other, [], "a1")
+    path = issue(tmp_path, "a0", [], 30, renew=True)
+    path.write_bytes(path.read_bytes()[:99])
+    assert not may_stay(path, [], "a0")
+    path = issue(tmp_path, "a0", [], 30, renew=True)
+    for file in ("ca.pem", "ca.key"):
+        (tmp_path / file).unlink()
+    authority(tmp_path)
+    assert not may_stay(path, [], "a0")
+
+
+@pytest.mark.parametrize("name", ["ca", "a0"])
+def test_a_key_is_for_its_owner_only_whatever_was_left(tmp_path: Path, name: str) -> None:
+    left = tmp_path / f"{name}.key.part"
+    left.write_text("")
+    left.chmod(0o666)
+    with left.open() as reader:
+        issue(tmp_path, "a0", [], 30)
+        assert os.fstat(reader.fileno()).st_size == 0
+    assert stat.S_IMODE((tmp_path / f"{name}.key").stat().st_mode) == 0o600
+    assert not left.exists()

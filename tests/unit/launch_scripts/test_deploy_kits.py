@@ -13,9 +13,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from launch_scripts.deploy.certificates import called_of, check_signed, hosts_of
+from launch_scripts.deploy.certificates import called_of, check_signed, hosts_of, issue
 from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
-from launch_scripts.deploy.kits import keepers_before, write_kits
+from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
 from launch_scripts.deploy.plan import Plan, make_plan
 from launch_scripts.deploy.revocations import revoke
 from launch_scripts.deploy.systemd import UNIT, systemd_files, unit_text
@@ -93,6 +93,72 @@ def test_a_second_plan_keeps_keys_that_need_not_be_others(tmp_path: Path) -> Non
     assert {name for name, key in keys().items() if key != before[name]} == {"router.1", "agent.all.a0"}
     assert called_of(certs / "agent.all.a0.pem") == "agent.all.a0~2"
     assert (first / "certs" / "revoked").read_text() == "agent.all.a0\n"
+
+
+def test_a_second_plan_ships_no_certificate_that_has_expired(tmp_path: Path) -> None:
+    write_kits(planned(), tmp_path, systemd_files, 7)
+    certs = tmp_path / "certs"
+    for name in ("router.1", "keeper.0", "operator.0", "operator.m2"):
+        issue(certs, name, ["10.0.0.2", "router-m1", "localhost", "127.0.0.1"], 0, renew=True)
+    for folder in unpacked(planned(), tmp_path):
+        for path in (folder / "certs").glob("*.*.pem"):
+            check_signed(folder / "certs" / "ca.pem", path, path.with_suffix(".key"))
+    check_signed(certs / "ca.pem", certs / "operator.0.pem", certs / "operator.0.key")
+
+
+def test_a_second_plan_keeps_the_key_of_a_router_whose_address_is_written_at_length(tmp_path: Path) -> None:
+    plan, certs = planned(machines=hosts("fd00:0:0:0:0:0:0:1", "FD00::2")), tmp_path / "certs"
+    write_kits(plan, tmp_path, systemd_files, 7)
+    before = {path: path.read_bytes() for path in certs.iterdir()}
+    write_kits(plan, tmp_path, systemd_files, 7)
+    assert {path: path.read_bytes() for path in certs.iterdir()} == before
+
+
+def test_an_archive_is_for_its_owner_only_whatever_was_left(tmp_path: Path) -> None:
+    for left in (tmp_path / "m0.tar.gz.part", tmp_path / "m1.tar.gz"):
+        left.write_text("")
+        left.chmod(0o666)
+    unpacked(planned(), tmp_path)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_archives_of_machines_that_are_gone_are_removed_and_no_other_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_kits(planned(), tmp_path, systemd_files, 7)
+    (tmp_path / "mine.tar.gz").write_text("")
+    assert capsys.readouterr().err == ""
+    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.2")), tmp_path, systemd_files, 7)
+    assert {path.name for path in tmp_path.glob("*.gz")} == {"m0.tar.gz", "m1.tar.gz", "mine.tar.gz"}
+    assert (
+        capsys.readouterr().err == f"{tmp_path / 'm2.tar.gz'}: removed, as the plan has no machine of this name\n"
+    )
+
+
+def test_no_archive_outside_of_the_folder_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "mine.tar.gz").write_text("")
+    out = tmp_path / "kits"
+    write_kits(planned(), out, systemd_files, 7)
+    text = (out / "plan.json").read_text()
+    (out / "plan.json").write_text(text.replace('"name": "m2"', '"name": "../mine"'))
+    with pytest.raises(StoreError, match=r"plan\.json is no plan of `swarm deploy plan`"):
+        keep_plan(planned(), out)
+    assert (tmp_path / "mine.tar.gz").exists()
+
+
+def test_an_interrupted_plan_leaves_the_plan_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = planned()
+    keep_plan(plan, tmp_path)
+    before = (tmp_path / "plan.json").read_bytes()
+
+    def interrupted(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", interrupted)
+    with pytest.raises(StoreError, match=r"cannot write .*plan\.json: .*No space left on device"):
+        keep_plan(plan, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
+    assert (tmp_path / "plan.json").read_bytes() == before
 
 
 def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_its_own_processes(
