@@ -161,8 +161,8 @@ def called_of(path: Path) -> str:
 
 
 def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
-    """Whether a certificate is of its folder's authority, goes with its key, has this common name and at least these
-    hosts, and a third of its time or more is left."""
+    """Whether a certificate is of its folder's authority, goes with its key, has this common name and these
+    hosts at least, and a third of its time or more is left."""
     try:
         check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))
     except StoreError:
