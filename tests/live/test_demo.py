@@ -31,7 +31,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     assert (report["scenario"], report["vehicles"], report["targets"]) == ("demo", 100, 10)
     assert (report["processes"], report["restarts"]) == (17, 0)
     assert report["seconds"] == pytest.approx(15, abs=1.5)
-    assert report["vehicles_routed"] >= 95  # in 15 s, on a machine that does other work
+    assert report["vehicles_routed"] == 100
     assert (report["collisions"], report["lethal_entries"], report["lost"]) == (0, 0, 0)
     for name in ("captures", "marks", "reroute_requests", "routes_served", "startup_s"):
         assert report[name] > 0, name

@@ -95,7 +95,7 @@ def test_an_added_target_gets_a_planner_and_is_chased(running: LiveSwarm) -> Non
     removed = order(running, "target", "remove", "x")
     assert removed["given"]["off"]
     order(running, "group", "all", "--as-scenario")
-    eventually(lambda: "planner-x" not in swarm("status", "--connect", running.endpoint).stdout, 60, "its end")
+    eventually(lambda: "planner-x" not in swarm("status", "--connect", running.endpoint).stdout, 20, "its end")
 
 
 def test_a_person_gives_an_order_by_a_selector_and_reads_json(running: LiveSwarm) -> None:
