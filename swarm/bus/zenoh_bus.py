@@ -277,7 +277,7 @@ class ZenohBus:
 
         expression = topic.expression(self._namespace, **fields)
         arrivals = Arrivals(_QUERY_BUFFER)
-        queryable = self._session.declare_queryable(expression, arrivals.handler)
+        queryable = self._session.declare_queryable(expression, _into(arrivals))
         self._queryables.setdefault(expression, []).append(queryable)
         self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
@@ -356,7 +356,7 @@ class ZenohBus:
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
         arrivals = Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._namespace}/{key}", arrivals.handler, history=True
+            f"{self._namespace}/{key}", _into(arrivals), history=True
         )
         self._read(subscriber, arrive, "alive", arrivals.take)
 
@@ -365,7 +365,7 @@ class ZenohBus:
             post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
 
         arrivals = Arrivals(_TOKEN_BUFFER)
-        listener = self._session.info.declare_transport_events_listener(arrivals.handler, history=False)
+        listener = self._session.info.declare_transport_events_listener(_into(arrivals), history=False)
         self._read(listener, arrive, "links", arrivals.take)
 
     def close(self) -> None:
@@ -409,3 +409,8 @@ class ZenohBus:
         thread = threading.Thread(target=run, name=name, daemon=True)
         thread.start()
         self._threads.append(thread)
+
+
+def _into(arrivals: Arrivals) -> Any:
+    """What an entity is declared with to leave what comes in there."""
+    return zenoh.handlers.Callback(arrivals.put, arrivals.end, indirect=False)

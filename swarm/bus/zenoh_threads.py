@@ -7,8 +7,6 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
-import zenoh
-
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.errors import ProtocolError
 from swarm.wire.readable import JSON_ENCODING, may_be_json
@@ -33,20 +31,16 @@ class Arrivals:
         """What has come; None ends it."""
         self._most = most
 
-    @property
-    def handler(self) -> Any:
-        """What an entity is declared with."""
-        return zenoh.handlers.Callback(self._put, self._end, indirect=False)
-
-    def _put(self, item: Any) -> None:
+    def put(self, item: Any) -> None:
         if self._items.qsize() < self._most:
             self._items.put(item)
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """The entity is undeclared."""
         self._items.put(None)
 
     def take(self) -> Any:
-        """The next item, once there is one; None once the entity is undeclared."""
+        """The next item, once there is one; None after the last."""
         return self._items.get()
 
 

@@ -11,13 +11,12 @@ from swarm.bus.zenoh_threads import Arrivals
 @given(st.integers(1, 5), st.lists(st.booleans(), max_size=40))
 def test_arrivals_are_taken_in_order_and_the_newest_are_dropped_when_full(most: int, comes: list[bool]):
     arrivals = Arrivals(most)
-    handler = arrivals.handler
     waiting: list[int] = []
     for number, comes_one in enumerate(comes):
         if comes_one:
-            handler.callback(number)
+            arrivals.put(number)
             waiting = [*waiting, number][:most]
         elif waiting:
             assert arrivals.take() == waiting.pop(0)
-    handler.drop()
+    arrivals.end()
     assert list(iter(arrivals.take, None)) == waiting
