@@ -111,8 +111,12 @@ Bench = tuple[
 ]
 """(names, cost, own, inner, less, queue, keys, code, name, around, kept, place, holder, spot)."""
 
+Turns = tuple[NDArray[np.int64], NDArray[np.float64], int, NDArray[np.int32], NDArray[np.uint8]]
+"""(order, turn, now, stack, todo)."""
+
 LABELLED = "Tuple((u1[::1], u1[::1], f8[::1], i8))"
 PIECES = "Tuple((f8[:, ::1], i4[:, ::1]))"
+TURNS = "Tuple((i8[::1], f8[::1], i4, i4[::1], u1[::1]))"
 TILES = "Tuple((u1[::1], i4[::1], f8[::1], u1[::1], f8[:, ::1], f8[:, ::1], i8))"
 _SCRATCH = "i2[::1], f8[::1], f8[::1], f8[::1], i4[::1], i4[::1], f4[::1], u1[::1], u1[::1], i8[::1]"
 BENCH = f"Tuple(({_SCRATCH}, f8[::1], i4[::1], i4[::1], i4[::1]))"

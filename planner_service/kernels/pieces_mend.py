@@ -41,6 +41,7 @@ from planner_service.kernels.pieces import (
     SIDE,
     TILES,
     TOTAL,
+    TURNS,
     WIDE,
     corner_of,
     moved,
@@ -51,6 +52,7 @@ from planner_service.kernels.pieces import (
     where_to,
 )
 from planner_service.kernels.pieces_labels import drive_tile, keep_tile
+from planner_service.kernels.pieces_totals import evaluate_totals, find_risen
 
 _ONE = np.uint64(1)
 _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
@@ -269,22 +271,52 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     return True
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, i8[::1])")
-def mend_tiles(grid, labels, pieces, tiles, bench, which):
-    """Look at these tiles, in this order, and mend them. Returns how many had to be; `evaluate` is to follow.
+@helper
+def _is_first(t, turn, todo, across):
+    """Whether no tile about this one, of those to be looked at, has an earlier turn."""
+    row, col = t // across, t % across
+    down = todo.size // across
+    for i in range(max(row - 1, 0), min(row + 2, down)):
+        for j in range(max(col - 1, 0), min(col + 2, across)):
+            other = i * across + j
+            if todo[other] and turn[other] < turn[t]:
+                return False
+    return True
 
-    Until then totals of a mended tile are what its exits were offered, and those of others may be too high.
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {TURNS}, f8)")
+def mend_tiles(grid, labels, pieces, tiles, bench, turns, most):
+    """Evaluate totals, look at tiles and mend them, until the tree is optimal or `most` tiles have been looked at; one
+    that was mended counts three times. Returns (tiles looked at, mended, rounds, left to be looked at).
+
+    turns  (order, turn, now, stack, todo):
+           order  int64 (n,), all tiles, those nearest the root first
+           turn   float64 (n,): of tiles beside each other the one with the least is looked at first, and totals are
+                  evaluated before the other is. All alike, all are looked at in each round
+           now    of `evaluate_totals`, the first time
+           todo   uint8 (n,), scratch
     """
-    wanted, falls = tiles[3], tiles[4]
-    mended = 0
-    for n in range(which.size):
-        t = which[n]
-        wanted[t] &= ~LOOK
-        falls[2, t] = 0.0
-        if _mend(t, grid, labels, pieces, tiles, bench):
-            wanted[t] |= REHOOK
-            mended += 1
-    return mended
+    order, turn, now, stack, todo = turns
+    wanted, falls, across = tiles[3], tiles[4], tiles[6]
+    looked = mended = rounds = 0
+    evaluate_totals(grid, labels, pieces, tiles, bench[0], order, now, stack)
+    while True:
+        rounds += 1
+        count = np.int64(find_risen(pieces, tiles, todo))
+        if count == 0 or looked + 2 * mended > most:
+            return looked, mended, rounds, count
+        for n in range(order.size):
+            t = order[n]
+            if not todo[t] or not _is_first(t, turn, todo, across):
+                continue
+            looked += 1
+            wanted[t] &= ~LOOK
+            falls[2, t] = 0.0
+            if _mend(t, grid, labels, pieces, tiles, bench):
+                # Until totals are evaluated its own are what its exits were offered, and those of others too high.
+                wanted[t] |= REHOOK
+                mended += 1
+        evaluate_totals(grid, labels, pieces, tiles, bench[0], order, np.int32(0), stack)
 
 
 @helper
