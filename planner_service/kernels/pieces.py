@@ -72,6 +72,8 @@ ROOT_PIECE = np.uint8(252)
 NO_PIECE = np.uint8(255)
 
 LOOK, REHOOK = np.uint8(1), np.uint8(2)
+DEARER, ALTERED = np.uint8(1), np.uint8(2)
+"""What has changed in a tile: cells got dearer, or lost their way; or anything else, perhaps that too."""
 FINEST = 2.0**-46
 """Of a cost: what is offered less than by this is not taken. Sums of the same numbers in another order differ by a
 32nd of it; it keeps costs within so much a step of the optimum."""

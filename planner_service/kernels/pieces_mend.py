@@ -26,10 +26,12 @@ from planner_service.kernels.layout import (
     SQRT2_EXACT,
 )
 from planner_service.kernels.pieces import (
+    ALTERED,
     BEFORE,
     BENCH,
     BITS,
     CELLS,
+    DEARER,
     FINEST,
     LABELLED,
     LOOK,
@@ -286,8 +288,8 @@ def _is_first(t, turn, todo, across):
 
 @kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {TURNS}, f8)")
 def mend_tiles(grid, labels, pieces, tiles, bench, turns, most):
-    """Evaluate totals, look at tiles and mend them, until the tree is optimal or `most` tiles have been looked at; one
-    that was mended counts three times. Returns (tiles looked at, mended, rounds, left to be looked at).
+    """Evaluate totals, look at tiles and mend them, until the tree is optimal or `most` tiles have been looked at;
+    one that was mended counts three times. Returns (tiles looked at, mended, rounds, left to be looked at).
 
     turns  (order, turn, now, stack, todo):
            order  int64 (n,), all tiles, those nearest the root first
@@ -339,7 +341,7 @@ def _merge_tile(t, grid, labels, total, across, window, inner, old_root, changed
             code = NONE if v == root else part_parent[i]
             if (part[i] < cost + way or v == old_root) and parent[v] != code:
                 parent[v] = code
-                changed[t] = 1
+                changed[t] = ALTERED
 
 
 @kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {_WINDOW}, i8, u1[::1])")
@@ -348,8 +350,8 @@ def merge_parents(grid, labels, pieces, tiles, bench, window, old_root, changed)
     tree's and the way from the old root to the new one.
 
     window   (part, part_parent, box, way): its costs and parents, and the way between the roots, s
-    changed  uint8 (n,), set to 1 for tiles in which a parent has changed
-    Costs stay what they are until `evaluate`. There is no cycle: with the lesser of the two costs, every
+    changed  uint8 (n,), set to ALTERED for tiles in which a parent has changed
+    Costs stay what they are until totals are evaluated. There is no cycle: with the lesser of the two costs, every
     cell's parent has a lower one.
     """
     across = tiles[6]
@@ -361,7 +363,7 @@ def merge_parents(grid, labels, pieces, tiles, bench, window, old_root, changed)
             _merge_tile(t, grid, labels, pieces[0], across, window, bench[3], old_root, changed)
     for v in (labels[3], old_root):
         t, _ = tile_of(v, grid[2], across)
-        changed[t] = 1
+        changed[t] = ALTERED
 
 
 @kernel(f"({GRID}, {LABELLED}, i8, i8[::1], f4[::1], u1[::1])")
@@ -369,14 +371,15 @@ def cut_ways(grid, labels, across, cells, before, changed):
     """Cells that became lethal, and those whose step they forbid, lose their parent.
 
     cells, before  padded cells whose cost changed, and their cell cost before, s
-    changed        uint8 (n,), set to 1 for tiles of cells that step into one of these, or are one
+    changed        uint8 (n,), DEARER or ALTERED for tiles of cells that step into one of these, or are one
     """
     cell_cost, offsets, stride, _, corners = grid
     parent = labels[0]
     for j in range(cells.size):
         x = cells[j]
         t, _ = tile_of(x, stride, across)
-        changed[t] = 1
+        what = DEARER if cell_cost[x] > before[j] else ALTERED
+        changed[t] |= what
         lethal = not cell_cost[x] < INF and before[j] < INF
         if lethal:
             parent[x] = NONE
@@ -390,7 +393,7 @@ def cut_ways(grid, labels, across, cells, before, changed):
             squeezed = squeezed and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
             if into or squeezed:
                 t, _ = tile_of(v, stride, across)
-                changed[t] = 1
+                changed[t] |= what
                 if lethal:
                     parent[v] = NONE
 

@@ -162,8 +162,8 @@ def evaluate_totals(grid, labels, pieces, tiles, names, order, now, stack):
 
 @helper
 def find_risen(pieces, tiles, todo):
-    """Returns how many tiles are to be looked at, and writes 1 to `todo` for these, 0 for others: where it is wanted,
-    and where totals have risen by more than others about them since this was last called."""
+    """Returns how many tiles are to be looked at, and writes 1 to `todo` for these, 0 for others: where it is
+    wanted, and where totals have risen by more than others about them since this was last called."""
     _, many, _, wanted, falls, ends, across = tiles
     down = many.size // across
     for t in range(many.size):

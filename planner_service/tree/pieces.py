@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from planner_service.kernels import pieces, pieces_labels, pieces_mend, pieces_totals
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.pieces import CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
+from planner_service.kernels.pieces import ALTERED, CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import KeptScratch
@@ -97,7 +97,7 @@ class PieceTree:
         row, col = (at // SIDE for at in self.cost_grid.grid.row_col(root))
         rows, cols = np.divmod(np.arange(self._count), self._across)
         self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
-        self._relabel(np.arange(self._count))
+        self._relabel(np.full(self._count, ALTERED))
         self._moved = True
         self._mend(math.inf, self._at_once)
 
@@ -124,7 +124,7 @@ class PieceTree:
             *(grid.padded, self._labels, self._pieces, self._tiles, self._bench),
             *((cost, parent, box, way), old_root, changed),
         )
-        self._relabel(np.flatnonzero(changed))
+        self._relabel(changed)
         self._moved = True
         self.exact = False
         return window.cells
@@ -147,7 +147,7 @@ class PieceTree:
             self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
         )
         turn = self._ends[0].copy()
-        self._relabel(np.flatnonzero(changed))
+        self._relabel(changed)
         looked = self._mend(self._most, turn)
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
         pieces_mend.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
@@ -184,8 +184,11 @@ class PieceTree:
     def tighten(self, cells: Cells) -> None:
         """Costs are what is driven at all times."""
 
-    def _relabel(self, which: Cells) -> None:
-        pieces_labels.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
+    def _relabel(self, changed: NDArray[np.uint8]) -> None:
+        """Label tiles anew in which something has changed: uint8 (n,), `pieces.DEARER` or more."""
+        pieces_labels.relabel_tiles(
+            *(self.cost_grid.padded, self._labels, self._tiles, self._bench, np.flatnonzero(changed), changed),
+        )
 
     def _turns(self, turn: NDArray[np.float64]) -> pieces.Turns:
         """As `kernels.pieces_mend.mend_tiles` takes them; totals are up to date after what they are handed to."""
