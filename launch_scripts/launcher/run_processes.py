@@ -70,7 +70,7 @@ def has_ended(pid: int) -> bool:
 
 
 def threads_of(pid: int) -> str:
-    """What the threads of a process do, as the kernel says: name, state, and where it waits. Empty if it is gone."""
+    """What the threads of a process do, as the kernel says: name, state, where each waits. Empty if it is gone."""
     found = []
     with suppress(OSError):
         for thread in (_PROC / str(pid) / "task").iterdir():

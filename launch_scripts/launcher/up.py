@@ -37,7 +37,7 @@ from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
-from shared_map.terrain.prepared import load_terrain, load_truth, prepare
+from shared_map.terrain.prepared import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
@@ -146,7 +146,8 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
-        check_places(self._scenario, self._terrain, self._truth)
+        homes = load_prepared_homes(self._run_dir, scenario_key(self._scenario))
+        check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
         for sentence in begin_run(self._run_dir, self._options.scenario, self._run_id):
             self._terminal.say(sentence, "yellow")
@@ -168,7 +169,6 @@ class _Run:
             log.info("the router listens")
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
-                self._say_begin()
                 recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
@@ -176,6 +176,7 @@ class _Run:
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
+                    self._say_begin()  # beside their start: the terrain's corners take a library that is large
                     seconds = self._watch(watcher)
                 finally:
                     failures = self._stop(watcher)
