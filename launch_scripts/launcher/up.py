@@ -169,6 +169,7 @@ class _Run:
             log.info("the router listens")
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
+                self._say_begin()
                 recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
@@ -176,7 +177,6 @@ class _Run:
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
-                    self._say_begin()  # beside their start: the terrain's corners take a library that is large
                     seconds = self._watch(watcher)
                 finally:
                     failures = self._stop(watcher)
@@ -281,6 +281,8 @@ class _Run:
                 else:
                     so_far = "all processes are alive, and targets wait for their trackers"
                 self._terminal.say(f"{so_far}, {self._startup_s:.1f} s after launch")
+                for line in said_of(self._terrain):  # now: its corners in degrees take a library that is large
+                    self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
@@ -381,8 +383,6 @@ class _Run:
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
             f"{_counted(self._swarm.by_role())}"
         )
-        for line in said_of(self._terrain):
-            self._terminal.say(line)
         router = self._scenario.network.connect[0]
         self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
