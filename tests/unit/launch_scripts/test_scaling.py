@@ -360,7 +360,7 @@ def test_the_model_is_shown_and_drawn_without_measuring(tmp_path: Path) -> None:
         (deploy, ["size", "--vehicles", "100", "--map", "100"], "--map is 100, expected 1024 to"),
         (deploy, ["size", "--vehicles", "100", "--map", "300000000"], "--map is 300000000, expected 1024 to"),
         (deploy, ["size", "--memory", "inf"], "--memory is inf, expected a number"),
-        (deploy, ["size", "--link", "nan"], "--link is nan, expected a number"),
+        (deploy, ["size", "--link", "inf"], "--link is inf, expected a number"),
         (deploy, ["size", "--tick-hz", "inf"], "--tick-hz is inf, expected 0.1 to 100"),
     ],
 )
