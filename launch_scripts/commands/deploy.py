@@ -32,7 +32,7 @@ def certs(
     scenario: Annotated[
         str | None,
         typer.Option(
-            help="Make those that its processes lack, too, and number anew what it revokes.",
+            help="Make those that its processes lack or that end soon, too, and number anew what it revokes.",
             autocompletion=complete.scenarios,
         ),
     ] = None,
@@ -50,9 +50,11 @@ def certs(
 
     swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
+    What exists is kept while a third of its time is left; what --scenario finds to end sooner is made anew.
+
     Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
     """
-    from launch_scripts.deploy.certificates import THIS_MACHINE, issue
+    from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, hosts_of, issue, may_stay
     from launch_scripts.deploy.revocations import revoked_in
     from launch_scripts.launcher.options import find_scenario
     from launch_scripts.process_table import certificate_names
@@ -66,13 +68,18 @@ def certs(
         bearer(name)
     revoked = {*chosen.network.revoked, *revoked_in(folder)}
     for name in dict.fromkeys(wanted):
-        if name not in given and (folder / f"{name}.pem").exists():
-            continue
+        old = folder / f"{name}.pem"
         hosts = [host for host in given.get(name, "").split(",") if host]
         if bearer(name).role == ROUTER:
             hosts += THIS_MACHINE
+        ends = False
+        if name not in given and old.exists():
+            hosts = sorted(hosts_of(old))
+            if may_stay(old, hosts, called_of(old)):
+                continue
+            ends = True
         called = common_name(name, revoked)
-        path = issue(folder, name, hosts, days, renew=renew and name in given, called=called)
+        path = issue(folder, name, hosts, days, renew=ends or (renew and name in given), called=called)
         print(f"{path}, {path.with_suffix('.key')}: {called}, good for {days} days")
     print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
 
