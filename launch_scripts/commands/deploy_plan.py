@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -77,8 +78,15 @@ def plan(
         return
     _show(made)
     if kit == "kubernetes":
+        from launch_scripts.deploy.containers.cluster import RECIPE
+
         for folder in written:
-            typer.echo(f"{folder}: `kubectl apply -f {folder}`")
+            if (folder / RECIPE).exists():
+                which = image or "a second plan, with --image"
+                typer.echo(
+                    f"{folder / RECIPE}: adds the ground or plug-ins to the image of {which}; build that first"
+                )
+            typer.echo(f"{folder}: `kubectl apply -f {shlex.quote(str(folder))}`")
     else:
         for host, archive in zip(made.hosts, written, strict=True) if written else ():
             typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")

@@ -11,6 +11,7 @@ from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner, Result
 
 from launch_scripts.commands.deploy import app
+from launch_scripts.deploy.certificates import check_signed, hosts_of, issue
 from launch_scripts.launcher.options import as_process, tls_of
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.load import load_scenario
@@ -71,6 +72,22 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
     assert as_process(loaded, LAUNCHER, "0").network.tls != as_process(loaded, "keeper", "0").network.tls
     with pytest.raises(ConfigError, match=r"certs/keeper.west.pem, which keeper.west needs"):
         as_process(loaded, "keeper", "west")
+
+
+def test_what_has_expired_is_made_anew_for_the_same_hosts(tmp_path: Path, scenario: Path) -> None:
+    certs = tmp_path / "certs"
+    run("certs", certs, "--scenario", scenario, "router.0=10.0.0.1,base.local")
+    names = ("router.0", "keeper.0")
+    for name in names:
+        issue(certs, name, sorted(hosts_of(certs / f"{name}.pem")), 0, renew=True)
+    hosts = hosts_of(certs / "router.0.pem")
+    before = {path: path.read_bytes() for path in certs.iterdir()}
+    assert run("certs", certs, "--scenario", scenario).exit_code == 0
+    changed = {path.stem + path.suffix for path in certs.iterdir() if path.read_bytes() != before[path]}
+    assert changed == {f"{name}.{kind}" for name in names for kind in ("pem", "key")}
+    assert hosts_of(certs / "router.0.pem") == hosts == {"10.0.0.1", "base.local", "localhost", "127.0.0.1"}
+    for name in names:
+        check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
 
 
 def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: Path, scenario: Path) -> None:
