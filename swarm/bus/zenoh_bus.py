@@ -1,8 +1,10 @@
 """The bus of real processes, on one Zenoh session.
 
-Each subscription and queryable has a channel and a thread that reads it. Two choices rest on measurements: channels
-of subscriptions drop their oldest sample when full, because with a FIFO a stalled reader holds up queries on the
-same link; replies are posted on Zenoh's own thread, because a thread per query is ten times slower.
+Each subscription and queryable has a thread that reads what comes in. Three choices rest on measurements:
+subscriptions have channels that drop their oldest sample when full, because with a FIFO a stalled reader holds up
+queries on the same link; replies are posted on Zenoh's own thread, because a thread per query is ten times slower;
+questions, tokens and links come seldom and have no channel of Zenoh's, because a thread that waits on one wakes
+ten times a second for nothing (`Arrivals`).
 """
 
 from __future__ import annotations
@@ -34,7 +36,15 @@ from swarm.bus.open_errors import why_not_listening, why_unreachable
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_intake import Intake
-from swarm.bus.zenoh_threads import guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
+from swarm.bus.zenoh_threads import (
+    Arrivals,
+    guarded,
+    says_json,
+    taken_after,
+    taken_from,
+    timeout_of,
+    waiting_in,
+)
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -52,9 +62,9 @@ _PRIORITIES = {
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
 _QUERY_BUFFER = 4096
-"""Queries that wait to be answered, per queryable. It takes no more until one is read."""
+"""Queries that wait to be read, per queryable. One that comes then ends without an answer."""
 _TOKEN_BUFFER = 65_536
-"""Changes of tokens that wait to be read: more than processes can start in a second."""
+"""Changes of tokens, or of links, that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
 
@@ -174,13 +184,14 @@ class ZenohBus:
                 post(heard)
 
         subscriber = self._subscriber(topic, fields)
+        channel = subscriber.handler  # a thread that waits on the subscriber itself keeps it from being undeclared
         name = f"sub-{topic.name}"
         if together:
-            self._read(subscriber, arrive_together, name, lambda channel: [waiting_in(channel)])
+            self._read(subscriber, arrive_together, name, partial(waiting_in, channel))
         elif every_s:
-            self._read(subscriber, arrive_sampled, name, lambda ch: [taken_after(ch, self._closing, every_s)])
+            self._read(subscriber, arrive_sampled, name, partial(taken_after, channel, self._closing, every_s))
         else:
-            self._read(subscriber, arrive, name)
+            self._read(subscriber, arrive, name, channel.recv)
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)
@@ -265,9 +276,10 @@ class ZenohBus:
             post(Asked(topic, asked, request, answerer))
 
         expression = topic.expression(self._namespace, **fields)
-        queryable = self._session.declare_queryable(expression, zenoh.handlers.FifoChannel(_QUERY_BUFFER))
+        arrivals = Arrivals(_QUERY_BUFFER)
+        queryable = self._session.declare_queryable(expression, _into(arrivals))
         self._queryables.setdefault(expression, []).append(queryable)
-        self._read(queryable, arrive, f"serve-{topic.name}")
+        self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))
@@ -342,19 +354,19 @@ class ZenohBus:
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
+        arrivals = Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._namespace}/{key}", zenoh.handlers.FifoChannel(_TOKEN_BUFFER), history=True
+            f"{self._namespace}/{key}", _into(arrivals), history=True
         )
-        self._read(subscriber, arrive, "alive")
+        self._read(subscriber, arrive, "alive", arrivals.take)
 
     def watch_links(self, post: Post) -> None:
         def arrive(event: Any) -> None:
             post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
 
-        listener = self._session.info.declare_transport_events_listener(
-            zenoh.handlers.FifoChannel(1024), history=False
-        )
-        self._read(listener, arrive, "links")
+        arrivals = Arrivals(_TOKEN_BUFFER)
+        listener = self._session.info.declare_transport_events_listener(_into(arrivals), history=False)
+        self._read(listener, arrive, "links", arrivals.take)
 
     def close(self) -> None:
         """Leave the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten seconds."""
@@ -380,26 +392,25 @@ class ZenohBus:
             thread.join(timeout=2.0)
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def _read(
-        self,
-        entity: Any,
-        arrive: Callable[[Any], None],
-        name: str,
-        take: Callable[[Any], Iterable[Any]] = lambda channel: (channel.recv(),),
-    ) -> None:
-        """Read an entity's channel on a thread of its own until it is undeclared: `take` and let `arrive` each."""
+    def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, take: Callable[[], Any]) -> None:
+        """Let what `take` returns arrive, one after the other on a thread of its own, until the entity is
+        undeclared: then `take` returns None or raises ZError."""
         self._entities.append(entity)
-        channel = entity.handler  # a thread that waits on the entity itself keeps it from being undeclared
 
         def run() -> None:
             try:
-                while True:
-                    for item in take(channel):
-                        arrive(item)
-            except zenoh.ZError:
+                for item in iter(take, None):
+                    arrive(item)
+                raise BusError(f"{name} hears nothing more")
+            except (BusError, zenoh.ZError):
                 if not self._closed and entity in self._entities:
-                    raise  # by itself, so that nothing more would be heard
+                    raise  # it has ended by itself
 
         thread = threading.Thread(target=run, name=name, daemon=True)
         thread.start()
         self._threads.append(thread)
+
+
+def _into(arrivals: Arrivals) -> Any:
+    """What an entity is declared with to leave what comes in there."""
+    return zenoh.handlers.Callback(arrivals.put, arrivals.end, indirect=False)

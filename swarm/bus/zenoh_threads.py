@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from queue import SimpleQueue
 from typing import Any
 
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
@@ -12,6 +13,35 @@ from swarm.wire.readable import JSON_ENCODING, may_be_json
 
 MOST_TOGETHER = 1024
 """Most samples in one `HeardMany`, so that a tick does not wait for long."""
+
+
+class Arrivals:
+    """What comes in on one entity, in its order.
+
+    `recv` of a channel of Zenoh's wakes its thread ten times a second, to look for signals, and asks for the
+    interpreter's lock each time (decision 95). A thread that waits here sleeps until something comes.
+    Zenoh's own thread needs the interpreter's lock to leave an item here, so this is for what comes seldom: a flood
+    of samples belongs into a channel.
+
+    most  items that wait; those that come then are dropped
+    """
+
+    def __init__(self, most: int) -> None:
+        self._items: SimpleQueue[Any] = SimpleQueue()
+        """What has come; None ends it."""
+        self._most = most
+
+    def put(self, item: Any) -> None:
+        if self._items.qsize() < self._most:
+            self._items.put(item)
+
+    def end(self) -> None:
+        """The entity is undeclared."""
+        self._items.put(None)
+
+    def take(self) -> Any:
+        """The next item, once there is one; None after the last."""
+        return self._items.get()
 
 
 def waiting_in(channel: Any) -> list[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -297,6 +299,31 @@ def test_a_token_that_names_nobody_is_dropped_and_others_are_still_told(world, t
     world.until(lambda: len(box) == 2)
     assert box == [Appeared(peer), Disappeared(peer)]
     raised.undeclare()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="this system does not count wake-ups in /proc")
+def test_readers_of_what_comes_seldom_sleep_until_it_comes(world):
+    a, b = world.bus("a"), world.bus("b")
+    before = set(threading.enumerate())
+    asked_of, tokens, links = Box(), Box(), Box()
+    b.serve(RUN, asked_of, role="agent", id="b")
+    b.watch_alive(tokens)
+    b.watch_links(links)
+    world.settle()
+    readers = [thread for thread in threading.enumerate() if thread not in before]
+    assert {thread.name for thread in readers} == {"serve-run", "alive", "links"}
+
+    def woken() -> list[int]:
+        statuses = [Path(f"/proc/self/task/{thread.native_id}/status").read_text() for thread in readers]
+        return [int(re.findall(r"^voluntary_ctxt_switches:\s*(\d+)$", text, re.M)[0]) for text in statuses]
+
+    slept = woken()
+    time.sleep(1.0)  # of a channel's `recv` ten wake-ups, fewer on a busy machine
+    assert woken() == slept
+    a.declare_alive(Peer("agent", "a1", 7))
+    a.ask(RUN, Nothing(), Box(), tag="q")
+    world.settle()
+    assert len(asked_of) == len(tokens) == 1
 
 
 class Deaf:
