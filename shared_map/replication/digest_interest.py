@@ -33,7 +33,7 @@ class DigestInterest:
 
     def __init__(self, name: str, period_ns: int) -> None:
         self._period_ns = period_ns
-        self._phase_ns = zlib.crc32(name.encode()) % (_ALL_EVERY * period_ns)
+        self._phase_ns = _ALL_EVERY * period_ns * zlib.crc32(name.encode()) >> 32
         self._keepers: dict[str, int] = {}  # keeper -> until when it counts as heard
         self._authors: dict[str, int] = {}  # author -> until when it counts as near
         self._all_until_ns = 0  # listen to everybody until then, at least

@@ -186,3 +186,17 @@ def test_whoever_is_listened_to_is_known_since_when(happened: list[tuple[str, st
                     break
                 since = at
             assert interest.since_ns(each) == since
+
+
+def test_agents_listen_to_everybody_at_times_that_are_spread() -> None:
+    """Of a hundred agents that began together about one in eighteen does so in any period."""
+    at_once = np.zeros(90, int)
+    for n in range(100):
+        interest = DigestInterest(f"a{n}.1", 10)
+        interest.start(0)
+        for period in range(290):
+            interest.keeper_spoke("k", 10 * period)
+            if interest.update(10 * period) is None and period >= 200:
+                at_once[period - 200] += 1
+    assert at_once.max() <= 20
+    assert 4 <= at_once.mean() <= 7
