@@ -16,7 +16,9 @@ from shared_map.keeper.store import KeeperStore
 from shared_map.replication.digest_interest import DigestInterest
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.wire.messages.marks import Digest
 from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST, MARKS
 
 TERRAIN = terrain_of_pace(np.ones((512, 768), np.float32))
 GRID = TERRAIN.grid
@@ -133,7 +135,7 @@ def test_what_neither_a_known_author_nor_a_keeper_tells_is_found_when_all_are_li
     assert lacks(here, far, ["far.1"]) == 0
 
 
-def test_a_set_of_one_who_is_not_listened_to_is_not_taken_for_one_of_the_dead() -> None:
+def test_a_set_of_one_who_is_not_listened_to_is_not_taken_for_one_of_the_dead_and_of_the_dead_it_is() -> None:
     chance = random.Random(2)
     swarm = SwarmModel(terrain=TERRAIN)
     swarm.keeper("k", KeeperStore(":memory:"))
@@ -143,11 +145,21 @@ def test_a_set_of_one_who_is_not_listened_to_is_not_taken_for_one_of_the_dead() 
     swarm.run(50)
     assert lacks(here, far, ["far.1"]) == 0
     swarm.kill("k.1")
-    since = len(swarm.deliveries)
-    swarm.keeper("k", KeeperStore(":memory:"), 2)
-    swarm.run(20)
-    put = [each for each in swarm.deliveries[since:] if each[1] == "here.1" and each[3] == "marks" and each[4]]
-    assert put == []
+    forgetful = swarm.network.bus("k.1")
+
+    def put_by_here(seconds: int) -> int:
+        since = len(swarm.deliveries)
+        for _ in range(seconds):
+            forgetful.publish(DIGEST, Digest(author="k.1", role="keeper", held={}), author="k.1")
+            swarm.run(1)
+        return sum(
+            each[1] == "here.1" and each[3] == "marks" and bool(each[4]) for each in swarm.deliveries[since:]
+        )
+
+    swarm.network.bus("onlooker").subscribe(MARKS, lambda event: None)
+    assert put_by_here(int(ROUND_S)) == 0
+    swarm.kill("far.1")
+    assert put_by_here(int(ROUND_S)) > 0
 
 
 names = st.sampled_from(["a", "b", "k1", "k2"])
