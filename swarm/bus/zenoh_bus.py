@@ -275,16 +275,11 @@ class ZenohBus:
             asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
             post(Asked(topic, asked, request, answerer))
 
-        def end() -> None:
-            if not self._closed and queryable in self._entities:
-                raise BusError(f"{topic.name} is served no more")  # it has ended by itself
-
         expression = topic.expression(self._namespace, **fields)
-        queryable: Any = self._session.declare_queryable(
-            expression, zenoh.handlers.Callback(guarded(arrive), guarded(end), indirect=False)
-        )
-        self._entities.append(queryable)
+        arrivals = Arrivals(_QUERY_BUFFER)
+        queryable = self._session.declare_queryable(expression, _into(arrivals))
         self._queryables.setdefault(expression, []).append(queryable)
+        self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))

@@ -311,7 +311,7 @@ def test_readers_of_what_comes_seldom_sleep_until_it_comes(world):
     b.watch_links(links)
     world.settle()
     readers = [thread for thread in threading.enumerate() if thread not in before]
-    assert {thread.name for thread in readers} == {"alive", "links"}
+    assert {thread.name for thread in readers} == {"serve-run", "alive", "links"}
 
     def woken() -> list[int]:
         statuses = [Path(f"/proc/self/task/{thread.native_id}/status").read_text() for thread in readers]
