@@ -37,7 +37,7 @@ from launch_scripts.report.results.run_folder import begin_run
 from launch_scripts.report.run_state import facts
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
-from shared_map.terrain.prepared import load_terrain, load_truth, prepare
+from shared_map.terrain.prepared import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
@@ -146,7 +146,8 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
-        check_places(self._scenario, self._terrain, self._truth)
+        homes = load_prepared_homes(self._run_dir, scenario_key(self._scenario))
+        check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
         records = self._options.records
         for sentence in begin_run(self._run_dir, self._options.scenario, self._run_id, recorded=records):
@@ -287,6 +288,8 @@ class _Run:
                 else:
                     so_far = "all processes are alive, and targets wait for their trackers"
                 self._terminal.say(f"{so_far}, {self._startup_s:.1f} s after launch")
+                for line in said_of(self._terrain):  # now: its corners in degrees take a library that is large
+                    self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
@@ -398,8 +401,6 @@ class _Run:
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
             f"{_counted(self._swarm.by_role())}"
         )
-        for line in said_of(self._terrain):
-            self._terminal.say(line)
         router = self._scenario.network.connect[0]
         if self._options.records:
             self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
