@@ -53,6 +53,8 @@ GOOD_GAP = 1.05
 """Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
 good already."""
 
+Answer = RouteReply | CostReply | Refusal
+
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 SEARCH_COUNTS = ("searches", "search_places")
 
@@ -169,13 +171,24 @@ class Planner:
         if chasers.target == self.target:
             self.followers.hear(chasers, now_ns)
 
-    def answer(self, request: RouteRequest | CostRequest, now_ns: int) -> RouteReply | CostReply | Refusal:
-        """Answer from the tree as it is. Never waits for a growth that is under way."""
+    def answer(
+        self,
+        request: RouteRequest | CostRequest,
+        now_ns: int,
+        send: Callable[[Answer], None] = lambda answer: None,
+    ) -> Answer:
+        """Answer from the tree as it is. Never waits for a growth that is under way.
+
+        send  called with what is returned as soon as that is known: who asked does not wait for what is counted
+        """
         if isinstance(request, CostRequest):
-            return self._costs(request, now_ns)
-        if len(request.cells) > MOST_ROUTES:
-            return Refusal(f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
-        return self._routes(request, now_ns)
+            answer: Answer = self._costs(request, now_ns)
+        elif len(request.cells) > MOST_ROUTES:
+            answer = Refusal(f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
+        else:
+            return self._routes(request, now_ns, send)
+        send(answer)
+        return answer
 
     def tick(self, now_ns: int) -> list[Action]:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
@@ -351,7 +364,7 @@ class Planner:
 
     # --- answers ------------------------------------------------------------------------------------------------
 
-    def _routes(self, request: RouteRequest, now_ns: int) -> RouteReply:
+    def _routes(self, request: RouteRequest, now_ns: int, send: Callable[[Answer], None]) -> RouteReply:
         cells = self._cells(request)
         most = (MOST_STEPS if self._puller is None else MOST_PULLED_STEPS) // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
@@ -364,12 +377,8 @@ class Planner:
             routes = self._read(cells, max_cells, now_ns)
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
                 routes = self._read(cells, max_cells, now_ns)
-            self._certify(routes, now_ns)
-        routes = self._pulled(routes)
-        self.counters.count("routes_served", len(routes))
-        for vehicle, route in zip(request.vehicles, routes, strict=False):  # a person's comes last, of no vehicle
-            self.followers.given(vehicle, route, request.max_cells, now_ns, now_ns + self._push_ns)
-        return RouteReply(
+        given = self._pulled(routes)
+        reply = RouteReply(
             target=self.target,
             incarnation=self._incarnation,
             target_cell=self.tree.target_cell,
@@ -377,11 +386,18 @@ class Planner:
             tree_age_ms=self._age_ms(now_ns),
             rows=self._grid.rows,
             cols=self._grid.cols,
-            routes=routes.columns(),
+            routes=given.columns(),
             pose_age_s=self._watch.age_s(now_ns),
             tracker_lost=self._watch.lost(now_ns),
             vehicle_class=self.vehicle_class,
         )
+        send(reply)
+        if search is None:
+            self._certify(routes, now_ns)
+        self.counters.count("routes_served", len(given))
+        for vehicle, route in zip(request.vehicles, given, strict=False):  # a person's comes last, of no vehicle
+            self.followers.given(vehicle, route, request.max_cells, now_ns, now_ns + self._push_ns)
+        return reply
 
     def _read(self, cells: list[int], max_cells: int, now_ns: int) -> RouteBatch:
         """Routes off the tree."""

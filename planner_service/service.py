@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 
 from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
 from planner_service.class_planners import ClassPlanners
 from planner_service.full_growth import GrownTree
-from planner_service.planner import Planner
+from planner_service.planner import Answer, Planner
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
@@ -189,6 +190,10 @@ class PlannerService:
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, Asked) and isinstance(event.request, (RouteRequest, CostRequest)):
+            self._held.append((now_ns, event))
+            self._answer(now_ns)
+            return
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         if self._candidacy.handle(event, now_ns) or self._obedience.handle(event, now_ns):
@@ -196,9 +201,6 @@ class PlannerService:
         match event:
             case Heard(message=Sighted() as sighted):
                 self._hear_sighted(sighted, now_ns)
-            case Asked(request=RouteRequest() | CostRequest()):
-                self._held.append((now_ns, event))
-                self._answer(now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag.startswith(_GROW):
                 grows = self._asked_by(tag)
                 if grows is not None:
@@ -323,13 +325,15 @@ class PlannerService:
             if self._planners.must_wait(name, now_ns) and not crowded and now_ns - asked_ns < _HOLD_NS:
                 waiting.append((asked_ns, event))
                 continue
-            reply = planner.answer(request, now_ns)
-            if isinstance(reply, Refusal):
-                event.refuse(reply.reason)
-            else:
-                event.answer(reply, target=self._target)
-            event.end()
+            planner.answer(request, now_ns, partial(self._send, event))
         self._held = waiting
+
+    def _send(self, asked: Asked, answer: Answer) -> None:
+        if isinstance(answer, Refusal):
+            asked.refuse(answer.reason)
+        else:
+            asked.answer(answer, target=self._target)
+        asked.end()
 
     def _obey(self) -> None:
         """Go by what is ordered."""

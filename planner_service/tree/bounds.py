@@ -66,7 +66,7 @@ class LowerBounds:
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            most = float(grid.rounding.at(rim_cost.max(initial=0.0)))
+            most = float(grid.rounding.at(rim_cost.max())) if rim.size else 0.0
             kernels.bound_by_heuristic(
                 heuristic, root, grid.stride, part, box, rim, rim_cost, starts, rounding, most, bound
             )

@@ -28,6 +28,9 @@ def read_routes(
     metres = (grid.grid.resolution_m, grid.diagonal)
     if not price_routes(metres, walks[1:], tree.time_at(walks.last), statuses, prices):
         raise AssertionError("a route does not end at the target: the tree is broken")
-    found = statuses == OK
-    prices[1, found] = bounds.at(tree, starts[found], None if grid.length_weight_s else prices[0, found])
+    if statuses.any():  # some have no way; a single route feels what a mask takes
+        found = statuses == OK
+        prices[1, found] = bounds.at(tree, starts[found], None if grid.length_weight_s else prices[0, found])
+    else:
+        prices[1] = bounds.at(tree, starts, None if grid.length_weight_s else prices[0])
     return RouteBatch(statuses, asked, walks.directions, walks.ends, *prices)

@@ -7,12 +7,13 @@ import math
 import numpy as np
 from support.scripted_planner import COLS, GRID, World
 
-from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP
+from planner_service.actions import Refusal
+from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer
 from planner_service.update import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute
+from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
 
 
@@ -160,3 +161,24 @@ def test_after_a_restart_those_who_report_to_follow_are_pushed_routes_without_as
     (push,) = world.tick()
     assert isinstance(push, PushedRoute)
     assert push.vehicle == "v"
+
+
+def test_an_answer_is_sent_before_it_is_counted(ready: World) -> None:
+    counted = []
+    request = RouteRequest(cells=[3], vehicles=["v1"])
+
+    def send(answer: Answer) -> None:
+        counted.append((ready.counters.counts["routes_served"], len(ready.planner.followers)))
+
+    answer = ready.planner.answer(request, ready.now_ns, send)
+    assert isinstance(answer, RouteReply)
+    assert counted == [(0, 0)]
+    assert (ready.counters.counts["routes_served"], len(ready.planner.followers)) == (1, 1)
+
+
+def test_every_answer_is_sent_once(ready: World) -> None:
+    sent: list[Answer] = []
+    asked = [RouteRequest(cells=[3]), CostRequest(cells=[3]), RouteRequest(cells=[0] * (MOST_ROUTES + 1))]
+    returned = [ready.planner.answer(each, ready.now_ns, sent.append) for each in asked]
+    assert returned == sent
+    assert [type(each) for each in sent] == [RouteReply, CostReply, Refusal]
