@@ -280,18 +280,13 @@ class Holdings:
         out is given back."""
         self._seq += 1
         by_plot: dict[int, list[tuple[int, Stand, object]]] = {plot: [] for plot in self.plots}
-        known = self._said
         for vehicle, path in self._paths.items():
             wish = wishes.get(vehicle, _NO_WISH)
-            said = known.get(vehicle)
+            said = self._said.get(vehicle)
             if said is None or said.wish is not wish or said.path is not path:
-                said = known[vehicle] = self._say(vehicle, path, wish)
+                said = self._said[vehicle] = self._say(vehicle, path, wish)
             for each in said.stands:
-                plot = each[0]
-                if plot in by_plot:
-                    by_plot[plot].append(each)
-                else:
-                    by_plot[plot] = [each]
+                by_plot.setdefault(each[0], []).append(each)
         for vehicle, cell in self._enters.items():
             if not any(cell in view.seen.get(vehicle, ()) for view in self._views.values()):
                 stand = Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
@@ -342,8 +337,8 @@ class Holdings:
         near.pop(-1, None)
         stands: list[tuple[int, Stand, object]] = []
         for plot in near:
-            within = len(near) == 1
-            holds = list(path) if within else [cell for cell, of in zip(path, plots, strict=True) if of == plot]
+            all_here = len(near) == 1
+            holds = list(path) if all_here else [cell for cell, of in zip(path, plots, strict=True) if of == plot]
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
             stands.append((plot, stand, (vehicle, path[0], holds, ahead, better)))
         return _Said(wish, path, stands)

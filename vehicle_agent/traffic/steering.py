@@ -58,8 +58,6 @@ class Steering:
         self._grid = grid
         self._climb = climb
         self._pace = pace.reshape(-1)
-        self._pace_of = memoryview(self._pace.data)
-        """The same; one cell of it is read in a third of the time."""
         self._diagonal = planner.neighbours == 8
         self._corner_cutting = planner.corner_cutting
         self._reserve = reserve
@@ -71,7 +69,7 @@ class Steering:
 
     def closed(self, cell: int) -> bool:
         """Whether a cell is lethal, or a body closes it."""
-        return cell in self._shut or not math.isfinite(self._pace_of[cell])
+        return cell in self._shut or not math.isfinite(self._pace.item(cell))
 
     def passable(self, tail: int, head: int) -> bool:
         """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
