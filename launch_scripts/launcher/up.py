@@ -168,7 +168,6 @@ class _Run:
             log.info("the router listens")
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
-                self._say_begin()
                 recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
                 self._recorder = recorder
                 watcher = Watcher(bus, recorder, MonotonicClock())
@@ -176,6 +175,7 @@ class _Run:
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
+                    self._say_begin()  # beside their start: of a large terrain it takes a second
                     seconds = self._watch(watcher)
                 finally:
                     failures = self._stop(watcher)

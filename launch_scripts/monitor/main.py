@@ -14,6 +14,7 @@ from launch_scripts.monitor.ground.zones import scenario_areas
 from launch_scripts.monitor.service import FRAME_HZ, MonitorService
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from shared_map.arrays import give_back_memory
 from shared_map.class_grounds import class_terrains
 from shared_map.prepared_classes import load_classes
 from shared_map.terrain.prepared import load_terrain, load_truth
@@ -59,6 +60,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             zones=scenario_areas(setup.scenario, terrain.grid),
             layers=layers,
         )
+        give_back_memory()  # of a large map a hundred megabytes, from which its picture was made
         process = Process(service, inbox, MonotonicClock(), FRAME_HZ, health=setup.health)
         sinks.tell_page(lambda: page_facts(setup, service, path))
         process.stop_on_signals()
