@@ -91,9 +91,9 @@ class GrowthTimes:
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took; not one that found networks too. A simulation does not call it."""
         median_ns = _median_with(self._full_took_ns, took_ns)
-        # Of a tree in pieces growths foretell no move: they include the cutting, and all planners of a machine grow
-        # their first trees at once. The tree is there, so a move is tried; to leave it untried takes another growth,
-        # and twice the memory.
+        # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
+        # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
+        # growth, and twice the memory.
         if not self._exact_took_ns and not self.in_pieces:
             self.exact_ns = self.exact_ns * median_ns // self.full_ns
         self.full_ns = max(1, median_ns)
