@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner, Result
 
 from launch_scripts.commands.deploy import app
+from launch_scripts.deploy import certificates
+from launch_scripts.deploy.certificates import THIS_MACHINE, check_signed, hosts_of
 from launch_scripts.launcher.options import as_process, tls_of
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.load import load_scenario
@@ -86,6 +89,23 @@ def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: P
     assert changed == {revoked}
 
 
+def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it_had(
+    tmp_path: Path, scenario: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certs = tmp_path / "certs"
+    with monkeypatch.context() as earlier:
+        earlier.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
+        run("certs", certs, "router.0=10.0.0.1,base.local", "keeper.0", "--days", 9)  # less than a third is left
+        run("certs", certs, "planner.t0", "--days", 11)
+    before = {path.stem: path.read_bytes() for path in certs.glob("*.pem")}
+    assert run("certs", certs, "--scenario", scenario).exit_code == 0
+    changed = {name for name, was in before.items() if (certs / f"{name}.pem").read_bytes() != was}
+    assert changed == {"router.0", "keeper.0"}
+    assert hosts_of(certs / "router.0.pem") == {"10.0.0.1", "base.local", *THIS_MACHINE}
+    for name in before:
+        check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
+
+
 def test_a_name_that_the_router_would_not_know_is_refused_before_anything_is_made(tmp_path: Path) -> None:
     told = run("certs", tmp_path / "certs", "keeper.0", "car1")
     assert isinstance(told.exception, ConfigError)
@@ -118,6 +138,7 @@ def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: 
     assert shown.exit_code == 0
     assert {"m1", "m2", "m3"} <= set(shown.stdout.split())
     assert "1 of 3 machines may be lost at once" in shown.stdout
+    assert " records the run and writes its report" in shown.stdout
     assert not kits.exists()
     told = run("plan", scenario, "--hosts", hosts, "--out", kits, "--json")
     plan = json.loads(told.stdout)
