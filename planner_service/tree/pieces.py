@@ -27,8 +27,8 @@ NEAR_ROUNDS = 4
 """Of a repair in changed tiles alone, at most; more than half of them need one."""
 
 MOST_KEPT = 1 << 9
-"""Of so many tiles is kept what cells cost inside: 17 MB. A move looks at 190 of a map of 2048 x 2048 cells, at 190 to
-350 of one of 4096 x 4096."""
+"""Of so many tiles is kept what cells cost inside: 17 MB. A move looks at 190 of a map of 2048 x 2048 cells,
+at 190 to 350 of one of 4096 x 4096."""
 
 
 class PieceTree:
