@@ -51,7 +51,12 @@ FAMILIES = [
     Family("zone", "launch_scripts.commands.orders.zone", "Close areas while the swarm runs.", ORDER),
     Family("target", "launch_scripts.commands.orders.target", "Add, move and remove targets.", ORDER),
     Family("vehicle", "launch_scripts.commands.orders.guests", "Add, remove and stop vehicles.", ORDER),
-    Family("deploy", "launch_scripts.commands.deploy", "Certificates and zenohd, for several machines.", ADMIN),
+    Family(
+        "deploy",
+        "launch_scripts.commands.deploy",
+        "A plan, certificates and configurations for several machines.",
+        ADMIN,
+    ),
     Family("bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire.", ADMIN),
 ]
 """Sub-commands which have sub-commands of their own, imported when they are called."""

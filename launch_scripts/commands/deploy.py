@@ -50,11 +50,10 @@ def certs(
 
     swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
-    What exists is kept while a third of its time is left; what --scenario finds to end sooner is made anew.
-
     Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
+    What is there is kept while more than a third of its time is left.
     """
-    from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, hosts_of, issue, may_stay
+    from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, ends_on, hosts_of, issue, may_stay
     from launch_scripts.deploy.revocations import revoked_in
     from launch_scripts.launcher.options import find_scenario
     from launch_scripts.process_table import certificate_names
@@ -68,19 +67,17 @@ def certs(
         bearer(name)
     revoked = {*chosen.network.revoked, *revoked_in(folder)}
     for name in dict.fromkeys(wanted):
-        old = folder / f"{name}.pem"
+        path, again = folder / f"{name}.pem", renew
         hosts = [host for host in given.get(name, "").split(",") if host]
         if bearer(name).role == ROUTER:
             hosts += THIS_MACHINE
-        ends = False
-        if name not in given and old.exists():
-            hosts = sorted(hosts_of(old))
-            if may_stay(old, hosts, called_of(old)):
+        if name not in given and (again := path.exists()):
+            if may_stay(path, (), called_of(path)):
                 continue
-            ends = True
+            hosts = sorted(hosts_of(path))
         called = common_name(name, revoked)
-        path = issue(folder, name, hosts, days, renew=ends or (renew and name in given), called=called)
-        print(f"{path}, {path.with_suffix('.key')}: {called}, good for {days} days")
+        issue(folder, name, hosts, days, renew=again, called=called)
+        print(f"{path}, {path.with_suffix('.key')}: {called}, good until {ends_on(path)}")
     print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
 
 

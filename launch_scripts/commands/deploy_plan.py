@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,8 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument
+from swarm.config.input_files import shown
+from swarm.errors import ConfigError
 
 KitName = Literal["systemd", "compose", "kubernetes"]
+_IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
+"""With a tag, which "-all" may be added to: no digest."""
 
 if TYPE_CHECKING:
     from launch_scripts.deploy.plan import Plan
@@ -56,7 +62,6 @@ def plan(
     from launch_scripts.deploy.kits import keepers_before
     from launch_scripts.deploy.plan import make_plan
     from launch_scripts.launcher.options import common_run_id, find_scenario, with_network
-    from swarm.errors import ConfigError
 
     chosen = with_network(find_scenario(scenario), namespace=namespace)
     try:
@@ -65,10 +70,13 @@ def plan(
         made = make_plan(chosen, load_hosts(hosts), run_id, keepers)
     except ConfigError as error:
         raise ConfigError(_of_file(str(error), hosts)) from error
+    _check_image(image, kit)
     if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
         raise ConfigError(f"--wheel: found {wheel}, expected a file NAME.whl; `uv build --wheel` makes one")
     if kit != "systemd" and wheel is not None:
         raise ConfigError(f"--wheel: found {wheel} with --kit {kit}, expected none: containers have an image")
+    if out is None and (image or wheel is not None):
+        raise ConfigError("--image and --wheel go into what --out writes, and it is not given")
     check_start(chosen, joins=True, has_ground=True)
     written = [] if out is None else _write(made, out, kit, image, days, wheel)
     if as_json:
@@ -78,13 +86,27 @@ def plan(
         return
     _show(made, kit)
     if kit == "kubernetes":
+        from launch_scripts.deploy.containers.cluster import RECIPE
+
         for folder in written:
-            typer.echo(f"{folder}: `kubectl apply -f {folder}`")
+            if (folder / RECIPE).exists():
+                which = image or "a second plan, with --image"
+                typer.echo(
+                    f"{folder / RECIPE}: adds the ground or plug-ins to the image of {which}; build that first"
+                )
+            typer.echo(f"{folder}: `kubectl apply -f {shlex.quote(str(folder))}`")
     else:
         for host, archive in zip(made.hosts, written, strict=True) if written else ():
             typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
     if out is not None:
         typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
+
+
+def _check_image(image: str, kit: KitName) -> None:
+    if image and kit == "systemd":
+        raise ConfigError(f"--image: found {shown(image)} with --kit systemd, expected none: it has no containers")
+    if image and re.fullmatch(_IMAGE, image) is None:
+        raise ConfigError(f"--image: found {shown(image)}, expected NAME:TAG; the monitor's is NAME:TAG-all")
 
 
 def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:

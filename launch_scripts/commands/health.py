@@ -49,8 +49,10 @@ def health(
 
     if url is None and live:
         raise ConfigError("--live goes with --url: of a whole swarm it is asked whether it is ready")
-    if url is not None and (where.connect or where.run):
-        raise ConfigError("--url asks one machine, --connect and --run a whole swarm: give one of them")
+    if url is not None and (where.connect or where.run or where.namespace or tls != Tls()):
+        raise ConfigError(
+            "--url asks one machine without TLS; what says how a whole swarm is reached goes without it"
+        )
     answer = swarm_answer(ask_status(where, tls)) if url is None else ask(url, live=live)
     raise typer.Exit(answer.show(as_json=as_json))
 

@@ -26,6 +26,7 @@ CA = "ca"
 THIS_MACHINE = ("localhost", "127.0.0.1")
 """Hosts in every router's certificate, for the processes beside it."""
 _CA_DAYS = 3650
+_NEW_AUTHORITY = "make an authority and all certificates anew, in another folder"
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 
@@ -39,7 +40,7 @@ class Authority:
 
 def authority(folder: Path) -> Authority:
     """The authority whose `ca.pem` and `ca.key` lie in the folder; made there if there is none. Raises
-    StoreError where they cannot be read or written, or do not belong together."""
+    StoreError where they cannot be read or written, do not belong together, or are not valid today."""
     path = folder / f"{CA}.pem"
     if path.exists():
         return _read_authority(folder)
@@ -57,7 +58,7 @@ def authority(folder: Path) -> Authority:
         decipher_only=False,
     )
     certificate = (
-        _begun(name, name, key.public_key(), _CA_DAYS)
+        _begun(name, name, key.public_key(), _in_days(_CA_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())
@@ -87,12 +88,14 @@ def issue(
     if path.exists() and not renew:
         raise StoreError(f"{path} is there already; --renew replaces it")
     signer = authority(folder)
+    # A certificate is refused once its authority has expired, so it promises no more than that.
+    end = min(_in_days(days), signer.certificate.not_valid_after_utc)
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, called or name)])
     usages = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
     public_key = signer.key.public_key()
     certificate = (
-        _begun(subject, signer.certificate.subject, key.public_key(), days)
+        _begun(subject, signer.certificate.subject, key.public_key(), end)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(usages, critical=False)
         .add_extension(
@@ -106,19 +109,22 @@ def issue(
 
 
 def _begun(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, end: datetime.datetime
 ) -> x509.CertificateBuilder:
-    now = datetime.datetime.now(datetime.UTC)
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _CLOCKS_DIFFER)
-        .not_valid_after(now + datetime.timedelta(days=days))
+        .not_valid_before(_in_days(0) - _CLOCKS_DIFFER)
+        .not_valid_after(end)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
+
+
+def _in_days(days: int) -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
 
 
 def _general_name(host: str) -> x509.GeneralName:
@@ -140,6 +146,7 @@ def _read_authority(folder: Path) -> Authority:
         raise StoreError(f"the authority in {folder} is no certificate and key in PEM: {error}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise StoreError(f"{folder / CA}.key is not the key of {folder / CA}.pem")
+    _check_today(certificate, folder / f"{CA}.pem", _NEW_AUTHORITY)
     return Authority(certificate, key)
 
 
@@ -160,6 +167,11 @@ def called_of(path: Path) -> str:
     return name if isinstance(name, str) else str(name.value)
 
 
+def ends_on(path: Path) -> datetime.date:
+    """The last day of a certificate. Raises StoreError where it cannot be read."""
+    return _read(path).not_valid_after_utc.date()
+
+
 def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
     """Whether a certificate is of its folder's authority, goes with its key, has this common name and these
     hosts at least, and a third of its time or more is left."""
@@ -169,7 +181,7 @@ def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
         return False
     certificate = _read(path)
     start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    lasts = end - datetime.datetime.now(datetime.UTC) >= (end - start) / 3
+    lasts = end - _in_days(0) >= (end - start) / 3
     wanted = {str(_general_name(host).value) for host in hosts}
     return lasts and called_of(path) == called and hosts_of(path) >= wanted
 
@@ -182,7 +194,8 @@ def _read(path: Path) -> x509.Certificate:
 
 
 def check_signed(ca: Path, certificate: Path, key: Path) -> None:
-    """Raise StoreError where three files in PEM do not go together: another authority's, another's key, expired."""
+    """Raise StoreError where three files in PEM do not go together: another authority's, another's key, or one of
+    the certificates not valid today."""
     try:
         authority, own = (
             x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE)) for path in (ca, certificate)
@@ -196,12 +209,15 @@ def check_signed(ca: Path, certificate: Path, key: Path) -> None:
         raise StoreError(f"{certificate} is not signed by the authority in {ca}; make it anew with both") from error
     if secret.public_key() != own.public_key():
         raise StoreError(f"{key} is not the key of {certificate}")
-    now = datetime.datetime.now(datetime.UTC)
-    if not own.not_valid_before_utc <= now <= own.not_valid_after_utc:
-        raise StoreError(
-            f"{certificate} is good from {own.not_valid_before_utc:%Y-%m-%d} to {own.not_valid_after_utc:%Y-%m-%d},"
-            " not today; make it anew with `swarm deploy certs FOLDER NAME --renew`"
-        )
+    _check_today(authority, ca, _NEW_AUTHORITY)
+    _check_today(own, certificate, "make it anew with `swarm deploy certs FOLDER NAME --renew`")
+
+
+def _check_today(certificate: x509.Certificate, path: Path, remedy: str) -> None:
+    """Raise StoreError where a certificate is not valid today."""
+    start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    if not start <= _in_days(0) <= end:
+        raise StoreError(f"{path} is good from {start:%Y-%m-%d} to {end:%Y-%m-%d}, not today; {remedy}")
 
 
 def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

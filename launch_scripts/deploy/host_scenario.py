@@ -37,8 +37,10 @@ def host_scenario(plan: Plan, host: PlannedHost) -> tuple[Scenario, dict[str, Pa
 
 
 def _with_files_beside(scenario: Scenario) -> tuple[Scenario, dict[str, Path]]:
-    """Every file that the terrain names as one below `GROUND`, under a name of its own."""
+    """Every file that the terrain names as one below `GROUND`, under a name of its own, with what belongs to it."""
     files: dict[str, Path] = {}
+    folders: dict[Path, int] = {}
+    """Files of one folder stay together and apart from others: what belongs to a file is found by its name."""
 
     def beside(name: str) -> str:
         path = Path(name)
@@ -47,10 +49,7 @@ def _with_files_beside(scenario: Scenario) -> tuple[Scenario, dict[str, Path]]:
                 f"{name} names other files, so it cannot be put into an archive alone: let the scenario name a"
                 " raster of its own, such as a GeoTIFF"
             )
-        place, n = f"{GROUND}/{path.name}", 0
-        while files.get(place, path) != path:
-            n += 1
-            place = f"{GROUND}/{n}/{path.name}"
+        place = f"{GROUND}/{folders.setdefault(path.parent, len(folders))}/{path.name}"
         files[place] = path
         return place
 

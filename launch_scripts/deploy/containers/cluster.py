@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+from launch_scripts.deploy.certificates import private_file
 from launch_scripts.deploy.containers.container import SETTINGS, image_name
 from launch_scripts.deploy.containers.kubernetes import SECRETS, kubernetes_files
-from launch_scripts.deploy.host_scenario import CERTIFICATES, host_scenario, plugin_files
+from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.kits import certificates_of, for_operators, keep_plan, with_parts
 from launch_scripts.deploy.plan import Plan
+from launch_scripts.report.files import replacing
 from swarm.errors import StoreError
 
 RECIPE = "Containerfile"
-_PRIVATE, _OPEN = 0o600, 0o644
+_OPEN = 0o644
 _RECIPE = """\
 # The images of this run, of the roles and of the monitor:
 #     podman build --tag IMAGE . && podman build --build-arg BASE={base}-all --tag IMAGE-all .
@@ -44,7 +45,7 @@ def write_cluster(plan: Plan, out: Path, days: int, image: str = "") -> Path:
     try:
         _write(cluster, texts, added)
     except OSError as error:
-        raise StoreError(f"cannot write {cluster}: {error.filename}: {error.strerror or error}") from error
+        raise StoreError(f"cannot write {cluster}: {error.filename or out}: {error.strerror or error}") from error
     keep_plan(plan, out)
     return cluster
 
@@ -54,13 +55,18 @@ def _ground(plan: Plan) -> dict[str, Path]:
 
 
 def _write(cluster: Path, texts: Mapping[str, str], added: Mapping[str, Path]) -> None:
+    """Each file whole or not at all; what an earlier plan added to the image and this one does not, goes."""
     cluster.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
-        path = cluster / name
-        path.unlink(missing_ok=True)  # an older one may be open to others
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE if name == SECRETS else _OPEN)
-        with open(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
+        with private_file(cluster / name) as file:
+            file.write(text.encode())
+        if name != SECRETS:
+            (cluster / name).chmod(_OPEN)
     for place, source in added.items():
         (cluster / place).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, cluster / place)
+        with replacing(cluster / place) as partial:
+            shutil.copyfile(source, partial)
+    kept = {cluster / name for name in (*texts, *added)}
+    for path in (cluster / RECIPE, *(cluster / GROUND).rglob("*"), *(cluster / PLUGINS).rglob("*")):
+        if path.is_file() and path not in kept:
+            path.unlink()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import stat
 import subprocess
 import tarfile
@@ -24,7 +25,7 @@ from launch_scripts.deploy.hosts import parse_hosts
 from launch_scripts.deploy.plan import make_plan
 from launch_scripts.launcher.options import as_process
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, StoreError
 
 SCENARIO = """
 name = "small"
@@ -123,7 +124,7 @@ def test_manifests_come_with_their_keys_apart_and_a_recipe_that_adds_the_ground(
     assert (folder / "kits" / "certs" / "operator.0.key").is_file()
     images = {pod["spec"]["containers"][0]["image"] for pod in manifests.pods.values()}
     assert images == {"registry/small:1", "registry/small:1-all"}
-    assert (kit / "ground" / "ground.tif").read_bytes() == (folder / "ground.tif").read_bytes()
+    assert (kit / "ground" / "0" / "ground.tif").read_bytes() == (folder / "ground.tif").read_bytes()
     assert "COPY ground /etc/swarm/ground" in (kit / "Containerfile").read_text()
     for secret in manifests.of("Secret"):
         files = {name: folder / name for name in secret["data"]}
@@ -131,6 +132,33 @@ def test_manifests_come_with_their_keys_apart_and_a_recipe_that_adds_the_ground(
             path.write_bytes(base64.b64decode(secret["data"][name]))
         (key,) = [path for name, path in files.items() if name.endswith(".key")]
         check_signed(files["ca.pem"], key.with_suffix(".pem"), key)
+
+
+def test_manifests_of_a_second_plan_are_whole_and_leave_nothing_of_the_first(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kit = folder / "kits" / "kubernetes"
+    done = plan(folder, "--kit", "kubernetes")
+    assert done.exit_code == 0, done.output
+    assert "Containerfile: adds the ground" in done.output.replace("\n", "")
+    before = {path: path.read_bytes() for path in kit.rglob("*") if path.is_file()}
+
+    def full(_: Path, __: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.copyfile", full)
+        done = plan(folder, "--kit", "kubernetes")
+    assert isinstance(done.exception, StoreError)
+    assert str(done.exception) == f"cannot write {kit}: {folder / 'kits'}: No space left on device"
+    assert before.keys() == {path for path in kit.rglob("*") if path.is_file()}
+    (kit / "own.yaml").write_text("")
+    scenario = folder / "small.toml"
+    scenario.write_text(scenario.read_text().replace("ground.tif", "synthetic"))
+    done = plan(folder, "--kit", "kubernetes")
+    assert done.exit_code == 0, done.output
+    assert "Containerfile" not in done.output
+    assert {path.name for path in kit.rglob("*") if path.is_file()} == {"own.yaml", "secrets.yaml", "swarm.yaml"}
 
 
 def test_a_wheel_is_refused_where_containers_have_an_image(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import re
 import shutil
 import stat
@@ -13,7 +14,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from launch_scripts.deploy.certificates import called_of, check_signed, hosts_of, issue
+from launch_scripts.deploy import certificates
+from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
 from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
 from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
 from launch_scripts.deploy.plan import Plan, make_plan
@@ -106,6 +108,34 @@ def test_a_second_plan_ships_no_certificate_that_has_expired(tmp_path: Path) -> 
     check_signed(certs / "ca.pem", certs / "operator.0.pem", certs / "operator.0.key")
 
 
+@pytest.mark.parametrize("start_days", [-20, 20])
+def test_an_authority_that_is_not_valid_today_signs_and_checks_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_days: int
+) -> None:
+    certs = tmp_path / "certs"
+    with monkeypatch.context() as patched:
+        patched.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=-start_days))
+        patched.setattr(certificates, "_CA_DAYS", start_days + 10)
+        authority(certs)
+    with pytest.raises(StoreError, match=r"ca\.pem is good from .* not today; make an authority and all"):
+        write_kits(planned(), tmp_path, systemd_files, 7)
+    assert not list(tmp_path.glob("*.tar.gz"))
+
+
+def test_no_certificate_outlives_its_authority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that refuses an authority refuses all that it has signed."""
+    monkeypatch.setattr(certificates, "_CA_DAYS", 3)
+    path = issue(tmp_path, "a0", [], 365)
+    assert ends_on(path) == ends_on(tmp_path / "ca.pem")
+    monkeypatch.setattr(
+        certificates,
+        "_in_days",
+        lambda days: datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days + 4),
+    )
+    with pytest.raises(StoreError, match=r"ca\.pem is good from"):
+        check_signed(tmp_path / "ca.pem", path, path.with_suffix(".key"))
+
+
 def test_a_second_plan_keeps_the_key_of_a_router_whose_address_is_written_at_length(tmp_path: Path) -> None:
     plan, certs = planned(machines=hosts("fd00:0:0:0:0:0:0:1", "FD00::2")), tmp_path / "certs"
     write_kits(plan, tmp_path, systemd_files, 7)
@@ -183,7 +213,8 @@ def test_files_of_the_terrain_go_to_keepers_and_the_targets_process_with_all_tha
     tmp_path: Path,
 ) -> None:
     (tmp_path / "parks").mkdir()
-    for name in ("hill.asc", "hill.prj", "hill.toml", "parks/hill.shp", "parks/hill.dbf"):
+    own = ("hill.asc", "hill.prj", "parks/hill.shp", "parks/hill.dbf", "parks/hill.prj")
+    for name in (*own, "hill.toml"):
         (tmp_path / name).write_text(name)
     plan = planned(ON_GROUND, base=tmp_path)
     folders = unpacked(plan, tmp_path / "kits")
@@ -191,11 +222,14 @@ def test_files_of_the_terrain_go_to_keepers_and_the_targets_process_with_all_tha
     assert sorted(having) == [False, True, True]
     for has, folder in zip(having, folders, strict=True):
         found = {str(path.relative_to(folder)): path.read_text() for path in folder.rglob("hill.*")}
-        files = {"hill.asc", "hill.prj", "parks/hill.shp", "parks/hill.dbf"}
-        assert set(found.values()) == (files if has else set())
+        assert sorted(found.values()) == (sorted(own) if has else [])
         scenario = load_scenario(folder / "scenario.toml")
         named = [scenario.terrain.source, scenario.cost.zones[0].file]
-        assert [Path(str(name)).is_file() for name in named] == [has, has]
+        beside = [
+            Path(str(name)).with_suffix(suffix) for name in named for suffix in (Path(str(name)).suffix, ".prj")
+        ]
+        asked = [path.read_text() for path in beside if path.is_file()]
+        assert asked == (["hill.asc", "hill.prj", "parks/hill.shp", "parks/hill.prj"] if has else [])
 
 
 def test_modules_of_plug_ins_lie_beside_the_scenario(tmp_path: Path) -> None:
