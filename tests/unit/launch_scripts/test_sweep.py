@@ -78,6 +78,8 @@ def test_a_setting_takes_the_place_of_what_the_file_says_and_the_file_stays_as_i
         ("groups.-1.vehicles", "found '-1' in a list"),
         ("name.first", "x: name.first: found 'n' above 'first', expected a table"),
         ("empty.0", "expected nothing, as it is empty, or '*'"),
+        (".".join("a" * 17), "a key has more than 16 parts"),
+        (".".join("a" * 5000), "a key has more than 16 parts"),
     ],
 )
 def test_a_key_that_leads_nowhere_is_refused_with_what_was_found(key, said):
@@ -209,6 +211,22 @@ def test_a_file_that_a_scenario_names_counts_by_what_is_in_it(tmp_path):
     found = []
     for height_m in (0.0, 1.0, 0.0):
         np.savez(ground, elevation_m=np.full((8, 8), height_m))
+        plan.__globals__["_file_digest"].cache_clear()
+        found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
+    assert found[0] == found[2] != found[1]
+    (tmp_path / "ground.prj").write_text("another place")
+    plan.__globals__["_file_digest"].cache_clear()
+    assert plan(load_study(path), tmp_path, "x")[0].trials[0].key not in found, "what lies beside it counts, too"
+
+
+def test_the_modules_of_plug_ins_count_and_those_inside_of_packages(tmp_path):
+    package = tmp_path / "own"
+    package.mkdir()
+    (package / "__init__.py").write_text("from own.walk import Walk")
+    path = write_study(tmp_path, STUDY + "[variants.own]\ntargets.0.walk = 'own:Walk'")
+    found = []
+    for text in ("class Walk: ...", "class Walk: speed = 2", "class Walk: ..."):
+        (package / "walk.py").write_text(text)
         plan.__globals__["_file_digest"].cache_clear()
         found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
     assert found[0] == found[2] != found[1]
