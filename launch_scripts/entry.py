@@ -36,3 +36,7 @@ def main() -> int:
         print("swarm: stopped", file=sys.stderr)
         return 130
     return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

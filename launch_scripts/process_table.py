@@ -38,6 +38,10 @@ NICENESS: Mapping[str, int] = {"router": 0, "agent": 0, "targets": 0, "planner":
 """By how much less urgent each role is than the launcher, where the processor is short. A vehicle that is driven
 late stands, and a target jumps; a route may come a little later, what is kept or shown much."""
 
+RECORDED_BESIDE = "keeper-0"
+"""The launcher that starts this process records and reports the run, and all others look after their own processes
+only. Every plan of machines has one, and keeps it on the machine of its store."""
+
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:

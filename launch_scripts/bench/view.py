@@ -19,7 +19,8 @@ from launch_scripts.bench.machine import machine
 from launch_scripts.bench.tables import Progress, number, table
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.service import FRAME_HZ, MonitorService
+from launch_scripts.monitor.loading import FRAME_HZ
+from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.serving.sinks import Sinks
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import CostGrid

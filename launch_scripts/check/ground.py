@@ -20,19 +20,20 @@ from swarm.places import cell_of
 from vehicle_agent.placement import spawn_cells
 
 
-def check_places(scenario: Scenario, terrain: Terrain, truth: Floats) -> None:
+def check_places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | None = None) -> None:
     """Raise ConfigError with the first of `places` that is a failure."""
-    for finding in places(scenario, terrain, truth):
+    for finding in places(scenario, terrain, truth, homes):
         if finding.level == "failure":
             raise ConfigError(f"scenario {scenario.name}: {finding.sentence}")
 
 
-def places(scenario: Scenario, terrain: Terrain, truth: Floats) -> Iterator[Finding]:
+def places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | None = None) -> Iterator[Finding]:
     """Starts of targets and vehicles.
 
     truth  float32 (rows, cols), s/m; inf is lethal
+    homes  bool (rows, cols): `homes_of` the two, if that is known
     """
-    grounds = class_grounds(scenario, terrain, truth)
+    grounds = class_grounds(scenario, terrain, truth, homes)
     yield from _targets(scenario, terrain, truth, grounds[GROUND].homes)
     yield from _vehicles(scenario, terrain.grid, grounds)
 

@@ -32,7 +32,7 @@ def certs(
     scenario: Annotated[
         str | None,
         typer.Option(
-            help="Make those that its processes lack, too, and number anew what it revokes.",
+            help="Make those that its processes lack or that end soon, too, and number anew what it revokes.",
             autocompletion=complete.scenarios,
         ),
     ] = None,

@@ -54,7 +54,8 @@ def plan(
     swarm deploy plan my.toml --hosts hosts.toml --out kits --kit kubernetes && kubectl apply -f kits/kubernetes
 
     Every process runs once; keepers, and planners and their standbys, on machines of their own. A second plan into
-    the same folder keeps the certificates.
+    the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
+    archives of machines that it does not have.
     """
     from launch_scripts.check.settings import check_start
     from launch_scripts.deploy.hosts import load_hosts
@@ -83,7 +84,7 @@ def plan(
 
         typer.echo(json.dumps({**fields(made), "archives": list(map(str, written))}, indent=2))
         return
-    _show(made)
+    _show(made, kit)
     if kit == "kubernetes":
         from launch_scripts.deploy.containers.cluster import RECIPE
 
@@ -136,7 +137,7 @@ def _of_file(sentence: str, path: Path) -> str:
     return sentence if sentence.startswith(str(path)) else f"{path}: {sentence}"
 
 
-def _show(made: Plan) -> None:
+def _show(made: Plan, kit: KitName) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -156,3 +157,5 @@ def _show(made: Plan) -> None:
     lost = made.survive
     what = "no machine may be lost" if not lost else f"{lost} of {len(made.hosts)} machines may be lost at once"
     console.print(f"run {made.run_id}: {len(made.processes)} processes; {what}", soft_wrap=True)
+    if kit == "systemd":
+        console.print(f"{made.records} records the run and writes its report", soft_wrap=True)

@@ -45,10 +45,14 @@ def size(
     from launch_scripts.bench.scaling.rows import read_rows
     from launch_scripts.bench.show import show
     from launch_scripts.bench.tables import table
-    from launch_scripts.bench.whole_swarm.size import size_of
+    from launch_scripts.bench.whole_swarm.size import LEAST_SIDE, MOST_SIDE, size_of
 
-    if cells is not None and cells < 1:
-        raise ConfigError(f"--map is {cells}, expected a number of cells")
+    for option, value in (("--memory", memory), ("--link", link)):
+        if not math.isfinite(value):
+            raise ConfigError(f"{option} is {value}, expected a number")
+    least, most = max(LEAST_SIDE**2, 4 * vehicles), MOST_SIDE**2
+    if cells is not None and not least <= cells <= most:
+        raise ConfigError(f"--map is {cells}, expected {least} to {most} cells for {vehicles} vehicles")
     side = None if cells is None else math.isqrt(cells - 1) + 1
     swarm = size_of(vehicles, targets, per_agent=min(per_agent, vehicles), side=side, tick_hz=tick_hz)
     rows, _ = usable(read_rows())

@@ -9,7 +9,14 @@ import msgspec
 
 from launch_scripts.deploy.hosts import HostConfig, HostsConfig
 from launch_scripts.deploy.placement import ROUTER_CORES, Job, place
-from launch_scripts.process_table import EXPENDABLE, ROLES, certificate_name, certificate_names, processes_of
+from launch_scripts.process_table import (
+    EXPENDABLE,
+    RECORDED_BESIDE,
+    ROLES,
+    certificate_name,
+    certificate_names,
+    processes_of,
+)
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
@@ -95,6 +102,11 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     port: int
     survive: int
     hosts: tuple[PlannedHost, ...]
+
+    @property
+    def records(self) -> str:
+        """Name of the machine whose launcher records and reports the run, where launchers start the processes."""
+        return next(host.name for host, process in self.processes if process.name == RECORDED_BESIDE)
 
     @property
     def processes(self) -> list[tuple[PlannedHost, PlannedProcess]]:

@@ -38,13 +38,19 @@ class ExitReason:
 
 
 @dataclass(frozen=True, slots=True)
+class EndedAsAsked:
+    """The last word of a process that has ended in order: it has left the swarm, and all that it keeps is written.
+    What is left to do is the operating system's."""
+
+
+@dataclass(frozen=True, slots=True)
 class Reports:
     """Where a process of the launcher tells what.
 
     log_path     its log
     log_format   of the log
     health       memory of a `Board`, which the launcher reads
-    exit_reason  why it ended
+    exit_reason  its last word: an `ExitReason` or `EndedAsAsked`
     """
 
     log_path: Path
@@ -73,6 +79,9 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
         log.critical("crashed", exc_info=True)
         pipe.send(ExitReason(f"{type(error).__name__}: {error}", CRASHED, refused=False))
         _leave(CRASHED)
+    # Before the log, which a disk that stalls may hold up.
+    with contextlib.suppress(OSError):  # the launcher is gone
+        pipe.send(EndedAsAsked())
     log.info("ended as asked")
     _leave(0)
 

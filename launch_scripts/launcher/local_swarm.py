@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from launch_scripts.health.verdict import Process
-from launch_scripts.launcher.child import ExitReason, Reports, run_child
+from launch_scripts.launcher.child import EndedAsAsked, ExitReason, Reports, run_child
 from launch_scripts.launcher.hang_watch import STILL_S, HangWatch
 from launch_scripts.launcher.log_file import LogFormat
+from launch_scripts.launcher.run_processes import threads_of
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.deadline import KILLED_BY
@@ -78,6 +79,8 @@ class Running:
     spec: ProcessSpec
     process: ForkServerProcess | None = None
     pipe: Connection | None = None
+    last_word: ExitReason | EndedAsAsked | None = None
+    """What this life has said at its end; None while it has not."""
     began_s: float = 0.0
     due_s: float | None = None
     restarts: int = 0
@@ -98,6 +101,17 @@ class Running:
     @property
     def alive(self) -> bool:
         return self.process is not None
+
+    @property
+    def ended_as_asked(self) -> bool:
+        """Whether this life has said so: nothing of it can be lost any more, however it leaves."""
+        return isinstance(self.hear_last_word(), EndedAsAsked)
+
+    def hear_last_word(self) -> ExitReason | EndedAsAsked | None:
+        with contextlib.suppress(EOFError, OSError):
+            if self.last_word is None and self.pipe is not None and self.pipe.poll():
+                self.last_word = self.pipe.recv()
+        return self.last_word
 
     def seen(self) -> Process:
         """How it is. Called by any thread."""
@@ -236,6 +250,10 @@ class LocalSwarm:
         """Ends all processes, role by role: by SIGKILL what runs `STOP_GRACE_S` later. Returns a sentence for each
         that did not end as asked.
 
+        One that has said that it ended is waited for no longer: it takes as long to leave as the machine is busy or
+        its disk stalls, and has nothing to do any more. It is given `STOP_GRACE_S` after all others, and its end is
+        nobody's failure.
+
         Once `force` says so, all are asked at once and get `FORCED_GRACE_S`. What is killed then is in `cut_short`,
         and nobody's failure.
         """
@@ -248,6 +266,7 @@ class LocalSwarm:
             if of_role and not force():
                 before_role(role)
                 failures += self._stop(of_role, while_waiting, force)
+        self._see_off(while_waiting, force)
         if left := [running for running in self.running if running.alive]:
             self._stop_at_once(left, while_waiting)
         return failures
@@ -287,7 +306,7 @@ class LocalSwarm:
         with without_main():
             process.start()
         tell.close()
-        running.process, running.pipe = process, listen
+        running.process, running.pipe, running.last_word = process, listen, None
         running.began_s, running.due_s, running.hung_s = time.monotonic(), None, None
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
@@ -320,11 +339,8 @@ class LocalSwarm:
             # The forkserver is gone and reports no more ends: kill, because two processes of one id must not run.
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
-        with contextlib.suppress(EOFError, OSError):
-            if running.pipe is not None and running.pipe.poll():
-                reason = running.pipe.recv()
-                assert isinstance(reason, ExitReason)
-                return reason
+        if isinstance(reason := running.hear_last_word(), ExitReason):
+            return reason
         if running.hung_s is not None:
             return ExitReason("its loop stood still, so it was killed; its log says where", 1, refused=False)
         if code == -KILLED_BY:
@@ -342,6 +358,8 @@ class LocalSwarm:
         for running in of_role:
             process = running.process
             assert process is not None
+            if running.ended_as_asked:
+                continue
             if process.exitcode is None:
                 if force():
                     continue
@@ -353,6 +371,21 @@ class LocalSwarm:
                 failures.append(f"{running.spec.name} was asked to end, but {reason.sentence}")
             self._forget(running)
         return failures
+
+    def _see_off(self, while_waiting: Callable[[], None], force: Callable[[], bool]) -> None:
+        """Waits for those that have said that they ended, and kills what is left of them."""
+        leaving = [running for running in self.running if running.process is not None and running.ended_as_asked]
+        deadline_s = time.monotonic() + STOP_GRACE_S
+        while time.monotonic() < deadline_s and not force():
+            if all(running.process is None or running.process.exitcode is not None for running in leaving):
+                break
+            while_waiting()
+        for running in leaving:
+            process = running.process
+            if process is not None and process.exitcode is None and process.pid is not None:
+                log.warning("%s has ended and does not leave: %s", running.spec.name, threads_of(process.pid))
+                process.kill()
+            self._forget(running)
 
     def _stop_at_once(self, left: list[Running], while_waiting: Callable[[], None]) -> None:
         _ask(left, while_waiting, FORCED_GRACE_S)
@@ -384,7 +417,10 @@ def _ask(
     deadline_s = time.monotonic() + within_s
     while time.monotonic() < deadline_s and not force():
         while_waiting()
-        if all(running.process is None or running.process.exitcode is not None for running in processes):
+        if all(
+            running.process is None or running.ended_as_asked or running.process.exitcode is not None
+            for running in processes
+        ):
             return
 
 

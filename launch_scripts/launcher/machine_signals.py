@@ -4,7 +4,7 @@ supervisor that started it, if there is one."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -52,10 +52,18 @@ class MachineSignals:
         self._metrics = MetricsEndpoint(self._port, lambda: [Process(_NAME, board.read()), *seen()], self._address)
         self.url = self._metrics.url
 
-    def turned(self, observed: Observed, started_ns: int, missing: Sequence[str]) -> None:
+    def turned(
+        self,
+        observed: Observed,
+        started_ns: int,
+        missing: Sequence[str],
+        up: Collection[tuple[str, str]] | None = None,
+    ) -> None:
         """The launcher has turned: tells so, and answers who has asked for figures since the last time.
 
         missing  names of processes that it has started and nobody has heard yet
+        up       (role, id) of the processes that live, where these are a part of the run; None: all of the run is
+                 observed, so the figures name it
         """
         self._health.turned([f"word of {name}" for name in missing])
         if self._metrics is None:
@@ -64,8 +72,9 @@ class MachineSignals:
         if self._metrics is not None:
             from launch_scripts.metrics.families import Figures, Run, families
 
-            run = Run(*self._run, started_ns)
-            self._metrics.answer(lambda: families(Figures(run, observed, observed.status, observed.up())))
+            run = Run(*self._run, started_ns) if up is None else None
+            alive = observed.up() if up is None else up
+            self._metrics.answer(lambda: families(Figures(run, observed, observed.status, alive)))
 
     def ends(self) -> None:
         """The run ends from now on; figures are answered no more."""

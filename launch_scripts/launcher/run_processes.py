@@ -69,6 +69,17 @@ def has_ended(pid: int) -> bool:
     return fields is None or fields[0] in "ZX"
 
 
+def threads_of(pid: int) -> str:
+    """What the threads of a process do, as the kernel says: name, state, where each waits. Empty if it is gone."""
+    found = []
+    with suppress(OSError):
+        for thread in (_PROC / str(pid) / "task").iterdir():
+            with suppress(OSError):  # ended meanwhile
+                name, _, rest = (thread / "stat").read_text().partition("(")[2].rpartition(")")
+                found.append(f"{name} {rest.split()[0]} {(thread / 'wchan').read_text()}")
+    return ", ".join(found)
+
+
 def usage(pid: int) -> Usage | None:
     """What a process takes up now; None if it has ended."""
     place = _PROC / str(pid)

@@ -8,17 +8,15 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.busy_line import busy_line
 from launch_scripts.launcher.lasting_output import make_output_last
-from launch_scripts.launcher.live_table import live_table, plain_line
 from launch_scripts.plain_text import plain
 from launch_scripts.report.results.certified_gap import gap_text
-from launch_scripts.report.run_state.state import RunState
 
 log = logging.getLogger(__name__)
 
@@ -99,12 +97,13 @@ class Terminal:
         """Whether it is time to show the next summary."""
         return time.monotonic() >= self._due_s
 
-    def show(self, title: str, state: RunState) -> None:
+    def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType]) -> None:
+        """Draws the table anew, or says the line where there is no table."""
         self._due_s = time.monotonic() + (_DRAW_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
-            self.say(plain_line(state, title))
+            self.say(line())
             return
-        table = live_table(state, title, self._console)
+        table = table_on(self._console)
         with contextlib.suppress(OSError):  # of a terminal that is gone
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import shutil
@@ -12,12 +11,15 @@ from pathlib import Path
 
 from launch_scripts.check.ground import check_places
 from launch_scripts.check.settings import check_start
+from launch_scripts.launcher.leave_report import ELSEWHERE, leave_report
+from launch_scripts.launcher.live_table import live_table, plain_line
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.options import as_process, make_run_dir
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
+from launch_scripts.launcher.own_part import OwnPart
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.stop_signals import StopAsked
@@ -33,11 +35,9 @@ from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.run_folder import begin_run
 from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.state import RunState
-from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
-from shared_map.terrain.prepared import load_terrain, load_truth, prepare
+from shared_map.terrain.prepared import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
@@ -120,7 +120,7 @@ class _Run:
         self._up_at_s: float | None = None
         self._web_port = 0
         """When the swarm was whole, on the run's clock."""
-        self._recorder: Recorder | None = None
+        self._known: Recorder | OwnPart | None = None
         self._take_over: TakeOver | None = None
         if options.takes_over:
             targets = options.scenario.target_ids
@@ -146,9 +146,11 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
-        check_places(self._scenario, self._terrain, self._truth)
+        homes = load_prepared_homes(self._run_dir, scenario_key(self._scenario))
+        check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
-        for sentence in begin_run(self._run_dir, self._options.scenario, self._run_id):
+        records = self._options.records
+        for sentence in begin_run(self._run_dir, self._options.scenario, self._run_id, recorded=records):
             self._terminal.say(sentence, "yellow")
         log.info("terrain is ready")
         self._wait(lambda: self._warm_up.progress, self._warm_up.done)
@@ -169,10 +171,15 @@ class _Run:
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
                 self._say_begin()
-                recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
-                self._recorder = recorder
-                watcher = Watcher(bus, recorder, MonotonicClock())
+                known: Recorder | OwnPart
+                if self._options.records:
+                    known = Recorder(self._scenario, self._terrain.grid, self._started_ns)
+                else:
+                    known = OwnPart(self._terrain.grid, self._started_ns)
+                self._known = known
+                watcher = Watcher(bus, known, MonotonicClock())
                 watcher.begin()
+                watcher.look_after([running.spec for running in self._swarm.running])
                 try:
                     self._swarm.start()
                     log.info("all processes are started")
@@ -182,7 +189,7 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        code = self._end(watcher.recorder, seconds)
+        code = self._end(known, seconds)
         if self._startup_s is None and not self._stop_asked:
             failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
         for failure in failures:
@@ -225,7 +232,7 @@ class _Run:
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,
             anew=self._options.is_new,
-            before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
+            before=None if self._known is None else self._known.observed.newest_stats(spec.role, spec.id),
         )
 
     def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
@@ -258,10 +265,11 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
-        self._book = watcher.recorder.book
+        self._book = watcher.known.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
-            ordered.look(watcher.recorder.book, set(watcher.recorder.observed.up()), time.monotonic())
+            ordered.look(self._book, set(watcher.known.observed.up()), time.monotonic())
+            watcher.look_after([running.spec for running in self._swarm.running])
             if self._take_over is not None:
                 self._take_over.look(time.monotonic())
             self._raise_refusals(self._swarm.poll())
@@ -280,6 +288,8 @@ class _Run:
                 else:
                     so_far = "all processes are alive, and targets wait for their trackers"
                 self._terminal.say(f"{so_far}, {self._startup_s:.1f} s after launch")
+                for line in said_of(self._terrain):  # now: its corners in degrees take a library that is large
+                    self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
@@ -306,10 +316,12 @@ class _Run:
 
     def _missing(self, watcher: Watcher) -> list[str]:
         specs = [running.spec for running in self._swarm.running]
-        return [spec.name for spec in specs if not watcher.recorder.observed.was_up(spec.role, spec.id)]
+        return [spec.name for spec in specs if not watcher.known.observed.was_up(spec.role, spec.id)]
 
     def _tell(self, watcher: Watcher) -> None:
-        self._signals.turned(watcher.recorder.observed, self._started_ns, self._missing(watcher))
+        known = watcher.known
+        up = known.up() if isinstance(known, OwnPart) else None
+        self._signals.turned(known.observed, self._started_ns, self._missing(watcher), up)
         if (sentence := self._disk.look(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         if (compiled := self._warm_up.news()) is not None:
@@ -321,18 +333,27 @@ class _Run:
             self._terminal.say(f"live view: {page_of(self._web_port)}", "bold")
             self._terminal.say(f"from elsewhere: {tunnel(self._web_port)}, then the same address")
         if self._terminal.due():
-            state = watcher.recorder.summary(watcher.now_ns())
-            self._terminal.show(self._title(watcher, state), state)
+            self._show(known, watcher.now_ns())
 
-    def _title(self, watcher: Watcher, state: RunState) -> str:
+    def _show(self, known: Recorder | OwnPart, now_ns: int) -> None:
+        elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S
+        if isinstance(known, OwnPart):
+            up = f"{known.well} of this machine's"
+            title = self._title(up, elapsed_s)
+            self._terminal.show(lambda: known.line(title, now_ns), lambda on: known.table(title, now_ns, on))
+            return
+        state = known.summary(now_ns)
+        title = self._title(facts.fact("processes_well").shown(state), elapsed_s)
+        self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
+
+    def _title(self, up: str, elapsed_s: float) -> str:
         """How far the run is, on its own clock, which everybody shows: start-up counts, its time is added."""
         if self._up_at_s is None:
-            up = facts.fact("processes_well").shown(state)
-            return f"{self._scenario.name}: starting, {up} processes are up, {state.elapsed_s:.0f} s"
+            return f"{self._scenario.name}: starting, {up} processes are up, {elapsed_s:.0f} s"
         seconds = self._scenario.seconds
         of = "" if seconds >= UNTIL_STOPPED_S else f" of {self._up_at_s + seconds:.0f}"
         live = f", live view {page_of(self._web_port)}" if self._web_port else ""
-        return f"{self._scenario.name}: {state.elapsed_s:.0f}{of} s{live}"
+        return f"{self._scenario.name}: {elapsed_s:.0f}{of} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -360,11 +381,11 @@ class _Run:
         alive = sum(running.alive for running in self._swarm.running)
         return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
 
-    def _end(self, recorder: Recorder, seconds: float) -> int:
+    def _end(self, known: Recorder | OwnPart, seconds: float) -> int:
         """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
         try:
             with self._terminal.busy("writing the report and its picture"):
-                whole = self._stop_asked.interruptible_once_more(lambda: self._report(recorder, seconds))
+                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds))
         except StoreError as error:
             self._terminal.say(str(error), "red")
             return error.exit_code
@@ -380,24 +401,21 @@ class _Run:
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
             f"{_counted(self._swarm.by_role())}"
         )
-        for line in said_of(self._terrain):
-            self._terminal.say(line)
         router = self._scenario.network.connect[0]
-        self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
+        if self._options.records:
+            self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
+        else:
+            self._terminal.say(f"router at {router}; logs in {self._run_dir}; {ELSEWHERE}")
 
-    def _report(self, recorder: Recorder, seconds: float) -> bool:
-        report = make_report(
-            recorder,
-            self._terrain,
+    def _report(self, known: Recorder | OwnPart, seconds: float) -> bool:
+        leave_report(
+            known,
+            self._terminal,
+            self._run_dir,
+            (self._terrain, self._truth),
+            as_json=self._options.as_json,
             run_id=self._run_id,
             seconds=seconds,
             startup_s=self._startup_s,
         )
-        numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
-        if self._options.as_json:
-            self._terminal.print_json(json.dumps(numbers, indent=2))
-        else:
-            self._terminal.report(numbers)
-        # The figures come first: a full disk keeps nobody from them.
-        write_report(self._run_dir, report, recorder, self._terrain, truth=self._truth)
         return True

@@ -11,7 +11,7 @@ from launch_scripts.launcher.log_file import LogFormat, log_to
 from launch_scripts.launcher.options import as_process, common_run_id, new_run_id
 from launch_scripts.launcher.run_terrain import find_members
 from launch_scripts.monitor.serving.loopback_guard import LOOPBACK
-from launch_scripts.process_table import ENTRIES, LAUNCHER, ROLES, ProcessSpec, processes_of
+from launch_scripts.process_table import ENTRIES, LAUNCHER, RECORDED_BESIDE, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.run_state.plan import plan_of_members
 from swarm.config.explain import choice
 from swarm.config.scenario import Scenario
@@ -64,6 +64,12 @@ class UpOptions:
     def is_whole(self) -> bool:
         """Whether nothing but a router may be lacking."""
         return set(ROLES[1:]) <= set(self.roles) and self.rank is None and self.table is None
+
+    @property
+    def records(self) -> bool:
+        """Whether this launcher, alone of all of the run, records and reports it. Raises ConfigError where there is
+        no process to start."""
+        return any(spec.name == RECORDED_BESIDE for spec in table_of(self))
 
     @property
     def asks_for_ground(self) -> bool:

@@ -15,6 +15,7 @@ MODULES = (
     "shared_map.keeper.main",
     "vehicle_agent.main",
     "launch_scripts.world.main",
+    "launch_scripts.monitor.main",
     # What these import as they run, each for itself otherwise.
     "encodings.idna",
     "numpy.ma",

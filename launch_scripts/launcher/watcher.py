@@ -1,10 +1,14 @@
-"""Subscribes the launcher's recorder to the swarm."""
+"""What a launcher hears of the swarm: all of it if it records the run, else its own processes."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 
+from launch_scripts.launcher.own_part import OwnPart
+from launch_scripts.process_table import ProcessSpec
 from launch_scripts.report.recorder import RECORDED, Recorder
+from launch_scripts.report.run_state.model import HEARD
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
@@ -14,34 +18,54 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.vehicles import Followed
-from swarm.wire.topics import FOLLOWED, RUN, STATS
+from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, RUN, STATS, STATUS
 
 _TAG, _GONE_TAG = "launcher-run", "launcher-gone"
 _ASK_TIMEOUT_S = 1.0
+_OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}
+"""What a launcher hears of all processes where another records the run: routes until one is served."""
 _READ_S = 0.1
 """Longest time for which the launcher reads at once: it has processes to look after."""
 
 
 class Watcher:
-    """Listens only. It is no member of the run, so that its absence changes nothing."""
+    """Listens only. It is no member of the run, so that its absence changes nothing.
 
-    def __init__(self, bus: Bus, recorder: Recorder, clock: Clock) -> None:
-        self.recorder = recorder
+    known  what is kept of it. An `OwnPart` is told of the processes in `look_after`, of orders, and of who is there
+    """
+
+    def __init__(self, bus: Bus, known: Recorder | OwnPart, clock: Clock) -> None:
+        self.known = known
         self.notes: list[Note] = []
         self.web_port = 0
         """Where the live view's page is; 0 until that is known."""
         self.routes_served = False
-        self._hears_all_routes = True
+        self._hears = _OF_PART if isinstance(known, OwnPart) else RECORDED
         self._bus = bus
         self._clock = clock
         self._inbox = Inbox()
 
     def begin(self) -> None:
-        for topic, every_s in RECORDED.items():
+        for topic, every_s in self._hears.items():
             # The first route tells that routes are served, sooner than any figures do.
             self._bus.subscribe(topic, self._inbox.post, every_s=0.0 if topic is FOLLOWED else every_s)
         self._bus.watch_alive(self._inbox.post)
-        self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG)  # of a run that this is a part of
+        if not isinstance(self.known, OwnPart):
+            self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG)  # of a run that this is a part of
+
+    def look_after(self, processes: Collection[ProcessSpec]) -> None:
+        """Hear these processes and no others, where another launcher records the run; call it again whenever they
+        may have changed."""
+        if not isinstance(self.known, OwnPart) or self.known.own == (own := frozenset(processes)):
+            return
+        for spec in self.known.own - own:
+            self._bus.unsubscribe(STATS, role=spec.role, id=spec.id)
+            self._bus.unsubscribe(NOTE, role=spec.role, id=spec.id)
+        for spec in own - self.known.own:
+            self._bus.subscribe(STATS, self._inbox.post, role=spec.role, id=spec.id)
+            self._bus.subscribe(NOTE, self._inbox.post, role=spec.role, id=spec.id)
+            self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG, role=spec.role, id=spec.id)
+        self.known.own = own
 
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
@@ -70,20 +94,26 @@ class Watcher:
                     case Stats(role="monitor", web_port=port) if port:
                         self.web_port = port
                     case Followed():
-                        if self._hears_all_routes:
-                            self._hears_all_routes = False
-                            self._bus.unsubscribe(FOLLOWED)
-                            self._bus.subscribe(FOLLOWED, self._inbox.post, every_s=RECORDED[FOLLOWED])
-                        self.routes_served = True
+                        self._served()
                     case PlannerStatus(routes_served=served) if served:
-                        self.routes_served = True
-                self.recorder.heard(message, fields, now_ns)
+                        self._served()
+                self.known.heard(message, fields, now_ns)
             case Replied(tag=tag, message=Stats() as stats) if tag == _GONE_TAG:
-                self.recorder.heard(stats, {}, now_ns)
+                self.known.heard(stats, {}, now_ns)
             case Appeared(peer):
-                self.recorder.alive(peer, True, now_ns)
+                self.known.alive(peer, True, now_ns)
             case Disappeared(peer):
-                self.recorder.alive(peer, False, now_ns)
+                self.known.alive(peer, False, now_ns)
+
+    def _served(self) -> None:
+        """Routes are served: from now on they are heard as they are recorded, or not at all."""
+        if self.routes_served:
+            return
+        self.routes_served = True
+        for topic in (FOLLOWED, STATUS) if isinstance(self.known, OwnPart) else (FOLLOWED,):
+            self._bus.unsubscribe(topic)
+        if not isinstance(self.known, OwnPart):
+            self._bus.subscribe(FOLLOWED, self._inbox.post, every_s=RECORDED[FOLLOWED])
 
 
 def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:

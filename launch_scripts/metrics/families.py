@@ -121,6 +121,7 @@ class Run(NamedTuple):
 class Figures(NamedTuple):
     """What an observer knows of a run.
 
+    run  None where it knows a part of the run only
     up  (role, id) of the processes that are alive
     """
 

@@ -17,6 +17,7 @@ from launch_scripts.monitor.ground.ground_view import GroundView
 from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
+from launch_scripts.monitor.loading import FRAME_HZ
 from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
@@ -42,8 +43,6 @@ log = logging.getLogger(__name__)
 
 _GONE = "gone"
 """Tag of the question what processes that are gone have counted."""
-FRAME_HZ = 10.0
-"""How often the view is drawn."""
 _DRAWN: dict[Topic, float] = {
     FLEET: 0.5 / FRAME_HZ,
     POSE: 0.0,
@@ -68,6 +67,7 @@ class MonitorService:
     truth      the true ground, where this process knows it
     zones      of the scenario
     layers     tabs of the view; the photo if there are none
+    member     one that has joined already; None: one that joins when the service starts
     """
 
     def __init__(
@@ -84,6 +84,7 @@ class MonitorService:
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
         layers: Sequence[Layer] = (),
+        member: Member | None = None,
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
         self.over = False
@@ -92,7 +93,8 @@ class MonitorService:
         self._terrain = terrain
         self._bus = bus
         self._post = post
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._joins = member is None
+        self._member = member or Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._member.web_port = web_port
         self.counters: Counters = self._member.counters
         cost_map = CostMap(terrain, learning=setup.scenario.map.learning)
@@ -135,7 +137,8 @@ class MonitorService:
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns
-        self._member.join()
+        if self._joins:
+            self._member.join()
         for topic, every_s in {**RECORDED, **_DRAWN}.items():
             if topic is not MARKS:
                 self._bus.subscribe(topic, self._post, every_s=every_s)

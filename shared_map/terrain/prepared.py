@@ -162,6 +162,15 @@ def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
     return read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
 
 
+def load_prepared_homes(folder: Path, key: str = "") -> Bools | None:
+    """`homes_of` a prepared terrain and its truth, mapped read-only; None if they are not there."""
+    meta = read_meta(folder / _META, key)
+    if meta is None or "homes" not in meta["arrays"]:
+        return None
+    grid = GridSpec(**meta["grid"])
+    return read_array(folder, "homes", (grid.rows, grid.cols), np.bool_)
+
+
 def read_meta(meta_file: Path, key: str) -> dict[str, Any] | None:
     """A description that `save_ground` left; None if there is none, or one of another key. Raises TerrainError if
     it is unreadable."""
@@ -210,9 +219,10 @@ def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
 
 def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
     """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
-    meta = None if setup.run_dir is None else read_meta(setup.run_dir / _META, scenario_key(setup.scenario))
-    if setup.run_dir is not None and meta is not None and "homes" in meta["arrays"]:
-        return read_array(setup.run_dir, "homes", (terrain.grid.rows, terrain.grid.cols), np.bool_)
+    if setup.run_dir is not None:
+        homes = load_prepared_homes(setup.run_dir, scenario_key(setup.scenario))
+        if homes is not None:
+            return homes
     return homes_of(terrain.pace_s_per_m, truth)
 
 

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _WORKER_NICE = 5
-"""By how much less urgent jobs of a worker are than their process."""
+"""By how much less urgent jobs of a worker are than their process, after the first."""
 
 
 class Service(Protocol):
@@ -66,6 +66,9 @@ class ThreadWorker:
     """A `Worker` on one thread. Kernels release the interpreter's lock, so the process goes on meanwhile. An error
     in a job is raised in the process's own thread, by its next `take`.
 
+    The first job is as urgent as the process: until its result is there, the process has nothing to answer from.
+    Later jobs give way to whoever answers or drives. A thread cannot become more urgent again.
+
     turns  in which long jobs of this machine are run; each at once if not given
     """
 
@@ -89,22 +92,29 @@ class ThreadWorker:
         self._jobs.put(run)
 
     def _work(self) -> None:
-        # Where the processor is short, whoever has to answer or drive in time goes first.
-        thread = threading.get_native_id()
-        with suppress(OSError):  # not every system gives threads a priority of their own
-            nice = os.getpriority(os.PRIO_PROCESS, thread) + _WORKER_NICE
-            os.setpriority(os.PRIO_PROCESS, thread, min(nice, 19))
+        urgent = True
         while (run := self._jobs.get()) is not None and not self._closed:
             try:
                 run()
             except BaseException as error:
                 self._inbox.fail(error)
+            if urgent:
+                urgent = False
+                _give_way()
 
     def close(self) -> None:
         """Begin no other job. The one in hand is left to itself: nobody waits for it, and the process's end ends
         it."""
         self._closed = True
         self._jobs.put(None)
+
+
+def _give_way() -> None:
+    """Make this thread less urgent than the others of its process, by `_WORKER_NICE`."""
+    thread = threading.get_native_id()
+    with suppress(OSError):  # not every system gives threads a priority of their own
+        nice = os.getpriority(os.PRIO_PROCESS, thread) + _WORKER_NICE
+        os.setpriority(os.PRIO_PROCESS, thread, min(nice, 19))
 
 
 def tick_phase(id: str) -> float:

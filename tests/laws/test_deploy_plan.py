@@ -159,6 +159,22 @@ def test_planners_of_an_added_target_start_on_one_machine_each(scenario: Scenari
 
 @settings(max_examples=few(150), deadline=None)
 @given(SCENARIOS, machines())
+def test_one_launcher_records_the_run_on_a_machine_that_has_the_ground(
+    scenario: Scenario, hosts: HostsConfig
+) -> None:
+    plan = planned(scenario, hosts)
+    if plan is None:
+        return
+    records = []
+    for host in plan.hosts:
+        table = tuple(chosen_processes(plan.scenario, [process.selector for process in host.processes], None))
+        records += [host] if table and UpOptions(plan.scenario, Path(), table=table).records else []
+    assert [host.name for host in records] == [plan.records]
+    assert records[0].has_files
+
+
+@settings(max_examples=few(150), deadline=None)
+@given(SCENARIOS, machines())
 def test_each_two_routers_have_one_link_and_every_process_a_router_that_admits_it(
     scenario: Scenario, hosts: HostsConfig
 ) -> None:

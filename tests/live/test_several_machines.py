@@ -78,6 +78,12 @@ def test_launchers_on_two_machines_make_one_run_each_with_the_certificates_of_it
     for process in (part, base):
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0, hands.logs()
+    reports = list(hands.folder.glob("*/small-*/report.json"))
+    assert [path.parent.parent.name for path in reports] == ["runs"]
+    assert json.loads(reports[0].read_text())["routes_served"] >= 12
+    told = swarm("report", *(path.parent for path in hands.folder.glob("car-runs/small-*/run.json")))
+    assert told.returncode != 0
+    assert "the launcher of another machine records the run" in told.stderr
 
 
 def test_a_name_that_is_revoked_is_denied_while_the_router_runs_and_its_successor_is_not(hands: Hands) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import sys
 import threading
@@ -102,6 +103,12 @@ def stubborn(setup: RoleSetup, stop_when: StopWhen) -> None:
 def fail_at_the_end(setup: RoleSetup, stop_when: StopWhen) -> None:
     quiet(setup, stop_when)
     raise RuntimeError("could not write the last page")
+
+
+def end_and_stay(setup: RoleSetup, stop_when: StopWhen) -> None:
+    """Ends as asked, and does not leave: as where a disk that stalls keeps the system from closing its files."""
+    quiet(setup, stop_when)
+    os._exit = lambda code: time.sleep(1000)  # type: ignore[assignment, return-value]
 
 
 def leave_early(setup: RoleSetup, stop_when: StopWhen) -> None:

@@ -1,7 +1,7 @@
 """What a swarm needs on several machines: cores, memory and bytes on links of each, and what is full first. Pure.
 
 Agents and planners go to machines in equal blocks; keeper, targets and monitor run on the first. Each machine has a
-router and a launcher, and every router is linked with every other.
+router and a launcher, that of the first records, and every router is linked with every other.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Needs:
     """What a swarm takes on so many machines.
 
     cpu_cores        role -> cores of all its processes, all machines together
-    process          role -> share of a core that one process takes
+    process          role -> share of a core that one process takes; of launchers the one that records
     machine_cores    cores that work on each machine
     first_cores      on the first
     memory_gb, first_memory_gb  of each machine, of the first
@@ -95,41 +95,38 @@ def needs(
     crossed_bytes = sum(each for _, _, each in crossings)
     cpu = {role: each / 1000 for role, each in model.cpu_ms_per_s(q, change).items()}
     cpu["router"] += _router_cores(model, crossed, crossed_bytes)
+    records = _recorder_cores(model, q, flows, machines)
+    watches = (cpu["launcher"] - records) / (machines - 1) if machines > 1 else 0.0
     count = {
         "agent": q.agents,
         "planner": q.planners,
-        "launcher": machines,
         "router": machines,
         "targets": 1,
         "keeper": q.keepers,
         "monitor": max(monitors, 1),
     }
-    machine_cores = sum(each for role, each in cpu.items() if role not in SINGLE) / machines
-    single = sum(min(cpu[role], 1.0) for role in SINGLE)  # a process takes one core at most, and falls behind
+    shared_cores = sum(each for role, each in cpu.items() if role not in (*SINGLE, "launcher")) / machines
+    # A process takes one core at most, and falls behind.
+    single = min(records, 1.0) + sum(min(cpu[role], 1.0) for role in SINGLE)
     memory = _memory_gb(model, q, machines)
     leaving = sum(
         min(1.0, reached) * (first.put_bytes + OVERHEAD_BYTES * first.puts)
         for first, reached in _reached(flows, q, machines)
     )
     mbit = 8e-6 * (crossed_bytes + OVERHEAD_BYTES * crossed) / machines
-    first_in = 8e-6 * sum(
-        (flow.put_bytes + OVERHEAD_BYTES * flow.puts) * flow.copies
-        for flow in flows
-        if flow.to in SINGLE and flow.sent.source in ("agent", "planner")
-    )
     return Needs(
         size=size,
         machines=machines,
         cpu_cores=cpu,
-        process={role: cpu[role] / count[role] for role in cpu},
-        machine_cores=machine_cores,
-        first_cores=machine_cores + single,
+        process={role: records if role == "launcher" else cpu[role] / count[role] for role in cpu},
+        machine_cores=shared_cores + (watches if machines > 1 else records),
+        first_cores=shared_cores + single,
         memory_gb=memory[0],
         first_memory_gb=memory[1],
         crossings_per_s=crossed,
         link_mbit_per_s=mbit,
         link_out_mbit_per_s=8e-6 * leaving / machines,
-        first_link_mbit_per_s=mbit + (first_in * (1 - 1 / machines) if machines > 1 else 0.0),
+        first_link_mbit_per_s=_first_link_mbit_per_s(flows, q, machines),
         sessions=math.ceil((q.agents + q.planners) / machines) + len(SINGLE) + 1 + machines - 1,
     )
 
@@ -167,6 +164,36 @@ def reached_share(flow: Flow, q: Quantities, machines: int) -> float:
     if flow.to in ("agent", "planner"):
         return min(1.0, flow.copies / machines)
     return 1 / machines  # on the first, whichever machine sends
+
+
+def _first_link_mbit_per_s(flows: Sequence[Flow], q: Quantities, machines: int) -> float:
+    """Into the first machine: what a process takes that runs there alone comes from all others, once however many
+    take it; all else is shared out as on the other machines."""
+    alone = {
+        id(flow.sent)
+        for flow in flows
+        if (flow.to in SINGLE or flow.to == "launcher") and flow.sent.source in ("agent", "planner")
+    }
+    elsewhere = 1 - 1 / machines
+    return 8e-6 * sum(
+        (first.put_bytes + OVERHEAD_BYTES * first.puts)
+        * (elsewhere if id(first.sent) in alone else reached / machines)
+        for first, reached in _reached(flows, q, machines)
+    )
+
+
+def _recorder_cores(model: Model, q: Quantities, flows: Sequence[Flow], machines: int) -> float:
+    """Of the launcher that records: it takes a copy of all that launchers hear, and has a machine's share of the
+    processes."""
+    heard = [flow for flow in flows if flow.to == "launcher"]
+    values = {
+        **term_values(q),
+        "launchers": 1.0,
+        "processes": term_values(q)["processes"] / machines,
+        "messages": sum(flow.puts for flow in heard),
+        "bytes": sum(flow.put_bytes for flow in heard),
+    }
+    return sum(each * values[term] for term, each in model.cpu["launcher"].coefficients.items()) / 1000
 
 
 def _router_cores(model: Model, messages: float, size: float) -> float:

@@ -51,6 +51,7 @@ HEARERS: Mapping[str, Callable[[Quantities], float]] = {
     "monitors": lambda q: q.monitors,
     "launchers": lambda q: q.launchers,
     "one": one,
+    "its own and one": lambda q: 2 - 1 / max(q.launchers, 1),
 }
 """Who takes a copy of a message -> how many they are."""
 
@@ -72,7 +73,9 @@ class Sent:
     why: str
 
 
-_WATCHED = {"launcher": "launchers", "monitor": "monitors"}
+_WATCHED = {"launcher": "one", "monitor": "monitors"}
+_FIGURES = {"keeper": "keepers", "launcher": "its own and one", "monitor": "monitors"}
+"""One launcher records; each hears its own processes (decision 97)."""
 _ALL_MAPS = {"agent": "agents", "planner": "planners", "keeper": "keepers", "monitor": "monitors"}
 
 SENT: tuple[Sent, ...] = (
@@ -220,15 +223,8 @@ SENT: tuple[Sent, ...] = (
         {"targets": "one", **_WATCHED},
         "how a planner is doing",
     ),
-    Sent("stats", "agent", ("agents",), ("agents",), {"keeper": "keepers", **_WATCHED}, "counters, once a second"),
-    Sent(
-        "stats",
-        "planner",
-        ("planners",),
-        ("planners",),
-        {"keeper": "keepers", **_WATCHED},
-        "counters, once a second",
-    ),
+    Sent("stats", "agent", ("agents",), ("agents",), _FIGURES, "counters, once a second"),
+    Sent("stats", "planner", ("planners",), ("planners",), _FIGURES, "counters, once a second"),
     Sent(
         "orders",
         "keeper",
@@ -290,7 +286,7 @@ WORK: tuple[Work, ...] = (
         "launcher",
         ("launchers", "processes", "messages", "bytes"),
         ("launchers", "processes"),
-        "watches its processes, records what all say",
+        "watches its processes; one records what all say",
     ),
 )
 
@@ -306,17 +302,8 @@ def _near(q: Quantities) -> float:
     return q.near
 
 
-def _one_of(q: Quantities) -> float:
-    return 1 / max(q.launchers, 1)
-
-
 CHANGES: Mapping[str, Change] = {
     "as it is": NO_CHANGE,
-    "one launcher records, the others look after their own": {
-        (sent.topic, sent.source, "launcher"): _one_of
-        for sent in SENT
-        if sent.to.get("launcher") and sent.topic in ("fleet", "followed", "marks", "stats", "status", "pose")
-    },
     "agents ask for the costs of targets near": {
         ("cost", "agent", "planner"): _near,
         ("cost", "planner", PUT): _near,

@@ -17,7 +17,7 @@ _VEHICLES_AN_AGENT = 200
 _FEWEST_AGENTS, _MOST_AGENTS = 4, 40
 _MOST_PER_AGENT = 1000
 _MOST_VEHICLES = 100_000
-_LEAST_SIDE, _MOST_SIDE = 32, 16_384
+LEAST_SIDE, MOST_SIDE = 32, 16_384
 
 _SCENARIO = """
 name = "scale"
@@ -130,8 +130,8 @@ def size_of(
                               f"hosts at most {_MOST_PER_AGENT} vehicles, and there are {vehicles}")  # fmt: skip
     _between("--per-agent", per_agent, 1, _MOST_PER_AGENT)
     if side is None:
-        side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), _LEAST_SIDE)
-    _between("--size", side, _LEAST_SIDE, _MOST_SIDE)
+        side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), LEAST_SIDE)
+    _between("--size", side, LEAST_SIDE, MOST_SIDE)
     if side * side < 4 * vehicles:
         raise ConfigError(
             f"--size is {side}, expected {math.isqrt(4 * vehicles) + 1} or more for {vehicles} vehicles"

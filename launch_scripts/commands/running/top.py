@@ -9,7 +9,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group
@@ -18,12 +18,13 @@ from rich.text import Text
 
 from launch_scripts.commands.running.observer import RunObserver
 from launch_scripts.launcher.lasting_output import make_output_last
-from launch_scripts.launcher.live_table import columns, fitted
+from launch_scripts.launcher.live_table import fitted
+from launch_scripts.launcher.loads_table import loads_table
 from launch_scripts.launcher.watcher import ask_run
 from launch_scripts.process_table import ROLES
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.plan import run_of_most
-from launch_scripts.report.run_state.process_load import ProcessLoad, RoleLoad, by_role
+from launch_scripts.report.run_state.process_load import ProcessLoad, by_role
 from launch_scripts.report.run_state.state import RunState
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -73,12 +74,7 @@ def top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_jso
 
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
     """The run at an instant, at most 80 columns wide."""
-    load = columns("process" if each else "role", "up", "CPU %", "memory", "late/s", "messages/s", "restarts")
-    if not each:
-        load.add_column("busiest", no_wrap=True, overflow="ellipsis")
-    lines: Sequence[ProcessLoad | RoleLoad] = processes if each else by_role(processes, ROLES)
-    for line in lines:
-        load.add_row(*_row(line), style=_style(line))
+    load = loads_table(processes if each else by_role(processes, ROLES), each=each)
     title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').shown(state)}", style="bold")
     alarms = (Text(line, style="red") for line in facts.alarm_lines(state, _SHOWN_ALARMS))
     return fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)
@@ -105,29 +101,6 @@ def fields_of(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> di
             for line in processes
         ],
     }
-
-
-def _row(line: ProcessLoad | RoleLoad) -> tuple[str, ...]:
-    told = (
-        _number(line.cpu_percent),
-        "-" if line.rss_bytes is None else f"{line.rss_bytes / (1 << 20):,.0f} MB",
-        _number(line.late_per_s),
-        facts.count(line.messages_per_s),
-        str(line.restarts),
-    )
-    if isinstance(line, ProcessLoad):
-        return line.name, facts.seconds(line.up_s) if line.alive else "gone", *told
-    busiest = f"{line.busiest.name} {line.busiest.cpu_percent:.0f} %" if line.busiest and line.known > 1 else ""
-    return line.role, f"{line.alive} of {line.known}", *told, busiest
-
-
-def _style(line: ProcessLoad | RoleLoad) -> str | None:
-    whole = line.alive if isinstance(line, ProcessLoad) else line.alive == line.known
-    return "yellow" if line.restarts and whole else None if whole else "red"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"
 
 
 def _rounded(value: float | None) -> float | None:

@@ -16,7 +16,7 @@ from launch_scripts.report.geo.geo_layers import (
     write_layers,
 )
 from launch_scripts.report.geo.track_file import TRACKS_FILE, RunTracks, read_tracks
-from launch_scripts.report.results.run_folder import REPORT_FILE, read_report
+from launch_scripts.report.results.run_folder import REPORT_FILE, lacks, read_report
 from shared_map.terrain.places import MapFrame
 from swarm.errors import ConfigError, StoreError
 
@@ -48,7 +48,7 @@ def tracks_of_run(folder: Path) -> RunTracks:
     """Raises ConfigError or StoreError in one sentence."""
     path = folder / TRACKS_FILE
     if not path.exists():
-        raise ConfigError(f"{folder} has no {TRACKS_FILE}: the run has not ended yet, or its launcher was killed")
+        raise lacks(folder, TRACKS_FILE)
     return read_tracks(path)
 
 

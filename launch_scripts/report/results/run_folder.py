@@ -24,12 +24,22 @@ LAST = "LAST"
 _PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
 
 
-def begin_run(folder: Path, scenario: Scenario, run_id: str) -> list[str]:
+def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True) -> list[str]:
     """Write `scenario.toml` and `run.json`, and make `LAST` point here. Returns what a person should know: a run
-    goes on without them, as on a full disk."""
+    goes on without them, as on a full disk.
+
+    recorded  whether a report follows; else another launcher of the run makes it
+    """
     began = _now()
     head = f"# Run {run_id}, {began}: every setting that it ran with. `swarm up` runs it again.\n"
-    facts = {"run_id": run_id, "scenario": scenario.name, "seed": scenario.seed, "began": began, **made_with()}
+    facts = {
+        "run_id": run_id,
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "began": began,
+        "recorded": recorded,
+        **made_with(),
+    }
     said = []
     for name, text in (
         (SCENARIO_FILE, head + scenario_text(scenario, Path.cwd())),
@@ -60,14 +70,20 @@ def made_with() -> dict[str, Any]:
 
 def ended(folder: Path) -> dict[str, Any]:
     """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
+    facts = _facts(folder)
+    if not facts:
+        return {}
+    kept: dict[str, Any] = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
+    return {"began": kept.pop("began", None), "ended": _now(), **kept}
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """What `run.json` says; empty where it cannot be read."""
     try:
         facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    if not isinstance(facts, dict):
-        return {}
-    kept = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
-    return {"began": kept.pop("began", None), "ended": _now(), **kept}
+    return facts if isinstance(facts, dict) else {}
 
 
 def point_last(folder: Path) -> str | None:
@@ -105,11 +121,19 @@ def find_run(name: str, runs: Path) -> Path:
     raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}")
 
 
+def lacks(folder: Path, file: str) -> ConfigError:
+    """The error where a run's folder lacks a file that a run leaves at its end, and why it does."""
+    why = "the run has not ended yet, or its launcher was killed"
+    if _facts(folder).get("recorded") is False:
+        why = "the launcher of another machine records the run, and leaves it in its own folder"
+    return ConfigError(f"{folder} has no {file}: {why}")
+
+
 def read_report(folder: Path) -> dict[str, Any]:
     """`report.json` of a run. Raises ConfigError or StoreError in one sentence."""
     path = folder / REPORT_FILE
     if not path.exists():
-        raise ConfigError(f"{folder} has no {REPORT_FILE}: the run has not ended yet, or its launcher was killed")
+        raise lacks(folder, REPORT_FILE)
     try:
         report = json.loads(
             read_text(path, FileKind.RUN), parse_int=_whole, parse_float=_finite, parse_constant=_finite

@@ -13,6 +13,7 @@ from launch_scripts.report.results.certified_gap import CertifiedGap, gap_text, 
 from launch_scripts.report.run_state.alarms import Alarm
 from launch_scripts.report.run_state.state import RunState, TargetLine
 from swarm.config.classes import GROUND
+from swarm.grid import GridSpec
 
 NONE = "-"
 """What is shown where nothing is known."""
@@ -235,10 +236,14 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
 
     over  also what is over
     """
-    alarms = state.alarms if over else state.standing_alarms
+    return lines_of(state.alarms if over else state.standing_alarms, state.grid, most)
+
+
+def lines_of(alarms: Iterable[Alarm], grid: GridSpec, most: int) -> list[str]:
+    """Alarms in lines for people, and how many lines are left out."""
     found: list[str] = []
     for group in grouped(alarms):
-        found += [together(group)] if len(group) > 1 else [alarm.line(state.grid) for alarm in group]
+        found += [together(group)] if len(group) > 1 else [alarm.line(grid) for alarm in group]
     return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
 
 

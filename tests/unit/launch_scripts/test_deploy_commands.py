@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner, Result
 
 from launch_scripts.commands.deploy import app
-from launch_scripts.deploy.certificates import check_signed, hosts_of, issue
+from launch_scripts.deploy import certificates
+from launch_scripts.deploy.certificates import THIS_MACHINE, check_signed, hosts_of
 from launch_scripts.launcher.options import as_process, tls_of
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.load import load_scenario
@@ -74,22 +76,6 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
         as_process(loaded, "keeper", "west")
 
 
-def test_what_has_expired_is_made_anew_for_the_same_hosts(tmp_path: Path, scenario: Path) -> None:
-    certs = tmp_path / "certs"
-    run("certs", certs, "--scenario", scenario, "router.0=10.0.0.1,base.local")
-    names = ("router.0", "keeper.0")
-    for name in names:
-        issue(certs, name, sorted(hosts_of(certs / f"{name}.pem")), 0, renew=True)
-    hosts = hosts_of(certs / "router.0.pem")
-    before = {path: path.read_bytes() for path in certs.iterdir()}
-    assert run("certs", certs, "--scenario", scenario).exit_code == 0
-    changed = {path.stem + path.suffix for path in certs.iterdir() if path.read_bytes() != before[path]}
-    assert changed == {f"{name}.{kind}" for name in names for kind in ("pem", "key")}
-    assert hosts_of(certs / "router.0.pem") == hosts == {"10.0.0.1", "base.local", "localhost", "127.0.0.1"}
-    for name in names:
-        check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
-
-
 def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: Path, scenario: Path) -> None:
     certs, revoked = tmp_path / "certs", "agent.all.a0"
     run("certs", certs, "--scenario", scenario)
@@ -101,6 +87,23 @@ def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: P
     assert common_name(certs, revoked) == f"{revoked}~2"
     changed = {path.stem for path, was in before.items() if path.read_bytes() != was}
     assert changed == {revoked}
+
+
+def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it_had(
+    tmp_path: Path, scenario: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certs = tmp_path / "certs"
+    with monkeypatch.context() as earlier:
+        earlier.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
+        run("certs", certs, "router.0=10.0.0.1,base.local", "keeper.0", "--days", 9)  # less than a third is left
+        run("certs", certs, "planner.t0", "--days", 11)
+    before = {path.stem: path.read_bytes() for path in certs.glob("*.pem")}
+    assert run("certs", certs, "--scenario", scenario).exit_code == 0
+    changed = {name for name, was in before.items() if (certs / f"{name}.pem").read_bytes() != was}
+    assert changed == {"router.0", "keeper.0"}
+    assert hosts_of(certs / "router.0.pem") == {"10.0.0.1", "base.local", *THIS_MACHINE}
+    for name in before:
+        check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
 
 
 def test_a_name_that_the_router_would_not_know_is_refused_before_anything_is_made(tmp_path: Path) -> None:
@@ -135,6 +138,7 @@ def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: 
     assert shown.exit_code == 0
     assert {"m1", "m2", "m3"} <= set(shown.stdout.split())
     assert "1 of 3 machines may be lost at once" in shown.stdout
+    assert " records the run and writes its report" in shown.stdout
     assert not kits.exists()
     told = run("plan", scenario, "--hosts", hosts, "--out", kits, "--json")
     plan = json.loads(told.stdout)

@@ -16,6 +16,7 @@ from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
+from launch_scripts.launcher.run_processes import has_ended
 from launch_scripts.launcher.up import run_swarm
 from launch_scripts.launcher.up_options import UpOptions, chosen_processes
 from launch_scripts.launcher.warm_up import WarmUp
@@ -256,6 +257,31 @@ def test_who_does_not_end_when_asked_is_killed_and_named(
     for line in ("+agent-a0", "+router-0"):
         wait_for_line(tmp_path / "order.txt", line)
     assert "agent-a0 did not end within 0.5 s and was killed" in swarm.stop(lambda: time.sleep(0.02))
+
+
+def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_failure(
+    swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = [("agent", "a0", "end_and_stay"), ("keeper", "0", "end_and_stay"), ("router", "0", "quiet")]
+    swarm = swarm_of(swarms, tmp_path, *rows)
+    swarm.start()
+    for role, id, _ in rows:
+        wait_for_line(tmp_path / "order.txt", f"+{role}-{id}")
+    pids = [running.process.pid for running in swarm.running if running.process]
+    waited_for: list[str] = []
+
+    def before(role: str) -> None:
+        waited_for.append(role)
+        if role == "router":  # all others have been waited for: now little time is left to leave
+            monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 1.0)
+
+    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 60.0)
+    assert swarm.stop(lambda: time.sleep(0.02), before) == []
+    assert waited_for == ["agent", "keeper", "router"]
+    assert "agent-a0 has ended and does not leave: " in caplog.text
+    assert "router-0 has ended" not in caplog.text
+    assert swarm.by_role() == {"agent": (0, 1), "keeper": (0, 1), "router": (0, 1)}
+    eventually(lambda: all(pid is not None and has_ended(pid) for pid in pids), 10)
 
 
 def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed_is_named(

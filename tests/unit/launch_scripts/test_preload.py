@@ -52,6 +52,25 @@ def test_what_one_process_or_none_needs_is_not_loaded_for_all() -> None:
     assert {"rerun", "rasterio", "matplotlib", "PIL", "pyarrow", "typer"}.isdisjoint(loaded)
 
 
+_LAUNCHER = """
+import json, sys
+import numpy as np
+import launch_scripts.cli
+from launch_scripts.launcher import up
+from launch_scripts.simulation.worlds import crowd
+
+scenario, terrain = crowd("open", 1, 8, 4)
+up.check_places(scenario, terrain, terrain.pace_s_per_m, np.isfinite(terrain.pace_s_per_m))
+print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+"""
+
+
+def test_a_launcher_checks_a_prepared_terrain_without_a_library_that_is_large() -> None:
+    loaded = json.loads(_python(_LAUNCHER))
+    assert "numpy" in loaded
+    assert {"scipy", "numba", "rerun", "rasterio", "matplotlib", "PIL", "pyarrow"}.isdisjoint(loaded)
+
+
 @pytest.mark.parametrize(
     ("words", "starts"),
     [

@@ -105,6 +105,11 @@ def test_a_relative_path_of_a_scenario_leads_to_the_same_file_when_written(tmp_p
     facts = json.loads((folder / "run.json").read_text())
     assert facts["versions"]["numpy"] == np.__version__
     assert (facts["run_id"], facts["seed"]) == ("r1", 1)
+    with pytest.raises(ConfigError, match="has not ended yet"):
+        read_report(folder)
+    begin_run(folder, scenario, "r1", recorded=False)
+    with pytest.raises(ConfigError, match="the launcher of another machine records the run"):
+        read_report(folder)
 
 
 # --- which run was last -------------------------------------------------------------------------------------------

@@ -356,8 +356,12 @@ def test_the_model_is_shown_and_drawn_without_measuring(tmp_path: Path) -> None:
         (bench, ["scaling", "--kinds", "none", "--write", "no/page.md"], "no/page.md, which cannot be read"),
         (bench, ["scaling", "--kinds", "none", "--rows", "/nowhere"], "has no measurements of simulations"),
         (deploy, ["size", "--vehicles", "0"], "--vehicles is 0, expected 1 to 100000"),
-        (deploy, ["size", "--map", "0"], "--map is 0, expected a number of cells"),
-        (deploy, ["size", "--vehicles", "100", "--map", "100"], "--size is 10, expected 32"),
+        (deploy, ["size", "--map", "0"], "--map is 0, expected 4000 to 268435456 cells for 1000 vehicles"),
+        (deploy, ["size", "--vehicles", "100", "--map", "100"], "--map is 100, expected 1024 to"),
+        (deploy, ["size", "--vehicles", "100", "--map", "300000000"], "--map is 300000000, expected 1024 to"),
+        (deploy, ["size", "--memory", "inf"], "--memory is inf, expected a number"),
+        (deploy, ["size", "--link", "inf"], "--link is inf, expected a number"),
+        (deploy, ["size", "--tick-hz", "inf"], "--tick-hz is inf, expected 0.1 to 100"),
     ],
 )
 def test_an_option_that_cannot_be_is_named(command: Any, options: list[str], complaint: str) -> None:

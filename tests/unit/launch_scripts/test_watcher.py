@@ -1,15 +1,31 @@
-"""The launcher's watcher hears positions at the pace at which it records them, and no more than it needs."""
+"""The launcher's watcher hears positions at the pace at which it records them, and no more than it needs: one that
+records nothing hears its own processes."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
 from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
+from launch_scripts.launcher.own_part import OwnPart
+from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.launcher.watcher import Watcher
+from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
 from launch_scripts.report.recorder import Recorder
-from swarm.wire.messages.processes import Stats
+from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
+from swarm.liveness import Peer
+from swarm.ranks import split_rank
+from swarm.wire.messages.orders import Order, Orders
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Alarm, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import FLEET, FOLLOWED, STATS
+from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, STATS, STATUS
 
 
 def begun(swarm: SwarmModel) -> tuple[Watcher, list[object]]:
@@ -66,3 +82,132 @@ def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone
         swarm.run(3)
         watcher.listen(0.0)
         assert watcher.web_port == (port if role == "monitor" else 0)
+
+
+# --- a launcher that records nothing -----------------------------------------------------------------------------
+
+SCENARIO = parse_scenario(
+    '[[targets]]\nname = "t"\ncount = 3\n[[groups]]\nname = "all"\nvehicles = 80\n[standbys]\nplanner = 1'
+)
+PROCESSES = tuple(processes_of(SCENARIO))
+
+
+def figures(spec: ProcessSpec, stamp_ns: int = 1, alarms: tuple[Alarm, ...] = (), **counts: int) -> Stats:
+    return Stats(
+        role=spec.role, id=spec.id, incarnation=7, stamp_ns=stamp_ns, counts=counts, gauges={}, histograms={},
+        alarms=alarms,
+    )  # fmt: skip
+
+
+def status(target: str) -> PlannerStatus:
+    return PlannerStatus(
+        target=target, incarnation=1, stamp_ns=0, strategy="full", target_cell=0, map_version=1, tree_age_ms=1.0,
+        window=[], growths=3, window_growths=2, growth_ms=1.5, routes_served=9, following=1,
+    )  # fmt: skip
+
+
+class Part:
+    """A launcher that looks after some processes, and a swarm whose processes all speak."""
+
+    def __init__(self, *own: ProcessSpec) -> None:
+        self.swarm = SwarmModel()
+        self.known = OwnPart(self.swarm.terrain.grid, 0)
+        self.watcher = Watcher(self.swarm.bus("launcher"), self.known, self.swarm.scheduler.clock)
+        self.watcher.begin()
+        self.watcher.look_after(own)
+        self.buses = {spec: self.swarm.bus(spec.name) for spec in PROCESSES}
+        self.said = 0
+
+    def speak(self) -> None:
+        """Everybody says everything that a recorder hears."""
+        self.said += 1
+        for spec, bus in self.buses.items():
+            bus.publish(STATS, figures(spec, self.said, captures=self.said), role=spec.role, id=spec.id)
+            note = Note(role=spec.role, id=spec.id, stamp_ns=self.said, kind="x", text=f"{spec.name} {self.said}")
+            bus.publish(NOTE, note, role=spec.role, id=spec.id)
+            if spec.role == "agent":
+                report = fleet(100.0 * self.said, (f"{spec.id}-00", self.said))
+                bus.publish(FLEET, report, region=0, author=report.author)
+                bus.publish(FOLLOWED, followed(), agent="a0", vehicle="a0-00")
+            elif spec.role == "planner" and not split_rank(spec.id)[1]:
+                bus.publish(STATUS, status(spec.id), target=spec.id)
+        self.swarm.run(0.2)
+        self.watcher.listen(0.0)
+
+    def deliveries(self) -> list[str]:
+        """Topics of what has arrived at the launcher."""
+        return [topic for _, _, to, topic, payload in self.swarm.deliveries if to == "launcher" and payload]
+
+
+@settings(max_examples=20)
+@given(st.sets(st.sampled_from(PROCESSES), max_size=6), st.sets(st.sampled_from(PROCESSES), max_size=6))
+def test_whatever_processes_it_has_it_hears_those_and_no_others_also_after_they_have_changed(
+    first: set[ProcessSpec], then: set[ProcessSpec]
+) -> None:
+    part = Part(*first)
+    part.speak()
+    part.watcher.take_notes()
+    for own in (first, then):
+        part.watcher.look_after(own)
+        part.swarm.run(0.1)
+        part.speak()
+        notes = part.watcher.take_notes()
+        assert sorted(note.text for note in notes) == sorted(f"{spec.name} {part.said}" for spec in own)
+    newest = part.known.observed.newest()
+    assert {key for key, stats in newest.items() if stats.stamp_ns == part.said} == {(s.role, s.id) for s in then}
+    assert set(part.deliveries()) <= {"stats", "note", "followed", "status"}
+    for topic, role in (("followed", "agent"), ("status", "planner")):
+        together = sum(spec.role == role for spec in PROCESSES)
+        assert part.deliveries().count(topic) <= together, "only those that came together with the first"
+    assert part.watcher.routes_served
+
+
+def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_anywhere() -> None:
+    part = Part(planner_spec("t0"))
+    keeper = part.swarm.bus("keeper")
+    order = Order(subject="target", name="late", stamp_ns=1, off=False, added=True, cell=3)
+    keeper.publish(ORDERS, Orders(role="keeper", id="0", orders=(order,)), role="keeper", id="0")
+    part.swarm.run(1.0)
+    part.watcher.listen(0.0)
+    assert "late" in part.known.book.targets(SCENARIO)
+
+
+def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machine_is_not() -> None:
+    mine, other = planner_spec("t0"), planner_spec("t1")
+    known = OwnPart(SwarmModel().terrain.grid, 0)
+    known.own = frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))})
+    now_ns = 100 * NS_PER_S
+    for spec in (mine, other):
+        known.alive(Peer(spec.role, spec.id, 7), True, now_ns)
+        known.heard(figures(spec, now_ns), {}, now_ns)
+    assert known.alarms(now_ns) == ()
+    for spec in (mine, other):
+        known.alive(Peer(spec.role, spec.id, 7), False, now_ns)
+    assert [alarm.about for alarm in known.alarms(now_ns)] == ["planner-t0"]
+    assert known.up() == []
+    assert "0 of 3" in known.line("x", now_ns)
+    assert "planner-t0 is gone" in known.line("x", now_ns)
+
+
+@pytest.mark.parametrize(("height", "shown"), [(40, "planner-t2"), (8, "planner")])
+def test_its_table_has_a_line_for_each_process_or_where_room_lacks_for_each_role(height: int, shown: str) -> None:
+    known = OwnPart(SwarmModel().terrain.grid, 0)
+    known.own = frozenset(processes_of(SCENARIO, ("planner",)))
+    for spec in known.own:
+        known.alive(Peer(spec.role, spec.id, 7), True, 0)
+        for stamp_ns in (1, NS_PER_S):
+            known.heard(figures(spec, stamp_ns), {}, stamp_ns)
+    console = Console(width=80, height=height, record=True)
+    console.print(known.table("x", NS_PER_S, console))
+    text = console.export_text()
+    assert shown in text
+    assert ("planner-t2" in text) == (shown == "planner-t2")
+
+
+def test_of_the_launchers_of_any_plan_by_machines_one_records(tmp_path: Path) -> None:
+    of_keeper = [spec for spec in PROCESSES if spec.role in ("router", "keeper")]
+    others = tuple(spec for spec in PROCESSES if spec not in of_keeper)
+    assert UpOptions(SCENARIO, tmp_path).records
+    assert UpOptions(SCENARIO, tmp_path, table=tuple(of_keeper)).records
+    assert not UpOptions(SCENARIO, tmp_path, table=others).records
+    assert not UpOptions(SCENARIO, tmp_path, table=(ProcessSpec("keeper", "1", ""), *others)).records

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -297,6 +298,22 @@ def test_a_worker_gives_its_result_back_as_an_event():
     with pytest.raises(ZeroDivisionError):
         inbox.take(5.0)
     worker.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no priority of their own")
+def test_the_first_job_of_a_worker_is_as_urgent_as_its_process_and_later_ones_give_way():
+    inbox = Inbox()
+    worker = ThreadWorker("w", inbox)
+    ours = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    found = []
+    for _ in range(3):
+        worker.submit("j", lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), inbox.post)
+        done = inbox.take(5.0)
+        assert isinstance(done, WorkDone)
+        found.append(done.result)
+    worker.close()
+    later = min(ours + 5, 19)
+    assert found == [ours, later, later]
 
 
 def test_closing_a_worker_waits_for_no_job_and_begins_no_other():
