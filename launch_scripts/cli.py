@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import signal
-import sys
 import time
 from contextlib import nullcontext
 from functools import cache
@@ -14,11 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.exceptions import TyperException
 
-from launch_scripts.command_line import complete, usage
+from launch_scripts.command_line import complete
 from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
+from launch_scripts.command_line.run_command import run_command
 from launch_scripts.commands import afterwards, before, chaos, health, mavlink, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
@@ -30,7 +27,7 @@ from launch_scripts.commands.shared_options import (
     Tls,
     spread,
 )
-from swarm.errors import ConfigError, StoreError, SwarmError
+from swarm.errors import ConfigError
 from swarm.ranks import HIGHEST_RANK
 
 
@@ -377,60 +374,4 @@ def command() -> Any:
 
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
-    # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
-    asked: list[int] = []
-
-    def stop(number: int, frame: object) -> None:
-        asked.append(number)
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, stop)
-    _fill_streams()
-    try:
-        try:
-            code = command().main(prog_name="swarm", standalone_mode=False)
-        finally:
-            sys.stdout.flush()
-    except TyperException as error:
-        if said := usage.sentence(error):
-            print(f"swarm: {said}", file=sys.stderr)
-        return ConfigError.exit_code
-    except typer.Abort:
-        print("swarm: stopped; nothing is written", file=sys.stderr)
-        return 1
-    except SwarmError as error:
-        print(f"swarm: {error}", file=sys.stderr)
-        return error.exit_code
-    except BrokenPipeError:
-        _leave_output()
-        return 0
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
-            raise
-        _leave_output()
-        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
-        return StoreError.exit_code
-    except KeyboardInterrupt:
-        code = 128 + signal.SIGINT
-    if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
-        print("swarm: stopped", file=sys.stderr)
-    return code if isinstance(code, int) else 0
-
-
-def _fill_streams() -> None:
-    """Let standard streams that were closed lead nowhere: the next file that is opened would take their place, and
-    get what is printed."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            nowhere = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
-            if nowhere != number:
-                os.dup2(nowhere, number)
-                os.close(nowhere)
-            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
-
-
-def _leave_output() -> None:
-    """Send what still waits to be printed nowhere: the interpreter would complain about it at its end."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
+    return run_command(command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +42,8 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     kept = sweep.trials - len(sweep.missing)
     if kept:
         console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
+    # As a batch system or `timeout` ends it: workers and their folder go with it.
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         _run(sweep, console, workers or cores(), scheduler)
     except KeyboardInterrupt:

@@ -73,6 +73,8 @@ def local_client(workers: int) -> Iterator[Client]:
 @contextlib.contextmanager
 def client_of(address: str) -> Iterator[Client]:
     """A cluster that is there. Raises BusError where no scheduler answers."""
+    # It writes a traceback where a scheduler is lost, which `run_trials` tells of in a sentence.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except Exception as error:  # also bytes that are not its protocol, and TLS without a certificate

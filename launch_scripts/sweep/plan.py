@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 
+from launch_scripts.deploy.host_scenario import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
 from launch_scripts.simulation.campaign import MIX, world_of
 from launch_scripts.simulation.trial import SECONDS
@@ -19,7 +20,6 @@ from launch_scripts.sweep.study import Case, Study, cases_of, is_file
 from launch_scripts.sweep.trial import Trial
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.load import parse_scenario
-from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 
@@ -97,14 +97,12 @@ def _with_content(value: Any) -> Any:
         case list() | tuple():
             return [_with_content(each) for each in value]
         case str() if value.startswith("/") and Path(value).is_file():
-            return {"file": _file_digest(value)}
+            return {"file": [_file_digest(str(path)) for path in (Path(value), *parts_of(Path(value)))]}
     return value
 
 
-def _plugins(scenario: Scenario) -> list[str]:
-    if not any(":" in each.name for each in plugins_of(scenario)):
-        return []
-    return [_file_digest(str(path)) for path in sorted(Path(scenario.plugin_folder).glob("*.py"))]
+def _plugins(scenario: Scenario) -> dict[str, str]:
+    return {place: _file_digest(str(path)) for place, path in plugin_files(scenario).items()}
 
 
 @cache

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from swarm.config.input_files import shown
+from swarm.config.input_files import MAX_DEPTH, shown
 from swarm.errors import ConfigError
 
 EACH = "*"
@@ -27,6 +27,8 @@ def with_settings(raw: Mapping[str, Any], settings: Mapping[str, Any], source: s
     setting is left to the check of types. Raises ConfigError, which begins with `source`."""
     changed: dict[str, Any] = copy.deepcopy(dict(raw))
     for key, value in settings.items():
+        if key.count(".") >= MAX_DEPTH:
+            raise ConfigError(f"{source}: {shown(key)}: a key has more than {MAX_DEPTH} parts")
         _set(changed, key.split("."), value, f"{source}: {key}")
     return changed
 

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from support.live_swarm import SMALL_WORLD
 from support.machines import Machines, machines, why_not
 from support.onlooker import Onlooker
 from support.processes import eventually
@@ -40,20 +41,7 @@ SCENARIO = f"""
 name = "small"
 seed = 3
 time_scale = 4
-[terrain]
-source = "synthetic"
-rows = 96
-cols = 128
-resolution_m = 30
-relief_m = 300
-roads = 4
-[terrain.hidden]
-rubble_fields = 5
-[[targets]]
-count = 2
-walk = "waypoints"
-[[groups]]
-vehicles = 12
+{SMALL_WORLD}
 [vehicles]
 per_agent = {PER_AGENT}
 """

@@ -53,12 +53,16 @@ def crash_twice(setup: RoleSetup, stop_when: StopWhen) -> None:
 
 
 class Idle:
-    """A service without any work, which starts a thread that dies."""
+    """A service without any work, which is ready at once."""
 
-    counters = Counters()
+    def __init__(self) -> None:
+        self.counters = Counters()
+
+    def lacks(self) -> list[str]:
+        return []
 
     def start(self, now_ns: int) -> None:
-        threading.Thread(target=lambda: [][1], name="reader").start()
+        pass
 
     def handle(self, event: Event, now_ns: int) -> None:
         pass
@@ -70,8 +74,15 @@ class Idle:
         pass
 
 
+class LosesAThread(Idle):
+    """It starts a thread that dies."""
+
+    def start(self, now_ns: int) -> None:
+        threading.Thread(target=lambda: [][1], name="reader").start()
+
+
 def lose_a_thread(setup: RoleSetup, stop_when: StopWhen) -> None:
-    Process(Idle(), Inbox(), MonotonicClock(), tick_hz=20.0).run()
+    Process(LosesAThread(), Inbox(), MonotonicClock(), tick_hz=20.0).run()
 
 
 def hang_in_native_code(setup: RoleSetup, stop_when: StopWhen) -> None:
@@ -104,35 +115,17 @@ def leave_early(setup: RoleSetup, stop_when: StopWhen) -> None:
     sys.exit(0)
 
 
-class Ticking:
-    """A service without any work, which is ready at once."""
-
-    def __init__(self) -> None:
-        self.counters = Counters()
-
-    def lacks(self) -> list[str]:
-        return []
-
-    def start(self, now_ns: int) -> None:
-        pass
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        pass
-
-    def tick(self, now_ns: int) -> None:
-        pass
-
-    def stop(self, now_ns: int) -> None:
-        pass
-
-
-def tick(setup: RoleSetup, stop_when: StopWhen) -> None:
-    process = Process(Ticking(), Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
+def _run(setup: RoleSetup, service: Idle) -> None:
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
     process.stop_on_signals()
     process.run()
 
 
-class StandsStill(Ticking):
+def tick(setup: RoleSetup, stop_when: StopWhen) -> None:
+    _run(setup, Idle())
+
+
+class StandsStill(Idle):
     """Its third tick never ends, in the first life of the process."""
 
     def __init__(self, marker: Path) -> None:
@@ -152,7 +145,4 @@ class StandsStill(Ticking):
 
 def stand_still(setup: RoleSetup, stop_when: StopWhen) -> None:
     assert setup.run_dir is not None
-    service = StandsStill(setup.run_dir / "stood still")
-    process = Process(service, Inbox(), MonotonicClock(), tick_hz=20.0, health=setup.health)
-    process.stop_on_signals()
-    process.run()
+    _run(setup, StandsStill(setup.run_dir / "stood still"))

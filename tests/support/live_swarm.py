@@ -24,12 +24,7 @@ from swarm.wire.topics import RUN, Topic
 
 SWARM = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
-_SCENARIO = """
-name = "small"
-seed = 3
-seconds = 300
-time_scale = 10
-
+SMALL_WORLD = """
 [terrain]
 source = "synthetic"
 rows = 96
@@ -47,13 +42,19 @@ walk = "waypoints"
 
 [[groups]]
 vehicles = 12
-
+"""
+_SCENARIO = f"""
+name = "small"
+seed = 3
+seconds = 300
+time_scale = 10
+{SMALL_WORLD}
 [vehicles]
 per_agent = 6
 
 [network]
-listen = ["tcp/127.0.0.1:{port}"]
-connect = ["tcp/127.0.0.1:{port}"]
+listen = ["tcp/127.0.0.1:{{port}}"]
+connect = ["tcp/127.0.0.1:{{port}}"]
 
 [monitor]
 grpc_port = 0

@@ -27,8 +27,7 @@ from launch_scripts.sweep.store import ResultStore
 from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study, study_names, study_path
 from launch_scripts.sweep.summary import Summary
 from launch_scripts.sweep.trial import Result, Trial, numbers, run_trial
-from swarm.config.dotted import flat, with_settings
-from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.load import load_scenario
 from swarm.errors import ConfigError, StoreError
 
 
@@ -44,52 +43,6 @@ def finished(path: Path, out: Path, captures: dict[int, float]) -> tuple[Sweep, 
             sweep.store.add(result_of(trial, captures=captures[trial.seed] + number, marks=5.0))
     sweep.store.flush()
     return sweep, sweep.finish()
-
-
-# --- settings by dotted keys -----------------------------------------------------------------------------------
-
-_TABLES = st.recursive(
-    st.integers() | st.text(max_size=3) | st.lists(st.integers(), max_size=2),
-    lambda inner: st.dictionaries(st.text("abc", min_size=1, max_size=2), inner, min_size=1, max_size=3),
-    max_leaves=8,
-)
-
-
-@given(st.dictionaries(st.text("abc", min_size=1, max_size=2), _TABLES, max_size=3))
-def test_what_is_set_key_by_key_into_nothing_is_the_table_itself(table):
-    assert with_settings({}, dict(flat(table)), "x") == table
-
-
-def test_a_setting_takes_the_place_of_what_the_file_says_and_the_file_stays_as_it_was():
-    raw = {"groups": [{"vehicles": 2}, {"vehicles": 3}], "map": {"learning": True}}
-    changed = with_settings(raw, {"groups.*.vehicles": 7, "groups.1.name": "b", "map.digest_s": 2.0}, "x")
-    assert changed == {
-        "groups": [{"vehicles": 7}, {"vehicles": 7, "name": "b"}],
-        "map": {"learning": True, "digest_s": 2.0},
-    }
-    assert raw == {"groups": [{"vehicles": 2}, {"vehicles": 3}], "map": {"learning": True}}
-
-
-@pytest.mark.parametrize(
-    ("key", "said"),
-    [
-        ("groups.2.vehicles", "x: groups.2.vehicles: found '2' in a list, expected a number from 0 to 0 or '*'"),
-        ("groups.vehicles", "found 'vehicles' in a list"),
-        ("groups.-1.vehicles", "found '-1' in a list"),
-        ("name.first", "x: name.first: found 'n' above 'first', expected a table"),
-        ("empty.0", "expected nothing, as it is empty, or '*'"),
-    ],
-)
-def test_a_key_that_leads_nowhere_is_refused_with_what_was_found(key, said):
-    with pytest.raises(ConfigError) as error:
-        with_settings({"groups": [{"vehicles": 1}], "name": "n", "empty": []}, {key: 1}, "x")
-    assert said in str(error.value)
-
-
-def test_a_preset_as_a_setting_brings_its_own_settings():
-    text = '[cost]\npreset = "hiker"'
-    wheeled = parse_scenario(text, settings={"cost.preset": "wheeled"})
-    assert wheeled.cost == parse_scenario('[cost]\npreset = "wheeled"').cost
 
 
 # --- what a study means ------------------------------------------------------------------------------------------
@@ -209,6 +162,22 @@ def test_a_file_that_a_scenario_names_counts_by_what_is_in_it(tmp_path):
     found = []
     for height_m in (0.0, 1.0, 0.0):
         np.savez(ground, elevation_m=np.full((8, 8), height_m))
+        plan.__globals__["_file_digest"].cache_clear()
+        found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
+    assert found[0] == found[2] != found[1]
+    (tmp_path / "ground.prj").write_text("another place")
+    plan.__globals__["_file_digest"].cache_clear()
+    assert plan(load_study(path), tmp_path, "x")[0].trials[0].key not in found, "what lies beside it counts, too"
+
+
+def test_the_modules_of_plug_ins_count_and_those_inside_of_packages(tmp_path):
+    package = tmp_path / "own"
+    package.mkdir()
+    (package / "__init__.py").write_text("from own.walk import Walk")
+    path = write_study(tmp_path, STUDY + "[variants.own]\ntargets.0.walk = 'own:Walk'")
+    found = []
+    for text in ("class Walk: ...", "class Walk: speed = 2", "class Walk: ..."):
+        (package / "walk.py").write_text(text)
         plan.__globals__["_file_digest"].cache_clear()
         found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
     assert found[0] == found[2] != found[1]

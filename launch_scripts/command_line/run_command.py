@@ -1,0 +1,78 @@
+"""Runs a command: whatever ends it becomes an exit code and one sentence, never a traceback."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import typer
+from typer.exceptions import TyperException
+
+from launch_scripts.command_line import usage
+from swarm.errors import ConfigError, StoreError, SwarmError
+
+
+def run_command(command: Callable[[], Any]) -> int:
+    """Runs the command that is made here. Returns its exit code; what a user, a file or the network has wrong is
+    told in a sentence."""
+    # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
+    asked: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
+    _fill_streams()
+    try:
+        try:
+            code = command().main(prog_name="swarm", standalone_mode=False)
+        finally:
+            sys.stdout.flush()
+    except TyperException as error:
+        if said := usage.sentence(error):
+            print(f"swarm: {said}", file=sys.stderr)
+        return ConfigError.exit_code
+    except typer.Abort:
+        print("swarm: stopped; nothing is written", file=sys.stderr)
+        return 1
+    except SwarmError as error:
+        print(f"swarm: {error}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:
+        _leave_output()
+        return 0
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
+            raise
+        _leave_output()
+        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
+        return StoreError.exit_code
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
+        print("swarm: stopped", file=sys.stderr)
+    return code if isinstance(code, int) else 0
+
+
+def _fill_streams() -> None:
+    """Let standard streams that were closed lead nowhere: the next file that is opened would take their place, and
+    get what is printed."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
+
+
+def _leave_output() -> None:
+    """Send what still waits to be printed nowhere: the interpreter would complain about it at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
