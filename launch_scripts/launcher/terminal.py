@@ -21,7 +21,8 @@ from launch_scripts.report.results.certified_gap import gap_text
 log = logging.getLogger(__name__)
 
 _PLAIN_EVERY_S = 5.0
-_DRAW_EVERY_S = 0.25
+_DRAW_EVERY_S = 1.0
+"""What the table shows is made once a second (`Recorder.shown`)."""
 
 _LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
 REPORTED = {

@@ -252,6 +252,6 @@ class MonitorService:
         if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
             return
         self._figures_due_ns = now_ns + NS_PER_S
-        summary = self.recorder.summary(now_ns)
+        summary = self.recorder.shown(now_ns)
         self._movers.summarised(summary)
         self._drawing.summary(summary_markdown(self._setup, summary))

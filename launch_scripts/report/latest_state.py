@@ -175,12 +175,11 @@ class Observed(Counts):
         """The vehicles that somebody drives: not those that have left, or whose agent is gone. An agent of the crew
         which ended because it was asked to has said its last words, and they stand."""
         vehicles = self.vehicles()
-        drives = {
-            agent: self._drives(agent, ("agent", agent) in crew, now_ns) for agent in map(agent_of, vehicles.ids)
-        }
+        agents = list(map(agent_of, vehicles.ids))
+        drives = {agent: self._drives(agent, ("agent", agent) in crew, now_ns) for agent in set(agents)}
         if all(drives.values()):
             return vehicles
-        return vehicles.only(np.array([drives[agent_of(id)] for id in vehicles.ids], bool))
+        return vehicles.only(np.array([drives[agent] for agent in agents], bool))
 
     def _drives(self, agent: str, of_crew: bool, now_ns: int) -> bool:
         if self._alive.get(("agent", agent)):

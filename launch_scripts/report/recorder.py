@@ -47,6 +47,8 @@ RECORDED: dict[Topic, float] = {
 
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _SAMPLE_NS = NS_PER_S
+_SHOWN_NS = 5 * NS_PER_S // 4
+"""So old may be what is shown: a sample is taken with the first message after its second."""
 _NOTES_KEPT = 1000
 _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
@@ -88,6 +90,8 @@ class Recorder:
         self._track_keys: list[TrackKey] = []
         """Of the vehicles heard of last."""
         self._sample_due_ns: int | None = None
+        self._sampled: tuple[int, RunState] | None = None
+        """When the last sample was taken or shown, and of which state."""
         self._gap_max: float | None = None
 
     def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
@@ -168,6 +172,7 @@ class Recorder:
     def _add_sample(self, now_ns: int) -> None:
         self._sample_due_ns = now_ns + _SAMPLE_NS
         state = self.summary(now_ns)
+        self._sampled = now_ns, state
         self.samples.add(
             Sample(
                 time_s=state.elapsed_s,
@@ -189,6 +194,13 @@ class Recorder:
     def summary(self, now_ns: int) -> RunState:
         """What the run is at a time."""
         return self.model.state(now_ns)
+
+    def shown(self, now_ns: int) -> RunState:
+        """What people are shown: the state of the last sample, so that it is made once a second for all. Anew where
+        the swarm has said nothing since, as that is news, too."""
+        if self._sampled is None or not 0 <= now_ns - self._sampled[0] <= _SHOWN_NS:
+            self._sampled = now_ns, self.summary(now_ns)
+        return self._sampled[1]
 
     def report(
         self,

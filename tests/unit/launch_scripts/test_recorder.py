@@ -13,6 +13,7 @@ from launch_scripts.launcher.live_table import plain_line
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.certified_gap import CertifiedGap
 from launch_scripts.report.run_state import facts
+from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.samples import Sample, Samples
 from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
@@ -505,3 +506,41 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
 def test_nobody_tells_of_a_capture_outside_all_maps(cell: int) -> None:
     with pytest.raises(ProtocolError):
         decode(encode(capture("t1", cell)), Note)
+
+
+def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_nobody_speaks(
+    recorder: Recorder,
+) -> None:
+    made: list[int] = []
+    state = recorder.model.state
+
+    def counted(now_ns: int) -> RunState:
+        made.append(now_ns)
+        return state(now_ns)
+
+    recorder.model.state = counted  # type: ignore[method-assign]
+    for tick in range(100):
+        now_ns = tick * NS_PER_S // 10
+        recorder.heard(status("t0", None), {}, now_ns)
+        shown = [recorder.shown(now_ns) for _ in range(3)]
+        assert shown[0] is shown[1] is shown[2]
+        assert 0 <= now_ns / NS_PER_S - shown[0].elapsed_s < 1.0
+    assert len(made) == 10
+    for second in range(12, 20, 2):  # the swarm has fallen silent
+        assert recorder.shown(second * NS_PER_S).elapsed_s == second
+    assert len(made) == 14
+
+
+def test_who_drives_is_found_once_for_each_agent(recorder: Recorder) -> None:
+    asked: list[str] = []
+    drives = recorder.observed._drives
+
+    def counted(agent: str, of_crew: bool, now_ns: int) -> bool:
+        asked.append(agent)
+        return drives(agent, of_crew, now_ns)
+
+    recorder.observed._drives = counted  # type: ignore[method-assign]
+    hear(recorder, *(fleet(f"a{a}.1", {f"a{a}-{n:02d}": (1.0, 2.0) for n in range(10)}) for a in range(3)))
+    asked.clear()
+    assert len(recorder.observed.driven((), 1)) == 30
+    assert sorted(asked) == ["a0", "a1", "a2"]
