@@ -15,9 +15,8 @@ MODEL_NS_PER_CELL = 15
 MODEL_EXACT_NS_PER_CELL = 6
 """The same of an exact move."""
 MODEL_PIECES_NS_PER_ROW = 5_000
-"""The same of a tree in pieces, for each row of a square map: 4 ms at 512 x 512, 10 at 2048, 16 at 4096."""
-MODEL_CUT = 2
-"""A growth whose tree is cut into pieces takes so many times as long."""
+"""The same of a tree in pieces, for each row of a square map: 4 ms at 512 x 512, 10 at 2048, 16 at 4096. It counts
+until a move has been measured."""
 PIECES_CELLS = 1 << 18
 """Maps of so many cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as by the
 parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
@@ -92,10 +91,11 @@ class GrowthTimes:
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took; not one that found networks too. A simulation does not call it."""
         median_ns = _median_with(self._full_took_ns, took_ns)
-        if not self._exact_took_ns:
-            # The first growth on a large map is of a tree that is cut up: a move is not dearer for that.
-            first = self.in_pieces and len(self._full_took_ns) == 1
-            self.exact_ns = self.exact_ns * median_ns // (self.full_ns * (MODEL_CUT if first else 1))
+        # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
+        # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
+        # growth, and twice the memory.
+        if not self._exact_took_ns and not self.in_pieces:
+            self.exact_ns = self.exact_ns * median_ns // self.full_ns
         self.full_ns = max(1, median_ns)
         self._choose()
 

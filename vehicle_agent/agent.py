@@ -136,6 +136,8 @@ class Agent:
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
         self._sight_cells = max(sense_cells, config.reserve_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
+        self._reach_cells = int(config.capture_range_m / grid.resolution_m) + 1
+        """No target is within capture range that is so many rows away."""
         self.seen_lethal: set[int] = set()
         """Cells in zones over which no way out leads, as vehicles have seen."""
         self._driven_ns: int | None = None
@@ -291,6 +293,7 @@ class Agent:
             del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
+        paths = self.holdings.paths
         for vehicle in self.vehicles.values():
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
@@ -298,11 +301,11 @@ class Agent:
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
-            path = self.holdings.path(vehicle.id)
+            path = paths[vehicle.id]
             if len(path) > 1 and vehicle.motion.at_rest:
                 # What was granted late may be closed by now, and would be held for good.
                 self._driver.end_path(vehicle)
-                path = self.holdings.path(vehicle.id)
+                path = paths[vehicle.id]
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
@@ -341,8 +344,10 @@ class Agent:
         pose = self._poses.get(target) if target is not None else None
         if pose is None:
             return False
-        grid = self._map.grid
+        grid, reach = self._map.grid, self._reach_cells
         rows = cell // grid.cols - pose.cell // grid.cols
+        if not -reach <= rows <= reach:
+            return False
         cols = cell % grid.cols - pose.cell % grid.cols
         return math.hypot(rows, cols) * grid.resolution_m <= self._config.capture_range_m
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import contains
 
 from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND
@@ -67,4 +68,4 @@ class ChasersReport:
 
 def _holds(told: dict[str, int], paths: dict[str, Sequence[int]]) -> bool:
     """Whether what was told is still true: the same vehicles, and each may still reach its cell."""
-    return told.keys() == paths.keys() and all(cell in paths[id] for id, cell in told.items())
+    return told.keys() == paths.keys() and all(map(contains, map(paths.__getitem__, told), told.values()))

@@ -73,6 +73,12 @@ from vehicle_agent.zones import ZonesAround
 log = logging.getLogger(__name__)
 
 _LONGEST_AGE_NS = 10 * NS_PER_S
+_GAUGES = [
+    *((int(state), f"vehicles_{state.name.lower()}") for state in VehicleState),
+    (int(VehicleState.STRANDED), "stranded"),
+    (int(VehicleState.LOST), "lost"),
+]
+"""State of a vehicle -> the gauge that counts vehicles in it."""
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least."""
 
@@ -486,11 +492,9 @@ class AgentService:
             self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
 
     def _gauge(self) -> None:
-        states = [vehicle.state for vehicle in self._agent.vehicles.values()]
-        for state in VehicleState:
-            self.counters.gauge(f"vehicles_{state.name.lower()}", float(states.count(state)))
-        self.counters.gauge("stranded", float(states.count(VehicleState.STRANDED)))
-        self.counters.gauge("lost", float(states.count(VehicleState.LOST)))
+        states = bytes([vehicle.state for vehicle in self._agent.vehicles.values()])
+        for state, name in _GAUGES:
+            self.counters.gauge(name, float(states.count(state)))
 
 
 def _plan_of(setup: RoleSetup) -> AgentPlan:

@@ -14,6 +14,7 @@ from launch_scripts.monitor.ground.zones import scenario_areas
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from shared_map.arrays import give_back_memory
 from shared_map.class_grounds import class_terrains
 from shared_map.prepared_classes import load_classes
 from shared_map.terrain.prepared import load_terrain, load_truth
@@ -65,6 +66,7 @@ def load_view(
             layers=layers,
             member=member,
         )
+        give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
         sinks.tell_page(lambda: page_facts(setup, service, path))
         return service
 

@@ -15,13 +15,14 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
 import numba
-from numba.core import caching, config, sigutils
+from numba.core import caching, codegen, config, sigutils
 
 
 def _stamp() -> tuple[str, bool]:
@@ -55,6 +56,24 @@ class _FolderCacheImpl(caching.CompileResultCacheImpl):
         _ReadOnlyLocator,
         *caching.CompileResultCacheImpl._locator_classes[1:],
     )
+
+    linked = True
+    """Whether other compiled functions call this one, so that compiling them takes its bitcode."""
+
+    def rebuild(self, target_context, payload):
+        """As numba's. Of what nothing links to, only the machine code is read: to parse the bitcode beside it, and
+        to list what that defines, takes more than half of loading a kernel."""
+        if self.linked:
+            return super().rebuild(target_context, payload)
+        (name, kind, (code, _)), fndesc, *rest = payload
+        defined = (fndesc.llvm_func_name, fndesc.llvm_cpython_wrapper_name)
+        target_context.codegen()._engine._defined_symbols.update(defined)
+        return super().rebuild(target_context, ((name, kind, (code, _no_bitcode())), fndesc, *rest))
+
+
+@cache
+def _no_bitcode() -> Any:
+    return codegen.ll.parse_assembly("").as_bitcode()
 
 
 class _FolderCache(caching.FunctionCache):
@@ -111,6 +130,8 @@ def kernel(signature: str) -> Callable[[Any], Any]:
     def declare(function: Any) -> Any:
         compiled = _compiled(function)
         if not config.DISABLE_JIT:
+            if isinstance(compiled._cache, _FolderCache):
+                compiled._cache._impl.linked = False  # a kernel calls helpers only
             compiled.declared = signature
             compiled._compile_for_args = lambda *_: _load(compiled)  # numba's name for the first call
         KERNELS[function.__name__] = compiled
@@ -177,9 +198,9 @@ def is_on_disk(compiled: Any) -> bool:
     if not isinstance(compiled._cache, _FolderCache) or not Path(compiled._cache._cache_file._index_path).exists():
         return False
     argument_types, _ = sigutils.normalize_signature(compiled.declared)
-    cache = compiled._cache
-    name = cache._cache_file._load_index().get(cache._index_key(argument_types, compiled.targetctx.codegen()))
-    return name is not None and Path(cache._cache_file._data_path(name)).is_file()
+    kept = compiled._cache
+    name = kept._cache_file._load_index().get(kept._index_key(argument_types, compiled.targetctx.codegen()))
+    return name is not None and Path(kept._cache_file._data_path(name)).is_file()
 
 
 def cache_folder() -> Path | None:

@@ -72,6 +72,8 @@ ROOT_PIECE = np.uint8(252)
 NO_PIECE = np.uint8(255)
 
 LOOK, REHOOK = np.uint8(1), np.uint8(2)
+DEARER, ALTERED = np.uint8(1), np.uint8(2)
+"""What has changed in a tile: cells got dearer, or lost their way; or anything else, perhaps that too."""
 FINEST = 2.0**-46
 """Of a cost: what is offered less than by this is not taken. Sums of the same numbers in another order differ by a
 32nd of it; it keeps costs within so much a step of the optimum."""
@@ -111,8 +113,12 @@ Bench = tuple[
 ]
 """(names, cost, own, inner, less, queue, keys, code, name, around, kept, place, holder, spot)."""
 
+Turns = tuple[NDArray[np.int64], NDArray[np.float64], int, NDArray[np.int32], NDArray[np.uint8]]
+"""(order, turn, now, stack, todo)."""
+
 LABELLED = "Tuple((u1[::1], u1[::1], f8[::1], i8))"
 PIECES = "Tuple((f8[:, ::1], i4[:, ::1]))"
+TURNS = "Tuple((i8[::1], f8[::1], i4, i4[::1], u1[::1]))"
 TILES = "Tuple((u1[::1], i4[::1], f8[::1], u1[::1], f8[:, ::1], f8[:, ::1], i8))"
 _SCRATCH = "i2[::1], f8[::1], f8[::1], f8[::1], i4[::1], i4[::1], f4[::1], u1[::1], u1[::1], i8[::1]"
 BENCH = f"Tuple(({_SCRATCH}, f8[::1], i4[::1], i4[::1], i4[::1]))"

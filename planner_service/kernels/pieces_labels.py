@@ -10,6 +10,7 @@ from planner_service.kernels.pieces import (
     BENCH,
     BITS,
     CELLS,
+    DEARER,
     LABELLED,
     LOOK,
     NO_PIECE,
@@ -189,9 +190,14 @@ def want(tiles, t, what):
             wanted[i * across + j] |= what
 
 
-@kernel(f"({GRID}, {LABELLED}, {TILES}, {BENCH}, i8[::1])")
-def relabel_tiles(grid, labels, tiles, bench, which):
-    """Label these tiles anew, whose parents or cell costs have changed, and have those about them looked at."""
+@kernel(f"({GRID}, {LABELLED}, {TILES}, {BENCH}, i8[::1], u1[::1])")
+def relabel_tiles(grid, labels, tiles, bench, which, changed):
+    """Label these tiles anew, whose parents or cell costs have changed, and have them looked at; and those about
+    them, unless all that has changed is that cells got dearer (`changed` is `DEARER`, uint8 (n,)): that offers
+    nobody less, and whoever leads there sees its totals rise."""
+    wanted = tiles[3]
     for i in range(which.size):
-        relabel_tile(which[i], grid, labels, tiles, bench)
-        want(tiles, which[i], LOOK | REHOOK)
+        t = which[i]
+        relabel_tile(t, grid, labels, tiles, bench)
+        want(tiles, t, REHOOK if changed[t] == DEARER else LOOK | REHOOK)
+        wanted[t] |= LOOK

@@ -26,10 +26,12 @@ from planner_service.kernels.layout import (
     SQRT2_EXACT,
 )
 from planner_service.kernels.pieces import (
+    ALTERED,
     BEFORE,
     BENCH,
     BITS,
     CELLS,
+    DEARER,
     FINEST,
     LABELLED,
     LOOK,
@@ -41,6 +43,7 @@ from planner_service.kernels.pieces import (
     SIDE,
     TILES,
     TOTAL,
+    TURNS,
     WIDE,
     corner_of,
     moved,
@@ -51,6 +54,7 @@ from planner_service.kernels.pieces import (
     where_to,
 )
 from planner_service.kernels.pieces_labels import drive_tile, keep_tile
+from planner_service.kernels.pieces_totals import evaluate_totals, find_risen
 
 _ONE = np.uint64(1)
 _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
@@ -269,22 +273,52 @@ def _mend(t, grid, labels, pieces, tiles, bench):
     return True
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, i8[::1])")
-def mend_tiles(grid, labels, pieces, tiles, bench, which):
-    """Look at these tiles, in this order, and mend them. Returns how many had to be; `evaluate` is to follow.
+@helper
+def _is_first(t, turn, todo, across):
+    """Whether no tile about this one, of those to be looked at, has an earlier turn."""
+    row, col = t // across, t % across
+    down = todo.size // across
+    for i in range(max(row - 1, 0), min(row + 2, down)):
+        for j in range(max(col - 1, 0), min(col + 2, across)):
+            other = i * across + j
+            if todo[other] and turn[other] < turn[t]:
+                return False
+    return True
 
-    Until then totals of a mended tile are what its exits were offered, and those of others may be too high.
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {TURNS}, f8)")
+def mend_tiles(grid, labels, pieces, tiles, bench, turns, most):
+    """Evaluate totals, look at tiles and mend them, until the tree is optimal or `most` tiles have been looked at;
+    one that was mended counts three times. Returns (tiles looked at, mended, rounds, left to be looked at).
+
+    turns  (order, turn, now, stack, todo):
+           order  int64 (n,), all tiles, those nearest the root first
+           turn   float64 (n,): of tiles beside each other the one with the least is looked at first, and totals are
+                  evaluated before the other is. All alike, all are looked at in each round
+           now    of `evaluate_totals`, the first time
+           todo   uint8 (n,), scratch
     """
-    wanted, falls = tiles[3], tiles[4]
-    mended = 0
-    for n in range(which.size):
-        t = which[n]
-        wanted[t] &= ~LOOK
-        falls[2, t] = 0.0
-        if _mend(t, grid, labels, pieces, tiles, bench):
-            wanted[t] |= REHOOK
-            mended += 1
-    return mended
+    order, turn, now, stack, todo = turns
+    wanted, falls, across = tiles[3], tiles[4], tiles[6]
+    looked = mended = rounds = 0
+    evaluate_totals(grid, labels, pieces, tiles, bench[0], order, now, stack)
+    while True:
+        rounds += 1
+        count = np.int64(find_risen(pieces, tiles, todo))
+        if count == 0 or looked + 2 * mended > most:
+            return looked, mended, rounds, count
+        for n in range(order.size):
+            t = order[n]
+            if not todo[t] or not _is_first(t, turn, todo, across):
+                continue
+            looked += 1
+            wanted[t] &= ~LOOK
+            falls[2, t] = 0.0
+            if _mend(t, grid, labels, pieces, tiles, bench):
+                # Until totals are evaluated its own are what its exits were offered, and those of others too high.
+                wanted[t] |= REHOOK
+                mended += 1
+        evaluate_totals(grid, labels, pieces, tiles, bench[0], order, np.int32(0), stack)
 
 
 @helper
@@ -307,7 +341,7 @@ def _merge_tile(t, grid, labels, total, across, window, inner, old_root, changed
             code = NONE if v == root else part_parent[i]
             if (part[i] < cost + way or v == old_root) and parent[v] != code:
                 parent[v] = code
-                changed[t] = 1
+                changed[t] = ALTERED
 
 
 @kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {_WINDOW}, i8, u1[::1])")
@@ -316,8 +350,8 @@ def merge_parents(grid, labels, pieces, tiles, bench, window, old_root, changed)
     tree's and the way from the old root to the new one.
 
     window   (part, part_parent, box, way): its costs and parents, and the way between the roots, s
-    changed  uint8 (n,), set to 1 for tiles in which a parent has changed
-    Costs stay what they are until `evaluate`. There is no cycle: with the lesser of the two costs, every
+    changed  uint8 (n,), set to ALTERED for tiles in which a parent has changed
+    Costs stay what they are until totals are evaluated. There is no cycle: with the lesser of the two costs, every
     cell's parent has a lower one.
     """
     across = tiles[6]
@@ -329,7 +363,7 @@ def merge_parents(grid, labels, pieces, tiles, bench, window, old_root, changed)
             _merge_tile(t, grid, labels, pieces[0], across, window, bench[3], old_root, changed)
     for v in (labels[3], old_root):
         t, _ = tile_of(v, grid[2], across)
-        changed[t] = 1
+        changed[t] = ALTERED
 
 
 @kernel(f"({GRID}, {LABELLED}, i8, i8[::1], f4[::1], u1[::1])")
@@ -337,14 +371,15 @@ def cut_ways(grid, labels, across, cells, before, changed):
     """Cells that became lethal, and those whose step they forbid, lose their parent.
 
     cells, before  padded cells whose cost changed, and their cell cost before, s
-    changed        uint8 (n,), set to 1 for tiles of cells that step into one of these, or are one
+    changed        uint8 (n,), DEARER or ALTERED for tiles of cells that step into one of these, or are one
     """
     cell_cost, offsets, stride, _, corners = grid
     parent = labels[0]
     for j in range(cells.size):
         x = cells[j]
         t, _ = tile_of(x, stride, across)
-        changed[t] = 1
+        what = DEARER if cell_cost[x] > before[j] else ALTERED
+        changed[t] |= what
         lethal = not cell_cost[x] < INF and before[j] < INF
         if lethal:
             parent[x] = NONE
@@ -358,7 +393,7 @@ def cut_ways(grid, labels, across, cells, before, changed):
             squeezed = squeezed and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
             if into or squeezed:
                 t, _ = tile_of(v, stride, across)
-                changed[t] = 1
+                changed[t] |= what
                 if lethal:
                     parent[v] = NONE
 

@@ -25,6 +25,7 @@ from planner_service.kernels.pieces import (
     STAMP,
     TILES,
     TOTAL,
+    TURNS,
     corner_of,
     moved,
     name_of,
@@ -105,7 +106,7 @@ def _add_up_all(pieces, tiles, order, now, stack):
 def _note_changes(t, pieces, tiles):
     """Write `falls` and `ends` of a tile whose totals have changed."""
     total = pieces[0]
-    exits, many, _, _, falls, ends, _ = tiles
+    exits, many, _, wanted, falls, ends, _ = tiles
     least, most, near, far = np.inf, -np.inf, np.inf, 0.0
     for j in range(many[t]):
         y = t * ROOM + np.int64(exits[t * ROOM + j])
@@ -113,6 +114,9 @@ def _note_changes(t, pieces, tiles):
         change = 0.0
         if cost < np.inf or total[y, BEFORE] < np.inf:
             change = cost - total[y, BEFORE]
+        if change == -np.inf:
+            # Where all about it had no way either, nobody has risen by more than others.
+            wanted[t] |= LOOK
         total[y, BEFORE] = cost
         least = min(least, change)
         most = max(most, change)
@@ -124,8 +128,8 @@ def _note_changes(t, pieces, tiles):
     ends[1, t] = far
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], i8[::1], i4, i4[::1])")
-def evaluate(grid, labels, pieces, tiles, names, order, now, stack):
+@helper
+def evaluate_totals(grid, labels, pieces, tiles, names, order, now, stack):
     """Totals := what is driven from each exit to the root.
 
     order  all tiles, those nearest the root first
@@ -156,10 +160,10 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack):
                 again = True
 
 
-@kernel(f"({PIECES}, {TILES}, i8[::1])")
+@helper
 def find_risen(pieces, tiles, todo):
-    """Returns how many tiles are to be looked at, and writes them to `todo`: those where it is wanted, and where
-    totals have risen by more than others about them since this was last called."""
+    """Returns how many tiles are to be looked at, and writes 1 to `todo` for these, 0 for others: where it is
+    wanted, and where totals have risen by more than others about them since this was last called."""
     _, many, _, wanted, falls, ends, across = tiles
     down = many.size // across
     for t in range(many.size):
@@ -179,10 +183,17 @@ def find_risen(pieces, tiles, todo):
             if falls[1, t] > least:
                 falls[2, t] += falls[1, t] - least
             near = ends[0, t] if ends[0, t] < np.inf else 0.0
-            if wanted[t] & LOOK or falls[2, t] > _DRIFT * FINEST * near:
-                todo[count] = t
-                count += 1
+            todo[t] = 1 if wanted[t] & LOOK or falls[2, t] > _DRIFT * FINEST * near else 0
+            count += todo[t]
     return count
+
+
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], {TURNS})")
+def add_up(grid, labels, pieces, tiles, names, turns):
+    """Evaluate totals, and note where they have risen."""
+    order, _, now, stack, todo = turns
+    evaluate_totals(grid, labels, pieces, tiles, names, order, now, stack)
+    find_risen(pieces, tiles, todo)
 
 
 @kernel(f"({GRID}, {LABELLED}, {PIECES}, {BENCH}, i8, i8[::1], f8[::1])")

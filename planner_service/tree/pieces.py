@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from planner_service.kernels import pieces, pieces_labels, pieces_mend, pieces_totals
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.pieces import CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
+from planner_service.kernels.pieces import ALTERED, CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import KeptScratch
@@ -23,11 +23,10 @@ from swarm.grid import Window
 MOST_LOOKS = 3.0
 """A move or a repair gives way to a growth once it has looked at so many times as many tiles as the map has; to
 mend one counts double."""
-NEAR_ROUNDS = 4
-"""Of a repair in changed tiles alone, at most; more than half of them need one."""
 
-MOST_KEPT = 1 << 10
-"""Of so many tiles, all of a map of 2048 x 2048 cells, is kept what cells cost inside: 34 MB."""
+MOST_KEPT = 1 << 9
+"""Of so many tiles is kept what cells cost inside: 17 MB. A move looks at 190 of a map of 2048 x 2048 cells,
+at 190 to 350 of one of 4096 x 4096."""
 
 
 class PieceTree:
@@ -66,7 +65,9 @@ class PieceTree:
         self._bench = pieces.make_bench(count, MOST_KEPT)
         self._now = 0
         self._stack = np.empty(count * ROOM, np.int32)
-        self._todo = np.empty(count, np.int64)
+        self._todo = np.empty(count, np.uint8)
+        self._at_once = np.zeros(count)
+        self._most = MOST_LOOKS * count + 64
         self._kept: KeptScratch = {}
         self.work = (0, 0, 0)
         """Tiles looked at, tiles mended and rounds of the last `mend`."""
@@ -97,9 +98,9 @@ class PieceTree:
         row, col = (at // SIDE for at in self.cost_grid.grid.row_col(root))
         rows, cols = np.divmod(np.arange(self._count), self._across)
         self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
-        self._relabel(np.arange(self._count))
+        self._relabel(np.full(self._count, ALTERED))
         self._moved = True
-        self._mend(math.inf)
+        self._mend(math.inf, self._at_once)
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, by a window that holds it and the old one; `mend` makes the tree exact again.
@@ -124,7 +125,7 @@ class PieceTree:
             *(grid.padded, self._labels, self._pieces, self._tiles, self._bench),
             *((cost, parent, box, way), old_root, changed),
         )
-        self._relabel(np.flatnonzero(changed))
+        self._relabel(changed)
         self._moved = True
         self.exact = False
         return window.cells
@@ -132,7 +133,7 @@ class PieceTree:
     def mend(self) -> int:
         """Make the tree exact, after whatever moves and repairs, or give way to a growth: `exact` tells. Returns
         cells looked at."""
-        return self._mend(MOST_LOOKS * self._count + 64)
+        return self._mend(self._most, self._at_once)
 
     def repair(self, changes: Changes) -> int:
         """Bring the tree up to date after the map changed, and make it exact, or give way: `exact` tells.
@@ -146,9 +147,9 @@ class PieceTree:
         pieces_mend.cut_ways(
             self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
         )
-        self._relabel(np.flatnonzero(changed))
-        self._mend_near(np.flatnonzero(changed))
-        looked = self.mend()
+        turn = self._ends[0].copy()
+        self._relabel(changed)
+        looked = self._mend(self._most, turn)
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
         pieces_mend.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
         return looked if self.exact or not lost.size else -1
@@ -184,54 +185,32 @@ class PieceTree:
     def tighten(self, cells: Cells) -> None:
         """Costs are what is driven at all times."""
 
-    def _relabel(self, which: Cells) -> None:
-        pieces_labels.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
+    def _relabel(self, changed: NDArray[np.uint8]) -> None:
+        """Label tiles anew in which something has changed: uint8 (n,), `pieces.DEARER` or more."""
+        pieces_labels.relabel_tiles(
+            *(self.cost_grid.padded, self._labels, self._tiles, self._bench, np.flatnonzero(changed), changed),
+        )
 
-    def _evaluate(self) -> None:
+    def _turns(self, turn: NDArray[np.float64]) -> pieces.Turns:
+        """As `kernels.pieces_mend.mend_tiles` takes them; totals are up to date after what they are handed to."""
         self._now += self._moved
-        pieces_totals.evaluate(
-            *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench[0]),
-            *(np.argsort(self._ends[0]), self._now if self._moved else 0, self._stack),
-        )
+        now = self._now if self._moved else 0
         self._moved = False
+        return np.argsort(self._ends[0]), turn, now, self._stack, self._todo
 
-    def _add_up(self) -> int:
-        """Evaluate the totals; returns how many tiles are to be looked at now, which stand in `_todo`."""
-        self._evaluate()
-        return int(pieces_totals.find_risen(self._pieces, self._tiles, self._todo))
-
-    def _mend_tiles(self, which: Cells) -> int:
-        """Look at these tiles, those nearest the root first; returns how many had to be mended."""
-        which = which[np.argsort(self._ends[0][which])]
-        return int(
-            pieces_mend.mend_tiles(
-                *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench, which),
-            )
+    def _add_up(self) -> None:
+        """Evaluate the totals."""
+        pieces_totals.add_up(
+            *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench[0]),
+            self._turns(self._at_once),
         )
 
-    def _mend_near(self, near: Cells) -> None:
-        """Find ways around what has changed in the changed tiles, before others look at them. What lies behind then
-        costs a little more, and keeps its parents. Were all looked at at once, whole branches would go over to
-        others while they have no way, and come back."""
-        for _ in range(NEAR_ROUNDS):
-            self._evaluate()
-            todo = near[(self._wanted[near] & LOOK) != 0]
-            if not todo.size:
-                break
-            self._mend_tiles(todo)
-        # What lay behind had no total when they were looked at, and nobody has noted that it has one again.
-        self._wanted[near] |= LOOK
-
-    def _mend(self, most: float) -> int:
+    def _mend(self, most: float, turn: NDArray[np.float64]) -> int:
         """Look at tiles until the tree is exact, or as many as `most` have been."""
-        looked = mended = rounds = 0
-        while True:
-            rounds += 1
-            count = self._add_up()
-            if not count or looked + 2 * mended > most:
-                break
-            looked += count
-            mended += self._mend_tiles(self._todo[:count])
-        self.exact = not count
+        looked, mended, rounds, left = pieces_mend.mend_tiles(
+            *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench),
+            *(self._turns(turn), most),
+        )
+        self.exact = not left
         self.work = looked, mended, rounds
-        return looked * CELLS
+        return int(looked) * CELLS

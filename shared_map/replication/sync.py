@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 
 from shared_map.replication.digest import Held
+from shared_map.replication.digest_interest import DigestInterest
 from shared_map.replication.limits import Quota
 from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.pending_digests import PendingDigest, PendingDigests
@@ -58,7 +59,8 @@ class MapSync:
     committed    what whole digests tell; default: the replica's own sets
     on_accepted  called with every set that is merged
     on_digest    called with the author of every digest that is heard, and when
-    near         hold only regions that `enter` names, instead of the whole map
+    near         hold only regions that `enter` names, instead of the whole map, and hear only the digests that
+                 can matter there (`digest_interest`)
     at_ticks     merge what others put at the next tick, all at once, and wake nobody for it: for a service that
                  uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
@@ -103,6 +105,9 @@ class MapSync:
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
         self._changed: dict[int, int | None] = {}
         self._digests = PendingDigests()
+        # Whose digests are of interest, and to whom we listen: None for everybody.
+        self._digest_interest = DigestInterest(self._name or "", self._digest_ns) if near else None
+        self._listened_to: frozenset[str] | None = None
         self._asked_ns: dict[str, int] = {}  # author -> when its missing sets were asked for, until the ask ends
         self._heard_ns: dict[str, int] = {}  # sender -> when its last digest came
         self._started_ns = 0
@@ -114,6 +119,8 @@ class MapSync:
             self._listen()
             self._join()
         self._bus.collect(DIGEST)
+        if self._digest_interest is not None:
+            self._digest_interest.start(now_ns)
         if self._serves_all:
             self._bus.serve(MARKS, self._post)
         elif self.replica.author is not None:
@@ -167,6 +174,8 @@ class MapSync:
             case LinkChanged(up=True):
                 self._digest_due_ns = now_ns  # what the others missed; theirs come within digest_s
                 self._digests.hasten(now_ns)
+                if self._digest_interest is not None:
+                    self._digest_interest.listen_to_all(now_ns)
                 return False
             case _:
                 return False
@@ -180,6 +189,7 @@ class MapSync:
             self._hear_digest(digest.message, now_ns)
         self._take_in(now_ns)
         self._merge_waiting(now_ns)
+        self._choose_digests(now_ns)
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:
             self._join()
@@ -262,6 +272,9 @@ class MapSync:
     def _merge_charged(self, sets: Sequence[MarkSet], authors: Iterable[str], now_ns: int) -> None:
         costs = dict.fromkeys(authors, 0)
         merged = self._merge(sets, measured=True)
+        if self._digest_interest is not None:
+            for author in {each.author for each in merged.sets} - {self.replica.author}:
+                self._digest_interest.author_is_near(author, now_ns)
         for each, changed in zip(merged.sets, merged.changed, strict=True):
             costs[each.author] += changed
         for author, cost in costs.items():
@@ -327,6 +340,25 @@ class MapSync:
             return
         if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:
             self._heard_ns[digest.author] = now_ns
+        if self._digest_interest is not None and digest.role == "keeper" and digest.whole:
+            self._digest_interest.keeper_spoke(digest.author, now_ns)
+
+    def _choose_digests(self, now_ns: int) -> None:
+        """Listen to digests of those who may state something about what we hold."""
+        if self._digest_interest is None:
+            return
+        before, chosen = self._listened_to, self._digest_interest.update(now_ns)
+        if chosen == before:
+            return
+        self._listened_to = chosen
+        if chosen is None:
+            self._bus.collect(DIGEST)
+        for author in sorted((chosen or frozenset()) - (before or frozenset())):
+            self._bus.collect(DIGEST, author=author)
+        if before is None:
+            self._bus.unsubscribe(DIGEST)
+        for author in sorted((before or frozenset()) - (chosen or frozenset())):
+            self._bus.unsubscribe(DIGEST, author=author)
 
     def _send_digest(self, now_ns: int) -> None:
         """Tell all that we hold every `digest_s`, and in between what we changed lately: so others notice a lost
@@ -383,5 +415,9 @@ class MapSync:
             log.info("gave the keeper %d sets of authors that are gone", min(len(lost), _OFFERS_AT_ONCE))
 
     def _silent(self, author: str, now_ns: int) -> bool:
-        heard_ns = self._heard_ns.get(author, self._started_ns)
+        interest = self._digest_interest
+        since_ns = self._started_ns if interest is None else interest.since_ns(author)
+        if since_ns is None:
+            return False  # it may speak, we do not listen
+        heard_ns = max(self._heard_ns.get(author, since_ns), since_ns)
         return author != self.replica.author and now_ns - heard_ns > 3 * self._digest_ns

@@ -332,11 +332,13 @@ class Holdings:
         wants = list(asked.wants) if still else []
         better = asked.better if still else 0
         ahead = list(asked.ahead)
-        plots = [self._plots.of(cell) for cell in path]
-        near = [*plots, *map(self._plots.of, (*asked.ahead[:1], *wants))]
+        plots = list(map(self._plots.of, path))
+        near = dict.fromkeys((*plots, *map(self._plots.of, (*asked.ahead[:1], *wants))))
+        near.pop(-1, None)
         stands: list[tuple[int, Stand, object]] = []
-        for plot in dict.fromkeys(plot for plot in near if plot >= 0):
-            holds = [cell for cell, of in zip(path, plots, strict=True) if of == plot]
+        for plot in near:
+            all_here = len(near) == 1
+            holds = list(path) if all_here else [cell for cell, of in zip(path, plots, strict=True) if of == plot]
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
             stands.append((plot, stand, (vehicle, path[0], holds, ahead, better)))
         return _Said(wish, path, stands)
@@ -344,8 +346,11 @@ class Holdings:
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
         """Without cells that were left or given back while a table still grants them: granted anew, such a cell
         could not be told from one that is about to be freed."""
-        lapsed = {cell for view in self._views.values() for cell in view.seen.get(vehicle, ())}.difference(path)
-        if lapsed.isdisjoint(wish.ahead) and lapsed.isdisjoint(wish.wants):
+        lapsed: set[int] = set()
+        for view in self._views.values():
+            lapsed.update(view.seen.get(vehicle, ()))
+        lapsed.difference_update(path)
+        if not lapsed or (lapsed.isdisjoint(wish.ahead) and lapsed.isdisjoint(wish.wants)):
             return wish
         ahead = list(takewhile(lambda cell: cell not in lapsed, wish.ahead))
         better = sum(cell not in lapsed for cell in wish.wants[: wish.better])

@@ -179,3 +179,31 @@ def test_a_long_walk_stays_exact() -> None:
     for _ in range(120):
         chase.go(1)
     chase.check()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ways_closed_all_over_the_map(seed: int) -> None:
+    """Long branches lose their ways at many places at once, and find others from tile to tile, in turn."""
+    rng = np.random.default_rng(seed)
+    chase = Chase(4 * seed + 1, 30)
+    chase.pace = random_pace(rng, 260, 330, 4.0, 0.1)
+    chase.ground = CostGrid(GridSpec(*chase.pace.shape, 1.0), PlannerConfig(**chase.rules))
+    chase.ground.load(chase.pace)
+    chase.cells = chase.ground.pad_all(np.arange(chase.pace.size))
+    chase.tree = PieceTree(chase.ground)
+    chase.grow(int(rng.choice(np.flatnonzero(np.isfinite(chase.pace)))))
+    root = divmod(chase.tree.root, chase.pace.shape[1])
+    for factor in (np.inf, np.inf, 5.0):
+        windows = []
+        for _ in range(12):
+            row, col, long = int(rng.integers(250)), int(rng.integers(250)), int(rng.integers(20, 80))
+            high, wide = (1, long) if rng.random() < 0.5 else (long, 1)
+            window = Window(row, col, min(row + high, 260), min(col + wide, 330))
+            if window.row0 <= root[0] < window.row1 and window.col0 <= root[1] < window.col1:
+                continue
+            chase.pace[window.row0 : window.row1, window.col0 : window.col1] *= np.float32(factor)
+            windows.append(window)
+        chase.tree.repair(chase.ground.apply(chase.pace, windows))
+        if not chase.tree.exact:
+            chase.grow(chase.tree.root)
+        chase.check()

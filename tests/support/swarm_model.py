@@ -180,7 +180,13 @@ class SwarmModel:
         """A planner that is nothing but a replica."""
         return self._sync(node, "planner", None)
 
-    def _sync(self, node: str, role: str, author: str | None) -> SyncService:
+    def near(self, author: str, regions: frozenset[int]) -> SyncService:
+        """A writer that holds these regions only."""
+        service = self._sync(author, "agent", author, near=True)
+        service.sync.enter(regions)
+        return service
+
+    def _sync(self, node: str, role: str, author: str | None, *, near: bool = False) -> SyncService:
         replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
         config = self.scenario.map
-        return self.start(node, lambda bus, post: SyncService(MapSync(replica, bus, post, config, role)))
+        return self.start(node, lambda bus, post: SyncService(MapSync(replica, bus, post, config, role, near=near)))

@@ -53,7 +53,8 @@ class Driver:
         self._pulled = pulled and may_be_pulled(local_map.climb)
         self._left_s: dict[str, float] = {}
         self._rolling: set[str] = set()
-        """Vehicles that did not stop when they came to the middle of the cell where they are."""
+        """Vehicles that did not stop when they came to the middle of the cell where they are, if their steps are
+        measured."""
 
     def begin(self, vehicles: Iterable[str], seconds: float) -> None:
         """Give each of these so much time."""
@@ -92,12 +93,10 @@ class Driver:
                 if self._measures and freely:
                     self._steps[vehicle.id] = (path[1], 0.0)
             before = motion.cell
-            pace_s_per_m = self._physics.item(before if self._pulled else motion.head)
+            had_s, head = left_s, motion.head
+            length_m = motion.length_m - motion.border_m if self._pulled else motion.length_m
             climbing = climbing_of(motion, self._climb, self._pulled)
-            pace_s_per_m *= climbing
-            had_s, head, length_m = left_s, motion.head, motion.length_m
-            if self._pulled:
-                length_m -= motion.border_m
+            pace_s_per_m = self._physics.item(before if self._pulled else head) * climbing
             if self._dynamics is None:
                 left_s = motion.advance(left_s, pace_s_per_m)
             else:
@@ -106,8 +105,9 @@ class Driver:
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self._dynamics.slowed:  # by itself, not by the ground
                     self._steps.pop(vehicle.id, None)
-            measured_s = had_s - left_s if before == head or not self._pulled else 0.0
-            self._measure(vehicle, head, measured_s, length_m * climbing)
+            if self._measures:
+                measured_s = had_s - left_s if before == head or not self._pulled else 0.0
+                self._measure(vehicle, head, measured_s, length_m * climbing)
             cell = motion.cell
             if cell != before:
                 self._holdings.moved(vehicle.id, cell)

@@ -20,13 +20,26 @@ class Motion:
     The vehicle is a point. It occupies `tail` up to their border, or the corner that they share, and `head` from
     there on.
 
+    cell         the one cell that the vehicle occupies
     done_m       metres driven of the step
     length_m     metres of the step; 0 at rest
     border_m     metres of it up to the border
     heading_rad  clockwise from north
     """
 
-    __slots__ = ("_at", "_grid", "_to", "_via", "border_m", "done_m", "head", "heading_rad", "length_m", "tail")
+    __slots__ = (
+        "_at",
+        "_grid",
+        "_to",
+        "_via",
+        "border_m",
+        "cell",
+        "done_m",
+        "head",
+        "heading_rad",
+        "length_m",
+        "tail",
+    )
 
     def __init__(self, grid: GridSpec, cell: int) -> None:
         self._grid = grid
@@ -37,14 +50,13 @@ class Motion:
 
     def put(self, cell: int) -> None:
         """At rest in the middle of a cell."""
-        self.tail = self.head = cell
+        self.tail = self.head = self.cell = cell
         self._at = self._to = middle_of(self._grid, cell)
         self.done_m = self.length_m = self.border_m = 0.0
 
-    @property
-    def cell(self) -> int:
-        """The one cell that the vehicle occupies."""
-        return self.tail if self.done_m < self.border_m else self.head
+    def _settle(self) -> None:
+        """Find the cell anew. It is asked for seven times as often as it may change."""
+        self.cell = self.tail if self.done_m < self.border_m else self.head
 
     @property
     def goal(self) -> Stop:
@@ -81,6 +93,7 @@ class Motion:
         self.head = cell
         self.done_m = 0.0
         self.heading_rad = way.heading_rad
+        self._settle()
 
     def turn_back(self) -> None:
         """Return to where the step began, if it has not entered the next cell."""
@@ -90,6 +103,7 @@ class Motion:
             self.done_m = self.length_m - self.done_m
             self.border_m = self.length_m - self.border_m
             self.heading_rad = (self.heading_rad + math.pi) % math.tau
+            self._settle()
 
     def advance(self, seconds: float, pace_s_per_m: float) -> float:
         """Drive for some seconds at a pace in s/m, at most to the border of `head` or, behind it, to the end.
@@ -100,11 +114,13 @@ class Motion:
         needed_s = (goal_m - self.done_m) * pace_s_per_m
         if needed_s > seconds:
             self.done_m += seconds / pace_s_per_m
+            self._settle()  # rounding may take it to the border
             return 0.0
         self.done_m = goal_m
         if goal_m == self.length_m:
             self.tail, self._at = self.head, self._to
             self.done_m = self.length_m = self.border_m = 0.0
+        self._settle()
         return seconds - needed_s
 
     def stretch(self) -> tuple[Point, Point, float]:

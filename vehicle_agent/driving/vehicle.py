@@ -195,12 +195,16 @@ class Vehicle:
         if self.target is None or self.in_reach or self.planner_gone:
             return None
         if self._need is None and self.state is not VehicleState.STRANDED:
-            if self.route.left == 0 and self.motion.at_rest:
-                continues = self.route.partial or self.searching
-                self._need = Reason.CONTINUED if continues else Reason.RAN_OUT
-            elif self.route.partial and self.route.left <= PREFETCH_CELLS:
+            left = self.route.left
+            if left == 0:
+                if self.motion.at_rest:
+                    continues = self.route.partial or self.searching
+                    self._need = Reason.CONTINUED if continues else Reason.RAN_OUT
+                elif self.route.partial:
+                    self._need = Reason.CONTINUED
+                self._settle()  # of all that the state follows from, only this changes by driving
+            elif left <= PREFETCH_CELLS and self.route.partial:
                 self._need = Reason.CONTINUED
-            self._settle()
         if self._need is None or self.asked is not None or now_ns < self._ask_due_ns:
             return None
         self.asked = self.target

@@ -69,7 +69,7 @@ class Steering:
 
     def closed(self, cell: int) -> bool:
         """Whether a cell is lethal, or a body closes it."""
-        return cell in self._shut or not math.isfinite(self._pace[cell])
+        return cell in self._shut or not math.isfinite(self._pace.item(cell))
 
     def passable(self, tail: int, head: int) -> bool:
         """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
@@ -92,10 +92,13 @@ class Steering:
         tails, heads = at[:-1], at[1:]
         lethal = np.isinf(self._pace[heads])
         if not self._corner_cutting:
-            rows, cols = np.divmod(at, self._grid.cols)
-            south, east = rows[1:] - rows[:-1], cols[1:] - cols[:-1]
-            beside = np.isinf(self._pace[tails + east]) | np.isinf(self._pace[tails + south * self._grid.cols])
-            lethal |= beside & (south != 0) & (east != 0)
+            cols = at % self._grid.cols
+            east = cols[1:] - cols[:-1]
+            # Beside a straight step are its own two cells. That it leaves a lethal one matters to diagonals only;
+            # of all steps but the first it is the head of one before, which ends the route there anyway.
+            beside = np.isinf(self._pace[tails + east]) | np.isinf(self._pace[heads - east])
+            beside[0] &= cols[0] != cols[1] and cells[0] // self._grid.cols != cells[1] // self._grid.cols
+            lethal |= beside
         if self._climb is not None:
             lethal |= np.isinf(self._climb.along(tails, heads))
         first = int(lethal.argmax())
@@ -164,8 +167,9 @@ class Steering:
 
     def blocked(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> bool:
         """Whether it stands though its route goes on. Asks for another route after a while."""
-        if len(path) > 1 or vehicle.in_reach or not vehicle.route.left or not vehicle.motion.at_rest:
-            self._stood_ns.pop(vehicle.id, None)
+        if len(path) > 1 or vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
+            if self._stood_ns:
+                self._stood_ns.pop(vehicle.id, None)
             return False
         cell, since_ns = self._stood_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
         if cell != vehicle.cell or now_ns - since_ns > _BLOCKED_NS:

@@ -71,6 +71,21 @@ class _Host:
     told_ns: int = 0
 
 
+class _Beside(dict[int, tuple[int, ...]]):
+    """Cell -> the cells beside it in a grid of so many columns, of cells that were asked for lately."""
+
+    def __init__(self, cols: int) -> None:
+        self._cols = cols
+
+    def __missing__(self, cell: int) -> tuple[int, ...]:
+        if len(self) >= _MOST_BESIDE:
+            self.clear()
+        north, south = cell - self._cols, cell + self._cols
+        around = north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1
+        self[cell] = around
+        return around
+
+
 class Warden:
     """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
 
@@ -98,8 +113,7 @@ class Warden:
             if agent_of(vehicle) not in fleets:
                 self._guests.setdefault(agent_of(vehicle), {})[vehicle] = len(grant.cells)
         self._hosts: dict[str, _Host] = {}
-        self._beside: dict[int, tuple[int, ...]] = {}
-        """Cells beside which vehicles ended lately -> the cells beside them."""
+        self._beside = _Beside(plots.grid.cols)
         self._pushed: dict[str, int] = {}
         self._granted = True  # since the last table: something that a host waits for
         self._changed = False  # or anything else
@@ -289,7 +303,7 @@ class Warden:
             grants = by_host[name]
             # Also around those under way: what they want once they come to rest depends on who is there.
             stands = () if host.standing is None else host.standing.vehicles
-            near = set(chain.from_iterable(map(self._around, {stand.end for stand in stands})))
+            near = set(chain.from_iterable(map(self._beside.__getitem__, {stand.end for stand in stands})))
             occupied = sorted((near & held).difference(*grants.values()) | (near & shut))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             says = (life, grants, pushed, occupied, 0 if stands else heard)
@@ -309,17 +323,6 @@ class Warden:
                 occupied=occupied,
             )
 
-    def _around(self, cell: int) -> tuple[int, ...]:
-        """The cells beside a cell."""
-        around = self._beside.get(cell)
-        if around is None:
-            if len(self._beside) >= _MOST_BESIDE:
-                self._beside.clear()
-            north, south = cell - self._plots.grid.cols, cell + self._plots.grid.cols
-            around = north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1
-            self._beside[cell] = around
-        return around
-
     def _plan(self, now_ns: int) -> None:
         stands = self._stands(now_ns)
         held = {cell for cells in self._shut.values() for cell in cells}
@@ -327,7 +330,8 @@ class Warden:
         closed = set(held)
         movers: dict[str, Mover] = {}
         for stand in stands:
-            cells = self._cells_of(stand.vehicle)
+            grant = self._grants.get(stand.vehicle)
+            cells = _NO_CELLS if grant is None else grant.cells
             if not cells and _is_entering(stand):
                 continue  # nobody makes way for it
             if stand.cell != stand.end or (cells and cells != [stand.cell]):
@@ -345,7 +349,7 @@ class Warden:
             mover = movers.get(stand.vehicle)
             if mover is not None:
                 round.plan(mover)
-            else:
+            elif stand.ahead:
                 self._grant(stand, self._next_ahead(stand), held, round.taken)
         for stand in stands:
             to = round.to.get(stand.vehicle)

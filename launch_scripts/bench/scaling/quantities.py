@@ -23,6 +23,8 @@ INTEREST_CELLS = 75
 """Within so many cells of a vehicle its agent holds the map: `map.interest_m` of the scenario, in cells."""
 _ROAM_CELLS = 4
 """What a vehicle drives from its start in the first seconds, in which all runs are measured."""
+LISTEN_TO_ALL = 5 / 90
+"""The part of the time in which an agent hears everybody's digests: `shared_map/replication/digest_interest.py`."""
 REASSIGN_S = 5.0
 """`vehicles.reassign_s`."""
 _AFTER_CAPTURE_S = 0.5
@@ -47,6 +49,8 @@ class Quantities:
                   one member, which tells nobody
     shared        pairs of an agent and a region in which it has vehicles
     hearers       agents that hold the region of a vehicle, on average; they hear its marks
+    listeners     agents that hear an agent's digest, on average: those that hold a region in which it has vehicles,
+                  and all agents a part of the time
     near          share of all regions that an agent holds, on average
     chases        pairs of an agent and a target which one of its vehicles chases, where each takes any target
     asks          requests a second, of all agents, for what their vehicles need to every target
@@ -64,6 +68,7 @@ class Quantities:
     plots: float
     shared: float
     hearers: float
+    listeners: float
     near: float
     chases: float
     asks: float
@@ -71,7 +76,7 @@ class Quantities:
 
 def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines: int = 1) -> Quantities:
     """The numbers of a swarm of one size, with so many standbys of each planner."""
-    shared, hearers, near = _spread(size.vehicles, size.agents, size.side)
+    shared, hearers, told, near = _spread(size.vehicles, size.agents, size.side)
     per_agent = size.vehicles / size.agents
     return Quantities(
         vehicles=size.vehicles,
@@ -86,6 +91,7 @@ def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines:
         plots=math.ceil(size.side / REGION_CELLS) ** 2 if size.agents >= FEWEST_FOR_MAJORITY else 0,
         shared=shared,
         hearers=hearers,
+        listeners=told + LISTEN_TO_ALL * (size.agents - told),
         near=near,
         chases=size.agents * size.targets * -math.expm1(-per_agent / size.targets),
         asks=size.agents * _asks_per_s(_captures_per_s(size), size.targets),
@@ -112,8 +118,9 @@ def _asks_per_s(captures_per_s: float, targets: int) -> float:
 
 
 @functools.lru_cache(1024)
-def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float, float]:
-    """`shared`, `hearers` and `near` of `Quantities`, of vehicles anywhere on an empty square map."""
+def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float, float, float]:
+    """`shared`, `hearers`, agents that hold a region of an agent's vehicles, and `near`, as in `Quantities`, of
+    vehicles anywhere on an empty square map."""
     rng = np.random.default_rng(_SEED)
     rows, cols = rng.integers(0, side, (2, vehicles))
     order = np.argsort(_morton(rows, cols), kind="stable")
@@ -122,7 +129,9 @@ def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float, float]
     driven = _regions_within(_ROAM_CELLS, rows, cols, agent, side)
     held = _regions_within(INTEREST_CELLS, rows, cols, agent, side)
     hearers = held.sum(0)[rows // REGION_CELLS, cols // REGION_CELLS].mean()
-    return float(driven.sum()), float(hearers), float(held.mean())
+    spoken_of, of_interest = (each.reshape(len(each), -1).astype(np.float32) for each in (driven, held))
+    told = (spoken_of @ of_interest.T > 0).sum(1).mean()
+    return float(driven.sum()), float(hearers), float(told), float(held.mean())
 
 
 def _regions_within(

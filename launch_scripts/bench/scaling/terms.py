@@ -46,6 +46,7 @@ def one(_: Quantities) -> float:
 HEARERS: Mapping[str, Callable[[Quantities], float]] = {
     "agents": lambda q: q.agents,
     "agents near": lambda q: q.hearers,
+    "agents that listen": lambda q: q.listeners,
     "planners": lambda q: q.planners,
     "keepers": lambda q: q.keepers,
     "monitors": lambda q: q.monitors,
@@ -132,8 +133,8 @@ SENT: tuple[Sent, ...] = (
         "agent",
         ("agents", "vehicles"),
         ("agents", "vehicles"),
-        _ALL_MAPS,
-        "which sets an agent has put, to everyone who holds a map",
+        {**_ALL_MAPS, "agent": "agents that listen"},
+        "which sets an agent has put, to everyone who holds a map, of agents those near",
     ),
     Sent(
         "digest",
@@ -313,7 +314,7 @@ CHANGES: Mapping[str, Change] = {
         ("digest", "agent", "planner"): _near,
         ("digest", "keeper", "planner"): _near,
     },
-    "digests go to agents near": {("digest", "agent", "agent"): _near, ("digest", "keeper", "agent"): _near},
+    "a keeper's digests go by region": {("digest", "keeper", "agent"): _near},
     "agents hear the targets near": {("pose", "targets", "agent"): _near},
 }
 """What could be changed -> what that would save, where near is as large as what an agent holds."""

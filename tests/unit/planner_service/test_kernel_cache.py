@@ -8,9 +8,11 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import CodeType
 
 import pytest
 
+from planner_service.kernel_build import all_kernels
 from planner_service.kernels import compile as kernel_compile
 
 _HELPER = """
@@ -32,6 +34,15 @@ from kernels.helper import scaled
 def f(x):
     return scaled(x)
 """
+_ANOTHER = """
+from kernels.compile import kernel
+from kernels.helper import scaled
+
+
+@kernel("(i8,)")
+def g(x):
+    return scaled(x) + 1
+"""
 _CALL = """
 from kernels.kernel import f
 
@@ -51,12 +62,14 @@ def folder(tmp_path: Path) -> Path:
     return kernels
 
 
-def call(folder: Path, *, within: Sequence[str] = (), **environment: str) -> tuple[int, int, int]:
+def call(
+    folder: Path, *, within: Sequence[str] = (), code: str = _CALL, **environment: str
+) -> tuple[int, int, int]:
     """(f(7), cache hits, cache misses) in a fresh process, started by the command `within`."""
     settings = {"PYTHONPATH": str(folder.parent), "PYTHONDONTWRITEBYTECODE": "1"}
     settings = {"NUMBA_CACHE_DIR": str(folder.parent / "cache")} | settings | environment
     done = subprocess.run(
-        [*within, sys.executable, "-c", _CALL],
+        [*within, sys.executable, "-c", code],
         env={**os.environ, **settings},
         capture_output=True,
         text=True,
@@ -73,6 +86,28 @@ def test_a_kernel_is_compiled_once_and_again_when_a_helper_in_another_file_chang
     (folder / "helper.py").write_text(_HELPER.replace("= 3", "= 5"))
     assert call(folder) == (35, 0, 1)
     assert call(folder) == (35, 1, 0)
+
+
+def test_what_a_kernel_from_disk_shares_with_another_is_linked_to_when_that_is_compiled(folder: Path) -> None:
+    (folder / "another.py").write_text(_ANOTHER)
+    assert call(folder) == (21, 0, 1)
+    both = _CALL.replace("print(f(7)", "from kernels.another import g\nprint(f(7) + g(7)")
+    assert call(folder, code=both) == (43, 1, 0)
+    assert call(folder, code=both.replace("f.stats", "g.stats")) == (43, 1, 0)
+
+
+def test_no_kernel_calls_another_so_that_none_needs_bitcode_from_disk() -> None:
+    all_kernels()  # all modules are imported
+    kernels = {id(each): name for name, each in kernel_compile.KERNELS.items()}
+    for name, each in kernel_compile.KERNELS.items():
+        function = each.py_func
+        known = [function.__globals__.get(word) for word in _names(function.__code__)]
+        assert [kernels[id(value)] for value in known if id(value) in kernels] == [], name
+
+
+def _names(code: CodeType) -> set[str]:
+    inner = (_names(each) for each in code.co_consts if isinstance(each, CodeType))
+    return set(code.co_names).union(*inner)
 
 
 def test_code_without_bounds_checks_is_not_taken_where_they_are_asked_for(folder: Path) -> None:
