@@ -11,6 +11,7 @@ from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.pieces import PieceTree
+from planner_service.tree.rounding import Rounding
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
@@ -26,6 +27,8 @@ class LowerBounds:
         """float32, padded, s: the exact cost of an earlier root, lowered where the map became cheaper. A consistent
         heuristic: no step costs less than it falls by. `take` sets it, `learn` lowers it, or drops it (None) where
         that would visit too many cells."""
+        self._rim: tuple[Rounding, NDArray[np.float64], float] | None = None
+        """Of which map and rim `_rounding_of_rim` was asked last, and what it said: each query asks again."""
 
     def take(self, exact_cost: Floats) -> None:
         """Go by this exact padded cost from now on; nobody may write to it any more."""
@@ -66,12 +69,20 @@ class LowerBounds:
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            most = float(grid.rounding.at(rim_cost.max())) if rim.size else 0.0
+            most = self._rounding_of_rim(rim_cost)
             kernels.bound_by_heuristic(
                 heuristic, root, grid.stride, part, box, rim, rim_cost, starts, rounding, most, bound
             )
         # Of the optimum only the share that is travel time counts.
         return bound * grid.time_share
+
+    def _rounding_of_rim(self, rim_cost: NDArray[np.float64]) -> float:
+        """How far float32 may put the window's own costs of its rim off, relatively."""
+        rounding = self._grid.rounding
+        if self._rim is None or self._rim[0] is not rounding or self._rim[1] is not rim_cost:
+            most = float(rounding.at(rim_cost.max(initial=0.0)))
+            self._rim = rounding, rim_cost, most
+        return self._rim[2]
 
 
 _NONE: Floats = np.empty(0, np.float32)

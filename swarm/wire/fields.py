@@ -16,6 +16,7 @@ import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
+from struct import Struct
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -374,7 +375,11 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
 
         return check_bytes
 
+    alone = Struct(dtype[0] + code).unpack
+
     def check(name: str, data: bytes) -> None:
+        if len(data) == width and least <= alone(data)[0] <= most:  # one route, one cell: a third of the time
+            return
         if len(data) % width:
             raise ValueError(f"{name} has {len(data)} bytes, not a column of {word}")
         if len(data) <= _FEW or not numpy_loaded():
