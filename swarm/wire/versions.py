@@ -48,14 +48,18 @@ class Step:
         return self.writes_older(wire - 1)
 
 
+_MOST_DIGITS = 9
+
 STEPS: dict[type[Message], Step] = {}
 """The steps that are under way. Empty: no message has changed so since each has a version of its own."""
 
 
 def name_and_version(schema: str) -> tuple[str, int]:
-    """The parts of a schema such as "marks/8"; version -1 where it has none."""
+    """The parts of a schema such as "marks/8"; version -1 where it has none. It may be anybody's: Python raises on
+    numbers of thousands of digits."""
     name, _, version = schema.rpartition("/")
-    return (name, int(version)) if version.isascii() and version.isdigit() else (schema, -1)
+    is_one = version.isascii() and version.isdigit() and len(version) <= _MOST_DIGITS
+    return (name, int(version)) if is_one else (schema, -1)
 
 
 def schema_of_type(message_type: type[Message]) -> str:

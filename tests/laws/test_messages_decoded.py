@@ -71,6 +71,20 @@ def test_a_later_wire_version_is_refused_and_a_later_field_ignored():
         decode(msgpack.packb(fields | {"schema": "note/9"}), Note)
 
 
+@given(
+    st.sampled_from(TYPES),
+    st.integers(0, 2) | st.text(max_size=9) | st.binary(max_size=9) | st.integers(0, 20_000).map(lambda n: "9" * n),
+)
+def test_whatever_stands_for_a_version_is_a_message_or_refused(kind, version):
+    """Also a number of more digits than Python reads."""
+    fields = msgspec.to_builtins(BY_TYPE[kind], builtin_types=(bytes,))
+    name, _, own = fields["schema"].partition("/")
+    for schema in (version, f"{name}/{version}"):
+        with contextlib.suppress(ProtocolError):
+            assert decode(msgpack.packb(fields | {"schema": schema}), kind) == BY_TYPE[kind]
+            assert schema == f"{name}/{own}"
+
+
 def _attempt(payload: bytes, kind: type[Message]) -> bool:
     """Whether it is accepted. If so, it is what msgpack and msgspec one after the other would make of it; but where
     that fails the reason lies in what no field asks for, so it is a message of its own all the same."""
