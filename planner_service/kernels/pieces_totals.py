@@ -106,7 +106,7 @@ def _add_up_all(pieces, tiles, order, now, stack):
 def _note_changes(t, pieces, tiles):
     """Write `falls` and `ends` of a tile whose totals have changed."""
     total = pieces[0]
-    exits, many, _, wanted, falls, ends, _ = tiles
+    exits, many, _, _, falls, ends, _ = tiles
     least, most, near, far = np.inf, -np.inf, np.inf, 0.0
     for j in range(many[t]):
         y = t * ROOM + np.int64(exits[t * ROOM + j])
@@ -114,9 +114,6 @@ def _note_changes(t, pieces, tiles):
         change = 0.0
         if cost < np.inf or total[y, BEFORE] < np.inf:
             change = cost - total[y, BEFORE]
-        if change == -np.inf:
-            # Where all about it had no way either, nobody has risen by more than others.
-            wanted[t] |= LOOK
         total[y, BEFORE] = cost
         least = min(least, change)
         most = max(most, change)
@@ -182,6 +179,9 @@ def find_risen(pieces, tiles, todo):
             # Its own pieces have risen by no more than those about it that offer them less.
             if falls[1, t] > least:
                 falls[2, t] += falls[1, t] - least
+            elif least == -np.inf:
+                # It has no way, or had none: that it has not risen by more than who has got one says nothing.
+                falls[2, t] = np.inf
             near = ends[0, t] if ends[0, t] < np.inf else 0.0
             todo[t] = 1 if wanted[t] & LOOK or falls[2, t] > _DRIFT * FINEST * near else 0
             count += todo[t]
