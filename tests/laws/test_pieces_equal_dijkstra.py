@@ -16,6 +16,7 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service import growth_times
 from planner_service.kernels.layout import NONE
+from planner_service.kernels.pieces import SIDE
 from planner_service.tree import pieces
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -179,6 +180,24 @@ def test_a_long_walk_stays_exact() -> None:
     for _ in range(120):
         chase.go(1)
     chase.check()
+
+
+@pytest.mark.parametrize("seed", range(9000, 9000 + few(60)))
+def test_single_cells_beside_the_borders_of_tiles(seed: int) -> None:
+    """What gets dearer or cheaper there concerns the tile beside it, too: by its costs, by its corners, or not."""
+    chase = Chase(seed, 80)
+    rows, cols = chase.pace.shape
+    for n in range(12):
+        along = int(chase.rng.integers(1 + (rows if n % 2 else cols) // SIDE)) * SIDE - int(chase.rng.integers(2))
+        cell = (along, int(chase.rng.integers(cols))) if n % 2 else (int(chase.rng.integers(rows)), along)
+        row, col = min(max(cell[0], 0), rows - 1), min(max(cell[1], 0), cols - 1)
+        if row * cols + col == chase.tree.root:
+            continue
+        chase.pace[row, col] = chase.rng.choice([1.0, 0.02, 50.0, np.inf, 5.0])
+        chase.tree.repair(chase.ground.apply(chase.pace, [Window(row, col, row + 1, col + 1)]))
+        if not chase.tree.exact:
+            chase.grow(chase.tree.root)
+        chase.check()
 
 
 @pytest.mark.parametrize("seed", range(4))
