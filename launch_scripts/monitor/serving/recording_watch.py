@@ -22,7 +22,7 @@ SPACE_BYTES = 8 << 20
 class RecordingWatch:
     """Watches the file of a recording. Rerun's file sink ends at the first error, with a line in its own log only.
 
-    begin  lets what is drawn from now on go to this file as well
+    begin  lets what is drawn from now on go to this file as well; raises StoreError where it cannot
     """
 
     def __init__(self, path: Path, begin: Callable[[Path], None]) -> None:
@@ -48,10 +48,10 @@ class RecordingWatch:
             try:
                 check_space(self._path.parent)
                 self._path = new_recording_path(self._path.parent)
+                self._begin(self._path)
             except (OSError, StoreError):
                 pass
             else:
-                self._begin(self._path)
                 self._size, self._still, self._ended_ns = -1, 0, None
                 return f"the recording goes on in {self._path}", True
         if now_ns - self._ended_ns >= SAY_EVERY_S * NS_PER_S:

@@ -45,10 +45,11 @@ def new_recording_path(folder: Path) -> Path:
     raise StoreError(f"{folder} is full of recordings")
 
 
-def _file(path: Path) -> rr.FileSink:
-    """A file without a footer. For that rerun keeps an entry of every chunk in memory up to the end, 4 MB a minute
-    of the demo. What reads recordings reads those without one, too: a killed monitor leaves one in any case."""
-    return rr.FileSink(path, write_footer=False)
+def _files(path: Path | None) -> list[rr.FileSink]:
+    """A file without a footer, if there is to be one. For that rerun keeps an entry of every chunk in memory up to
+    the end, 4 MB a minute of the demo. What reads recordings reads those without one, too: a killed monitor leaves
+    one in any case."""
+    return [] if path is None else [rr.FileSink(path, write_footer=False)]
 
 
 class Streams:
@@ -81,9 +82,7 @@ class Sinks:
         """Address for a native viewer."""
         self._page: ViewerPage | None = None
         self._gate: StreamGate | None = None
-        sinks: list[rr.FileSink | rr.GrpcServerSink] = []
-        if path is not None:
-            sinks.append(_file(path))
+        live: list[rr.GrpcServerSink] = []
         if config.live:
             behind = _hidden_address()
             self._gate = _when_free(lambda port: StreamGate(port, behind), config.grpc_port, "grpc_port")
@@ -91,8 +90,16 @@ class Sinks:
             self.stream_url = f"rerun+http://{LOOPBACK}:{self._gate.port}/proxy"
             page = _when_free(lambda port: ViewerPage(port, behind), config.web_port, "web_port")
             self._page = page
-            sinks.append(rr.GrpcServerSink(bind_ip=behind[0], port=behind[1], server_memory_limit=_MEMORY))
-        self.rec.set_sinks(*sinks, default_blueprint=blueprint)
+            live.append(rr.GrpcServerSink(bind_ip=behind[0], port=behind[1], server_memory_limit=_MEMORY))
+        try:
+            self.rec.set_sinks(*_files(path), *live, default_blueprint=blueprint)
+        except (
+            RuntimeError
+        ) as error:  # a disk without space: `RecordingWatch` begins another file once there is some
+            if path is None:
+                raise
+            log.warning("recording nothing in %s: %s", path, error)
+            self.rec.set_sinks(*live, default_blueprint=blueprint)
 
     @property
     def live_url(self) -> str | None:
@@ -111,10 +118,13 @@ class Sinks:
 
     def begin_file(self, path: Path) -> None:
         """Let what is logged to `streams` go to this file, too. On a stream of its own: new sinks for `rec` would
-        close the live view's port."""
+        close the live view's port. Raises StoreError where nothing can be written to it."""
         _, *earlier = self.streams.streams
         stream = self._stream()
-        stream.set_sinks(_file(path), default_blueprint=self._blueprint)
+        try:
+            stream.set_sinks(*_files(path), default_blueprint=self._blueprint)
+        except RuntimeError as error:
+            raise StoreError(f"cannot write {path}: {error}") from error
         self.streams.streams = (self.rec, stream)
         for each in earlier:
             each.disconnect()

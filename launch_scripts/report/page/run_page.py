@@ -48,6 +48,7 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
     environment = environment_of_pages()
     tracks = folder / TRACKS_FILE
     scenario = folder / SCENARIO_FILE
+    recording = folder / "run.rrd"  # without a byte where the monitor ended before it drew anything
     notes = list(report.get("notes") or [])
     return environment.get_template(
         "report.html.j2"
@@ -69,7 +70,7 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         notes=notes[-_NOTES_SHOWN:],
         notes_left=max(len(notes) - _NOTES_SHOWN, 0),
         scenario=read_text(scenario, FileKind.SCENARIO) if scenario.exists() else None,
-        recording=(folder / "run.rrd").exists(),
+        recording=recording.is_file() and recording.stat().st_size > 0,
     )
 
 

@@ -427,7 +427,6 @@ def test_a_recording_that_finds_no_space_is_told_and_goes_on_in_a_new_file(tmp_p
     script = f"""
 import resource, pathlib, time, numpy
 import rerun as rr
-from launch_scripts.monitor import recording_watch
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
@@ -465,6 +464,41 @@ sinks.close()
     assert told[2:] == [f"{begun} True the recording goes on in {tmp_path / 'run-2.rrd'}"]
     assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 109 - begun
     assert sorted(each.name for each in tmp_path.iterdir()) == ["run-2.rrd", "run.rrd"]
+
+
+def test_a_recording_that_finds_no_space_at_its_beginning_stops_nobody_and_begins_later(tmp_path: Path) -> None:
+    script = f"""
+import resource, pathlib, numpy
+import rerun as rr
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.serving.recording_watch import RecordingWatch
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import MonitorConfig
+
+_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
+mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
+watch = RecordingWatch(path, sinks.begin_file)
+for second in range(20):
+    if second == 8:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    sinks.streams.set_time("tick", sequence=second)
+    sinks.streams.log("a", rr.Scalars(second))
+    sentence, begun = watch.look(second * 10**9)
+    if sentence:
+        print(second, begun, sentence, flush=True)
+sinks.close()
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True
+    ).stdout.splitlines()
+    ended = f"the recording {tmp_path / 'run.rrd'} has ended: File too large; another begins when there is space"
+    assert told == [f"5 False {ended}", f"16 True the recording goes on in {tmp_path / 'run-2.rrd'}"]
+    assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 3
 
 
 def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
