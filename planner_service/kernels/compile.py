@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -36,6 +37,7 @@ def _stamp() -> tuple[str, bool]:
 
 
 _STAMP = _stamp()
+_DIGEST_BYTES = hashlib.sha256().digest_size
 
 KERNELS: dict[str, Any] = {}
 """Name -> kernel, of all that Python calls, in the order in which modules were imported."""
@@ -76,6 +78,30 @@ def _no_bitcode() -> Any:
     return codegen.ll.parse_assembly("").as_bitcode()
 
 
+class _WholeFiles(caching.IndexDataCacheFile):
+    """numba's, for which a file that is not as it was written is one that is not there, so that the kernel is
+    compiled and written once more. A disk that fails or a machine that loses power leaves such files; numba raises
+    what `pickle` makes of one, at every start anew, and calls machine code with a wrong byte."""
+
+    def _load_index(self):
+        try:
+            return super()._load_index()
+        except Exception:  # of bytes that are no index, or that may not be read
+            return {}
+
+    def _load_data(self, name):
+        data = Path(self._data_path(name)).read_bytes()
+        digest, code = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        if hashlib.sha256(code).digest() != digest:
+            raise OSError(f"{name} is not as it was written")  # which numba takes for a file that is gone
+        return pickle.loads(code)
+
+    def _save_data(self, name, data):
+        code = self._dump(data)
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(hashlib.sha256(code).digest() + code)
+
+
 class _FolderCache(caching.FunctionCache):
     """A function's cache on disk, found where numba would put it (NUMBA_CACHE_DIR, __pycache__ or the user's)."""
 
@@ -84,7 +110,7 @@ class _FolderCache(caching.FunctionCache):
     def __init__(self, function):
         super().__init__(function)
         base = f"{self._impl.filename_base}.{_STAMP[0][:12]}"
-        self._cache_file = caching.IndexDataCacheFile(self.cache_path, base, _STAMP)
+        self._cache_file = _WholeFiles(self.cache_path, base, _STAMP)
 
     def load_overload(self, sig, target_context):
         """As numba's, but without its registries, which only a compilation needs and which take 0.5 s to load."""

@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType
 
@@ -113,6 +113,32 @@ def _names(code: CodeType) -> set[str]:
 def test_code_without_bounds_checks_is_not_taken_where_they_are_asked_for(folder: Path) -> None:
     assert call(folder) == (21, 0, 1)
     assert call(folder, NUMBA_BOUNDSCHECK="1") == (21, 0, 1)
+
+
+def _one_wrong_byte(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("files", "damaged"),
+    [
+        ("*.nbi", lambda data: b""),
+        ("*.nbi", lambda data: data[: len(data) // 2]),
+        ("*.nbc", lambda data: data[: len(data) // 2]),
+        ("*.nbc", lambda data: bytes(len(data))),
+        ("*.nbc", _one_wrong_byte),
+    ],
+    ids=["empty index", "half an index", "half the code", "code of zeros", "one wrong byte"],
+)
+def test_files_that_are_not_as_they_were_written_are_written_anew(
+    folder: Path, files: str, damaged: Callable[[bytes], bytes]
+) -> None:
+    assert call(folder) == (21, 0, 1)
+    for file in (folder.parent / "cache").rglob(files):
+        file.write_bytes(damaged(file.read_bytes()))
+    assert call(folder) == (21, 0, 1)
+    assert call(folder) == (21, 1, 0)
 
 
 def test_kernels_run_where_nothing_can_be_written(folder: Path) -> None:
