@@ -7,6 +7,7 @@ import re
 import signal
 from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -42,10 +43,9 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     kept = sweep.trials - len(sweep.missing)
     if kept:
         console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
-    # As a batch system or `timeout` ends it: workers and their folder go with it.
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    stops = _hear_stops()
     try:
-        _run(sweep, console, workers or cores(), scheduler)
+        _run(sweep, console, workers or cores(), scheduler, stops)
     except KeyboardInterrupt:
         there = sum(trial.key in sweep.store.results for trial in sweep.missing) + kept
         with suppress(KeyboardInterrupt):
@@ -61,7 +61,26 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     return not summary.failing and not summary.missing
 
 
-def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None) -> None:
+def _hear_stops() -> list[int]:
+    """The signals to stop that have come, to which more are added as they come. Each interrupts at once, too; but
+    what is raised while Python clears something away, as a future of Dask, is lost.
+
+    SIGTERM is one of them, as a batch system or `timeout` ends a sweep: workers and their folder go with it.
+    """
+    stops: list[int] = []
+    interrupt = signal.getsignal(signal.SIGINT)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stops.append(number)
+        if callable(interrupt):
+            interrupt(signal.SIGINT, frame)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return stops
+
+
+def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, stops: list[int]) -> None:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -84,6 +103,8 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None) ->
             while sweep.warned:
                 console.print(sweep.warned.pop(0))
             bar.update(task, advance=1, failed=failed)
+            if stops:
+                raise KeyboardInterrupt
 
         sweep.run(workers, scheduler, told)
 

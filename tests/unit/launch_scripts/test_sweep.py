@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import signal
 import statistics as plain
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -463,3 +466,29 @@ def test_intervals_of_many_values_are_students_and_of_few_there_are_none():
     assert statistics.mean([1.0, 2.0]).low is None
     assert statistics.median([1.0, 2.0, 3.0, 4.0, 5.0]).low is None
     assert statistics.median([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).low == 1.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_that_interrupts_nothing_stops_a_sweep_after_the_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """As where it comes while a future is cleared away: Python tells of the exception there, and goes on."""
+    told_of: list[int] = []
+
+    def run(sweep: Sweep, workers: int, scheduler: str | None, told: Callable[[Trial, None], None]) -> None:
+        for trial in sweep.missing:
+            told_of.append(trial.seed)
+            if len(told_of) == 2:
+                with contextlib.suppress(KeyboardInterrupt):
+                    signal.raise_signal(number)
+            told(trial, None)
+
+    monkeypatch.setattr(Sweep, "run", run)
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            sweep_study(str(write_study(tmp_path)), None, 1, tmp_path / "out", as_json=False)
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    assert len(told_of) == 2
