@@ -421,29 +421,41 @@ time.sleep(60)
     assert rows_by_entity(path)["/a"] == 100
 
 
+OPENED_WITHIN_A_LIMIT = """
+import pathlib, resource, time
+import numpy
+import rerun as rr
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.serving.recording_watch import RecordingWatch
+from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import MonitorConfig
+
+_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+def limit(size):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+
+def open_recording(folder):
+    path = new_recording_path(pathlib.Path(folder))
+    mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+    sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
+    return sinks, RecordingWatch(path, sinks.begin_file)
+"""
+"""Begins scripts that record where files may not grow beyond a size, which stands for a full disk."""
+
+
 @pytest.mark.thorough
 def test_a_recording_that_finds_no_space_is_told_and_goes_on_in_a_new_file(tmp_path: Path) -> None:
     """A limit of the size of files stands for the full disk: Rerun's sink ends at the first error all the same."""
     script = f"""
-import resource, pathlib, time, numpy
-import rerun as rr
-from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.serving.recording_watch import RecordingWatch
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
-from shared_map.terrain.terrain import terrain_of_pace
-from swarm.liveness import Peer
-from swarm.config.scenario import MonitorConfig
-
-path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
-mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
-watch = RecordingWatch(path, sinks.begin_file)
-_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, hard))
+{OPENED_WITHIN_A_LIMIT}
+sinks, watch = open_recording({str(tmp_path)!r})
+limit(300_000)
 for second in range(110):
     if second == 90:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+        limit(hard)
     sinks.streams.set_time("tick", sequence=second)
     sinks.streams.log("a", rr.Points3D(numpy.random.rand(2000, 3)))
     time.sleep(0.12)  # in which what is logged is written
@@ -468,24 +480,12 @@ sinks.close()
 
 def test_a_recording_that_finds_no_space_at_its_beginning_stops_nobody_and_begins_later(tmp_path: Path) -> None:
     script = f"""
-import resource, pathlib, numpy
-import rerun as rr
-from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.serving.recording_watch import RecordingWatch
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
-from shared_map.terrain.terrain import terrain_of_pace
-from swarm.config.scenario import MonitorConfig
-
-_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
-path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
-mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
-watch = RecordingWatch(path, sinks.begin_file)
+{OPENED_WITHIN_A_LIMIT}
+limit(0)
+sinks, watch = open_recording({str(tmp_path)!r})
 for second in range(20):
     if second == 8:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+        limit(hard)
     sinks.streams.set_time("tick", sequence=second)
     sinks.streams.log("a", rr.Scalars(second))
     sentence, begun = watch.look(second * 10**9)
