@@ -100,7 +100,10 @@ class GrowthTimes:
         self._choose()
 
     def observe_exact_ns(self, took_ns: int) -> None:
-        """What an exact move really took."""
+        """What an exact move really took, without the repair before it."""
+        if self.in_pieces and not self._exact_took_ns:
+            # One slow move, such as the first after a growth, gives up no tree: another one takes a second.
+            self._exact_took_ns.extend([int(self.exact_ns)] * 2)
         self.exact_ns = max(1, _median_with(self._exact_took_ns, took_ns))
         self._choose()
 

@@ -346,7 +346,7 @@ class Planner:
             took_ns = update.cells * (MODEL_EXACT_NS_PER_CELL if update.kind == "exact" else MODEL_NS_PER_CELL)
         if update.kind in ("full", "exact"):
             self._exact_ns = now_ns
-            self._record_growth(took_ns, exact_move=update.kind == "exact")
+            self._record_growth(took_ns - update.repair_ns, exact_move=update.kind == "exact")
             self._gaps.record_growth(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
         elif update.kind != "none":
             self.counters.count("window_growths")

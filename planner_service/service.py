@@ -111,6 +111,7 @@ class PlannerService:
                 all_kernels or (lambda: True),
                 has_worker=True,
                 chosen_by=chosen_by,
+                stopwatch=stopwatch or (lambda: 0),
             )
             shelf = prepared if name == GROUND else None
             if shelf is not None:

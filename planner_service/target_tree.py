@@ -45,6 +45,7 @@ class TargetTree:
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
                  the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
     chosen_by    the strategy; the built-in one that `config` names if not given
+    stopwatch    CPU time of this thread, ns, by which repairs are told from what follows them; none in a simulation
     times        what growths take, to be told; by these the strategy chooses
     last_gaps    float64, driven cost over optimum of what was offered to each followed vehicle, measured by the
                  last `adopt`; empty before
@@ -59,6 +60,7 @@ class TargetTree:
         *,
         has_worker: bool = False,
         chosen_by: Strategy | None = None,
+        stopwatch: Callable[[], int] = lambda: 0,
     ) -> None:
         self.target_cell: int | None = None
         self.map_version = -1
@@ -67,6 +69,7 @@ class TargetTree:
         self._grid = grid
         self._all_kernels = all_kernels
         self._has_worker = has_worker
+        self._stopwatch = stopwatch
         # The cell costs of the map as it was last told, and whether it was told at all.
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
@@ -139,7 +142,8 @@ class TargetTree:
             done = self._move(target_cell)
         if self._is_full_due(done):
             done = self._renew(done)
-        return done.after(repaired) if repaired.kind != "none" and moved | (done.kind == "none") else done
+        includes_repair = not moved and done.kind not in ("none", "full", "exact")
+        return done if repaired.kind == "none" or includes_repair else done.after(repaired)
 
     def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
         """A full growth for a worker, on the map as it was told last: see `growth_job`."""
@@ -325,10 +329,12 @@ class TargetTree:
             return None
         if not self._all_kernels():
             return None
+        began_ns = self._stopwatch()
         visited = tree.repair(changes)
         if visited < 0 or not tree.fine:
             return None
-        return Update("repair", self._costs.window_of(changes.cells), visited)
+        window, took_ns = self._costs.window_of(changes.cells), self._stopwatch() - began_ns
+        return Update("repair", window, visited, repair_ns=took_ns)
 
     @property
     def _can_mend(self) -> bool:
@@ -373,6 +379,8 @@ class TargetTree:
 
     def _move(self, target_cell: int) -> Update:
         """Grow a window around the target's new cell, a wider one where that fails, at last the whole tree."""
+        if isinstance(self._tree, PieceTree) and not self.times.is_quick(self._grid.cells):
+            return self._leave_to_worker()  # a tree with a cost in every cell takes as long as to grow one
         self._tree = tree = in_cells(self._tree)
         if self._left_to_worker or not (tree.fine or self.times.is_quick(self._grid.cells)):
             return self._leave_to_worker()
