@@ -18,6 +18,8 @@ REGION_TILES = 8
 """Side of a region, in tiles. Processes subscribe to positions and marks by region."""
 REGION_CELLS = REGION_TILES * TILE_CELLS
 """Side of a region, in cells."""
+MOST_PLOT_REGIONS = 64
+"""Side of the largest plot of right of way, in regions: that of the largest square grid."""
 
 MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.grid import GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
@@ -62,7 +62,8 @@ class RightOfWaySync:
         layer: int = 0,
         others: Collection[str] = (),
     ) -> None:
-        plots = Plots(grid, list(spawns), layer=layer, others=others)
+        side = setup.scenario.map.plot_regions * REGION_CELLS
+        plots = Plots(grid, list(spawns), side, layer=layer, others=others)
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved, vehicles=vehicles)
         self._id = setup.id
         self._store = store
@@ -170,7 +171,8 @@ class RightOfWaySync:
         self.core.silent = not self._store.ready
 
     def _ask_known(self) -> None:
-        request = KnownRequest(agent=self._id, disk=self._store.own.disk, layer=self.core.plots.layer)
+        plots = self.core.plots
+        request = KnownRequest(agent=self._id, disk=self._store.own.disk, layer=plots.layer, plot_cells=plots.side)
         self._asking, self._unasked = True, False
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 

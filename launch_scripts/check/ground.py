@@ -12,11 +12,13 @@ from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
-from swarm.config.classes import GROUND
+from swarm.config.agents import plan_agents
+from swarm.config.classes import GROUND, flies
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
-from swarm.grid import GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 from swarm.places import cell_of
+from swarm.right_of_way.plots import Plots, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 
@@ -36,6 +38,19 @@ def places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | N
     grounds = class_grounds(scenario, terrain, truth, homes)
     yield from _targets(scenario, terrain, truth, grounds[GROUND].homes)
     yield from _vehicles(scenario, terrain.grid, grounds)
+
+
+def plots(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
+    """More plots of right of way than the agents have use for."""
+    agents = sum(not flies(scenario, plan.group.vehicle_class) for plan in plan_agents(scenario))
+    fitting = fitting_regions(grid.rows, grid.cols, agents)
+    if agents and fitting > scenario.map.plot_regions:
+        many = Plots(grid, (), scenario.map.plot_regions * REGION_CELLS).count
+        yield warning(
+            "map.plot_regions",
+            f"{agents} agents speak of {many} plots of right of way {scenario.vehicles.tick_hz:g} times a second;"
+            f" set it to {fitting}, for larger ones",
+        )
 
 
 def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:

@@ -74,6 +74,7 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
         yield failure("", str(error))
         return
     yield from ground.places(scenario, terrain, truth)
+    yield from ground.plots(scenario, terrain.grid)
     wanted, here = needs.needs_of(scenario, terrain.grid.cells), needs.this_machine(runs)
     yield from needs.against(scenario, wanted, here, runs)
     facts |= _facts(scenario, terrain, wanted, here)

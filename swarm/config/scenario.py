@@ -34,6 +34,7 @@ from swarm.config.values import (
     Walk,
     plugin_name,
 )
+from swarm.grid import MOST_PLOT_REGIONS
 
 UNTIL_STOPPED_S = 1e9
 """A run whose `seconds` are as many ends when it is stopped."""
@@ -201,6 +202,8 @@ class MapConfig(Section, frozen=True, kw_only=True):
     interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
                         only. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
+    plot_regions        side of a plot of right of way, in regions of 256 x 256 cells. Agents speak of every plot in
+                        every tick: few agents on a large map want larger ones. The same for all processes of a run
     digest_s            every replica publishes this often which sets it holds
     author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
     total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
@@ -212,6 +215,7 @@ class MapConfig(Section, frozen=True, kw_only=True):
 
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
+    plot_regions: Annotated[int, Meta(ge=1, le=MOST_PLOT_REGIONS)] = 1
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0

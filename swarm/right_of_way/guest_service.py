@@ -145,7 +145,7 @@ class GuestService:
             if self.name in known.agents:
                 self._warn_once((f"{self.name} is an agent of this run's scenario: a guest needs another name",))
                 return
-            self.guest = Guest(Plots(self._grid, known.agents), self.name, self._lives.lives)
+            self.guest = Guest(Plots(self._grid, known.agents, known.plot_cells), self.name, self._lives.lives)
             for peer in self._tokens:
                 self.guest.hear_token(peer, up=True)
             if self._cell is not None:

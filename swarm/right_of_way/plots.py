@@ -5,12 +5,25 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from hashlib import blake2s
 
-from swarm.grid import REGION_CELLS, GridSpec
+from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS, GridSpec
 
-PLOT_CELLS = REGION_CELLS
-"""Side of a plot: that of a region. Messages go by plot, so that smaller ones cost more of them."""
+MOST_PLOTS_AN_AGENT = 8
+"""With few plots for each agent some are wardens of much more than others; many cost messages."""
 FEWEST_FOR_MAJORITY = 3
 """Members of a plot; a layer of fewer agents has one for each plot."""
+
+
+def fitting_regions(rows: int, cols: int, agents: int) -> int:
+    """The least side of a plot, in regions, by which a grid has no more plots than so many agents have use for."""
+    regions = 1
+    while _count(rows, cols, regions * REGION_CELLS) > MOST_PLOTS_AN_AGENT * agents and regions < MOST_PLOT_REGIONS:
+        regions += 1
+    return regions
+
+
+def _count(rows: int, cols: int, side: int) -> int:
+    """How many squares of a side cover a grid."""
+    return -(-rows // side) * -(-cols // side)
 
 
 class Plots:
@@ -23,6 +36,7 @@ class Plots:
     waits for anything in the other.
 
     agents  those of the layer
+    side    of a plot, in cells: `map.plot_regions`. Messages go by plot, so that smaller ones cost more of them
     layer   0 is the ground, 1 the air
     others  the agents of the other layer: no guest may take their names
 
@@ -33,17 +47,17 @@ class Plots:
         self,
         grid: GridSpec,
         agents: Sequence[str],
-        side: int = PLOT_CELLS,
+        side: int = REGION_CELLS,
         layer: int = 0,
         others: Collection[str] = (),
     ) -> None:
         self.grid = grid
         self.agents = tuple(agents)
-        self._side = side
+        self.side = side
         self._cells, self._cols = grid.cells, grid.cols
         self._across = -(-grid.cols // side)
         self._members: dict[int, tuple[str, ...]] = {}
-        self.count = self._across * -(-grid.rows // side)
+        self.count = _count(grid.rows, grid.cols, side)
         self.layer = layer
         self.others = frozenset(others)
         self._first = layer * self.count
@@ -54,7 +68,7 @@ class Plots:
         """The plot of a cell; -1 of a cell outside the grid."""
         if not 0 <= cell < self._cells:
             return -1
-        cols, side = self._cols, self._side
+        cols, side = self._cols, self.side
         return self._first + cell // cols // side * self._across + cell % cols // side
 
     def members(self, plot: int) -> tuple[str, ...]:

@@ -40,7 +40,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
             case Replied(message=Known() as known) if known.agents:
                 if name in known.agents:
                     raise ConfigError(f"{name} is an agent of the scenario, not a guest: start it again instead")
-                removal = removal or Removal(Plots(grid, known.agents), name)
+                removal = removal or Removal(Plots(grid, known.agents, known.plot_cells), name)
                 removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
                 if not removal.known:

@@ -36,10 +36,11 @@ class Member:
     """One process's membership in a run.
 
     A process asks all others for their run when it starts, whenever a link comes back and whenever a router
-    appears, as behind it there may be others. Two processes belong together when run id, terrain digest and the
-    classes of vehicles, in their order, are the same, and their builds speak neighbouring wire versions; each is
-    then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs. A confirmed one
-    never exits because of an answer; it reports the sender as a stranger: counts it, and names it once.
+    appears, as behind it there may be others. Two processes belong together when run id, terrain digest, the side
+    of plots and the classes of vehicles, in their order, are the same, and their builds speak neighbouring wire
+    versions; each is then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs.
+    A confirmed one never exits because of an answer; it reports the sender as a stranger: counts it, and names it
+    once.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
@@ -267,6 +268,11 @@ def check_same_run(mine: RunInfo, other: RunInfo) -> None:
         raise RunMismatchError(
             f"{mine.role} {mine.id} has terrain {mine.terrain} ({mine.rows} x {mine.cols}), but {who} has "
             f"{other.terrain} ({other.rows} x {other.cols}): terrain files or cost rules differ"
+        )
+    if other.plot_cells != mine.plot_cells:
+        raise RunMismatchError(
+            f"{mine.role} {mine.id} has plots of right of way of {mine.plot_cells} cells a side, but {who} has "
+            f"{other.plot_cells}: map.plot_regions differs, or was set by a version that does not know it"
         )
     if other.classes != mine.classes:
         raise RunMismatchError(

@@ -8,7 +8,7 @@ from pathlib import Path
 from swarm.config.agents import AddedAgent, crew_of
 from swarm.config.classes import class_numbers
 from swarm.config.scenario import Scenario
-from swarm.grid import GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.base import WIRE_VERSION
@@ -67,6 +67,7 @@ class RoleSetup:
             restarts=self.restarts,
             classes=list(class_numbers(self.scenario)),
             wire_version=WIRE_VERSION,
+            plot_cells=self.scenario.map.plot_regions * REGION_CELLS,
         )
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
@@ -51,6 +52,26 @@ def test_nobody_meets_under_seeded_faults(seed):
     report = simulation.report(SECONDS)
     assert report["vehicles_routed"] == 24
     assert report["captures"] > 0
+
+
+@pytest.mark.seeds(2)
+def test_nobody_meets_where_plots_are_larger_than_regions(seed):
+    wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, plot_regions=2))
+    simulation = Simulation(seeded(seed, wide), faults=random_plan(seed, nodes_of(wide), SECONDS))
+    laws = Laws(simulation)
+    messages = {"standing": 0, "table": 0}
+    simulation.network.trace = lambda _, source, destination, topic, payload: messages.update(
+        {topic: messages.get(topic, 0) + 1}
+    )
+    simulation.run_until(SECONDS)
+    simulation.finish()
+    report = simulation.report(SECONDS)
+    assert laws.collisions == laws.lethal == []
+    assert report["vehicles_routed"] == 24
+    assert report["captures"] > 0
+    assert min(messages.values()) > 0
+    plots = {plot for service in agents_of(simulation) for plot in service._right_of_way.core.holdings.plots}
+    assert plots <= {0, 1}  # 280 x 800 cells
 
 
 def test_agents_that_drove_alone_and_died_are_not_driven_into():

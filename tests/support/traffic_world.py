@@ -337,8 +337,11 @@ class TrafficWorld:
     def ask_known(self, source: Process, first: bool = False) -> None:
         """Ask everybody what they know of us, again and again as long as it is needed."""
 
+        own = source.disk.own
+        request = KnownRequest(agent=source.agent, disk=own.disk, plot_cells=self.plots.side)
+
         def answer(to: Process) -> None:
-            for action in to.ask_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
+            for action in to.ask_known(request):
                 if isinstance(action, Known):
                     self.carry(to, source, lambda known=action: source.hear_known(known))
                 else:

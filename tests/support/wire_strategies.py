@@ -244,10 +244,12 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     ),
     Stored: st.builds(Stored, plot=plots, agent=ids, epoch=naturals, seq=naturals),
     Claim: st.builds(Claim, epoch=naturals),
-    KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
+    KnownRequest: st.builds(
+        KnownRequest, agent=ids, disk=naturals, layer=st.integers(0, 1), plot_cells=st.integers(256, 16_384)
+    ),
     Known: st.builds(
         Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3),
-        agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3),
+        agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3), plot_cells=st.integers(256, 16_384),
     ),
     RemoveVehicles: st.builds(RemoveVehicles, vehicles=st.lists(ids, max_size=3)),
     Removed: st.builds(
@@ -398,8 +400,8 @@ EXAMPLES: tuple[Message, ...] = (
     ),
     Stored(plot=0, agent="a2", epoch=3, seq=17),
     Claim(epoch=4),
-    KnownRequest(agent="a0", disk=77),
-    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3], agents=["a0", "a1"], lives=[1 << 32]),
+    KnownRequest(agent="a0", disk=77, layer=1, plot_cells=512),
+    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3], agents=["a0", "a1"], lives=[1 << 32], plot_cells=512),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(

@@ -12,6 +12,8 @@ import msgspec
 from msgspec.structs import replace
 
 from swarm.config.agents import agent_of
+from swarm.errors import StoreError
+from swarm.grid import REGION_CELLS
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host, first_of
@@ -27,12 +29,19 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     lives     the agent's lives that have run on it, the last ones
     noted     agent -> its file, the first that we were told of
     noted_by  the agents that have noted ours
+    plot_cells  side of the plots of which this file holds promises, if it holds any
     """
 
     disk: int
     lives: list[int] = []
     noted: dict[str, int] = {}
     noted_by: list[str] = []
+    plot_cells: int = REGION_CELLS
+
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing that was promised can be on the file."""
+        return not (self.lives or self.noted or self.noted_by)
 
 
 Action = MemberAction | Tell | OwnRecord | Known | AskKnown
@@ -50,6 +59,8 @@ class RightOfWay:
     holdings  which cells our vehicles hold: none before `begin`
     silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
               our vehicles hold and are granted does not depend on it
+
+    Raises StoreError if the file holds promises of plots of another size: the same cells would be granted twice.
     """
 
     def __init__(
@@ -64,6 +75,13 @@ class RightOfWay:
     ) -> None:
         self.agent = agent
         self.plots = plots
+        if own.is_new:
+            own = replace(own, plot_cells=plots.side)
+        elif own.plot_cells != plots.side:
+            raise StoreError(
+                f"agent {agent} has on file what it promised of plots of {own.plot_cells} cells, the scenario has "
+                f"{plots.side}: set map.plot_regions to {own.plot_cells // REGION_CELLS}, or begin another run"
+            )
         self.own = own
         self._is_guest = agent not in spawns
         self._host = Host(plots, agent, vehicles if self._is_guest else spawns[agent], place)
@@ -102,20 +120,19 @@ class RightOfWay:
         if request.agent == self.agent or self.silent or self._is_guest:
             return []
         if request.agent not in self._spawns or not request.disk:
-            life, plots = self._known(request.agent)
-            lives, agents = self._lives_of(request.agent), list(self.plots.agents)
-            return [Known(agent=self.agent, disk=request.disk, life=life, plots=plots, lives=lives, agents=agents)]
+            known = self._known_of(request.agent, request.disk)
+            return [replace(known, lives=self._lives_of(request.agent), agents=list(self.plots.agents))]
+        if request.plot_cells != self.plots.side:
+            return []  # what it grants is nothing that we may help to make usable
         actions: list[Action] = []
         if request.agent not in self.own.noted:
             self.own = replace(self.own, noted={**self.own.noted, request.agent: request.disk})
             actions.append(self.own)
-        life, plots = self._known(request.agent)
-        disk = self.own.noted[request.agent]
-        return [*actions, Known(agent=self.agent, disk=disk, life=life, plots=plots)]
+        return [*actions, self._known_of(request.agent, self.own.noted[request.agent])]
 
     def hear_known(self, known: Known) -> list[Action]:
         """An answer to our question."""
-        if known.agent not in self._spawns or known.agent == self.agent:
+        if known.agent not in self._spawns or known.agent == self.agent or known.plot_cells != self.plots.side:
             return []
         self._host.hear_known(known.agent, known.life, known.plots)
         if self.silent or self._is_guest or known.disk != self.own.disk or known.agent in self.own.noted_by:
@@ -138,6 +155,10 @@ class RightOfWay:
     def hear_token(self, peer: Peer, *, up: bool) -> None:
         """The liveliness token of another process has risen or fallen."""
         self._host.hear_token(peer, up=up)
+
+    def _known_of(self, agent: str, disk: int) -> Known:
+        life, plots = self._known(agent)
+        return Known(agent=self.agent, disk=disk, life=life, plots=plots, plot_cells=self.plots.side)
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
         """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles or keep

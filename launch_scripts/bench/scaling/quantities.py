@@ -45,9 +45,10 @@ class Quantities:
     cells         of the map
     side          cells a side of the map
     rate          ticks a second
-    plots         plots of right of way, one for each region; 0 of fewer than three agents, as their plots have
-                  one member, which tells nobody
+    plots         plots of right of way; 0 of fewer than three agents, as their plots have one member, which tells
+                  nobody
     shared        pairs of an agent and a region in which it has vehicles
+    shared_plots  the same of plots
     hearers       agents that hold the region of a vehicle, on average; they hear its marks
     listeners     agents that hear an agent's digest, on average: those that hold a region in which it has vehicles,
                   and all agents a part of the time
@@ -67,6 +68,7 @@ class Quantities:
     rate: float
     plots: float
     shared: float
+    shared_plots: float
     hearers: float
     listeners: float
     near: float
@@ -76,7 +78,8 @@ class Quantities:
 
 def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines: int = 1) -> Quantities:
     """The numbers of a swarm of one size, with so many standbys of each planner."""
-    shared, hearers, told, near = _spread(size.vehicles, size.agents, size.side)
+    plot_cells = size.plot_regions * REGION_CELLS
+    shared, shared_plots, hearers, told, near = _spread(size.vehicles, size.agents, size.side, plot_cells)
     per_agent = size.vehicles / size.agents
     return Quantities(
         vehicles=size.vehicles,
@@ -88,8 +91,9 @@ def quantities_of(size: Size, *, standbys: int = 0, monitors: int = 1, machines:
         cells=size.side**2,
         side=size.side,
         rate=size.tick_hz,
-        plots=math.ceil(size.side / REGION_CELLS) ** 2 if size.agents >= FEWEST_FOR_MAJORITY else 0,
+        plots=math.ceil(size.side / plot_cells) ** 2 if size.agents >= FEWEST_FOR_MAJORITY else 0,
         shared=shared,
+        shared_plots=shared_plots,
         hearers=hearers,
         listeners=told + LISTEN_TO_ALL * (size.agents - told),
         near=near,
@@ -118,32 +122,40 @@ def _asks_per_s(captures_per_s: float, targets: int) -> float:
 
 
 @functools.lru_cache(1024)
-def _spread(vehicles: int, agents: int, side: int) -> tuple[float, float, float, float]:
-    """`shared`, `hearers`, agents that hold a region of an agent's vehicles, and `near`, as in `Quantities`, of
-    vehicles anywhere on an empty square map."""
+def _spread(vehicles: int, agents: int, side: int, plot_cells: int) -> tuple[float, float, float, float, float]:
+    """`shared`, `shared_plots`, `hearers`, agents that hold a region of an agent's vehicles, and `near`, as in
+    `Quantities`, of vehicles anywhere on an empty square map."""
     rng = np.random.default_rng(_SEED)
     rows, cols = rng.integers(0, side, (2, vehicles))
     order = np.argsort(_morton(rows, cols), kind="stable")
     rows, cols = rows[order], cols[order]
     agent = np.arange(vehicles) * agents // vehicles
-    driven = _regions_within(_ROAM_CELLS, rows, cols, agent, side)
-    held = _regions_within(INTEREST_CELLS, rows, cols, agent, side)
+    driven = _squares_within(_ROAM_CELLS, rows, cols, agent, side)
+    plots = (
+        driven if plot_cells == REGION_CELLS else _squares_within(_ROAM_CELLS, rows, cols, agent, side, plot_cells)
+    )
+    held = _squares_within(INTEREST_CELLS, rows, cols, agent, side)
     hearers = held.sum(0)[rows // REGION_CELLS, cols // REGION_CELLS].mean()
     spoken_of, of_interest = (each.reshape(len(each), -1).astype(np.float32) for each in (driven, held))
     told = (spoken_of @ of_interest.T > 0).sum(1).mean()
-    return float(driven.sum()), float(hearers), float(told), float(held.mean())
+    return float(driven.sum()), float(plots.sum()), float(hearers), float(told), float(held.mean())
 
 
-def _regions_within(
-    reach: int, rows: NDArray[np.int64], cols: NDArray[np.int64], agent: NDArray[np.int64], side: int
+def _squares_within(
+    reach: int,
+    rows: NDArray[np.int64],
+    cols: NDArray[np.int64],
+    agent: NDArray[np.int64],
+    side: int,
+    square: int = REGION_CELLS,
 ) -> NDArray[np.bool_]:
-    """bool (agents, regions down, regions across), whether an agent has a vehicle so near to a region, or in it."""
-    across = -(-side // REGION_CELLS)
+    """bool (agents, squares down, squares across), whether an agent has a vehicle so near to one, or in it."""
+    across = -(-side // square)
     found = np.zeros((int(agent[-1]) + 1, across, across), np.bool_)
     for south in (-reach, 0, reach):
         for east in (-reach, 0, reach):
-            row = np.clip(rows + south, 0, side - 1) // REGION_CELLS
-            col = np.clip(cols + east, 0, side - 1) // REGION_CELLS
+            row = np.clip(rows + south, 0, side - 1) // square
+            col = np.clip(cols + east, 0, side - 1) // square
             found[agent, row, col] = True
     return found
 

@@ -10,6 +10,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.values import MOST_TARGETS
 from swarm.errors import ConfigError
+from swarm.right_of_way.plots import fitting_regions
 
 CELLS_PER_VEHICLE = 262.144
 """As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
@@ -66,6 +67,7 @@ cpu_budget = 0.05
 [map]
 interest = "near"
 interest_m = 1500
+plot_regions = {plot_regions}
 """
 _PLACES = """
 [network]
@@ -86,6 +88,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     side       cells a side of the square map
     tick_hz    of agents and planners
     time_scale seconds on the terrain per second
+    plot_regions  `map.plot_regions`
     """
 
     vehicles: int
@@ -96,6 +99,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     tick_hz: float
     seed: int
     time_scale: float = 2.0
+    plot_regions: int = 1
 
 
 def size_of(
@@ -138,15 +142,17 @@ def size_of(
         )
     if not 0.1 <= tick_hz <= 100:
         raise ConfigError(f"--tick-hz is {tick_hz:g}, expected 0.1 to 100")
+    hosts = -(-vehicles // per_agent)
     return Size(
         vehicles=vehicles,
         targets=targets,
-        agents=-(-vehicles // per_agent),
+        agents=hosts,
         per_agent=per_agent,
         side=side,
         tick_hz=tick_hz,
         time_scale=time_scale,
         seed=seed,
+        plot_regions=fitting_regions(side, side, hosts),
     )
 
 

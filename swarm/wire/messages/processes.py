@@ -7,6 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from swarm.grid import REGION_CELLS
 from swarm.wire.fields import (
     IDS,
     MOST_IDS,
@@ -41,6 +42,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     classes                     the classes of vehicles beside "ground", in the order of their numbers
     wire_version                of its build. This message is read by builds of all wire versions: it never steps to
                                 another version, so that each can say which the other speaks (decision 87)
+    plot_cells                  side of a plot of right of way: two layouts in one run would grant a cell twice
     """
 
     run_id: Word
@@ -62,6 +64,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     restarts: Count = 0
     classes: Annotated[list[Id], IDS] = []
     wire_version: Count = 8
+    plot_cells: Count = REGION_CELLS
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):

@@ -7,6 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS
 from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Part, Plot, VehicleId
 from swarm.wire.messages.base import Message, schema_of
 
@@ -15,6 +16,8 @@ Stamp = tuple[Natural, Natural]
 Held = Annotated[list[Cell], Meta(max_length=64)]
 """Cells of one vehicle in driving order."""
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
+PlotSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_PLOT_REGIONS * REGION_CELLS)]
+"""In cells."""
 
 
 class Stand(Part, frozen=True, array_like=True):
@@ -145,11 +148,13 @@ class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
     """A new life of an agent or a guest asks all agents what they know of it. `disk` names the file that it keeps;
-    a guest's is 0, and nobody notes it. Only agents of its layer answer: 0 is the ground, 1 the air."""
+    a guest's is 0, and nobody notes it. Only agents of its layer answer: 0 is the ground, 1 the air; an agent is
+    answered only by those whose plots are as large as its own."""
 
     agent: Id
     disk: Natural
     layer: Annotated[int, Meta(ge=0, le=1)] = 0
+    plot_cells: PlotSide = REGION_CELLS
 
 
 class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
@@ -161,6 +166,7 @@ class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     plots   those whose tables grant cells to its vehicles, or keep cells of an earlier life of it shut
     agents  for a guest, which may not know the scenario: the agents of which three are members of each plot
     lives   for a guest: all lives of it that tables name, so that an operator can say that they have ended
+    plot_cells  side of a plot
     """
 
     agent: Id
@@ -169,3 +175,4 @@ class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     plots: Annotated[list[Plot], LARGE]
     agents: Annotated[list[Id], IDS] = []
     lives: Annotated[list[Natural], Meta(max_length=32)] = []
+    plot_cells: PlotSide = REGION_CELLS

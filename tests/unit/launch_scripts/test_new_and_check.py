@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from launch_scripts import ports
 from launch_scripts.check import needs
-from launch_scripts.check.ground import places
+from launch_scripts.check.ground import places, plots
 from launch_scripts.cli import main
 from launch_scripts.commands.new import Choices, _asked
 from shared_map.class_grounds import class_grounds
@@ -29,6 +29,7 @@ from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.config.values import Preset, Walk
 from swarm.errors import ConfigError
+from swarm.grid import GridSpec
 from vehicle_agent.placement import spawn_cells
 
 ROOMY = needs.Machine(64, None, None)
@@ -215,6 +216,18 @@ def test_check_says_all_at_once_in_the_order_of_weight(
     told = json.loads(out)
     assert (code, told["ok"], len(told["findings"])) == (1, False, len(lines) - 1)
     assert told["findings"][0]["level"] == "failure"
+
+
+def test_more_plots_than_agents_have_use_for_are_a_warning_with_what_to_set() -> None:
+    grid = GridSpec(4096, 4096, 20.0)
+    text = "[terrain]\nsource = 'synthetic'\n[[targets]]\n[[groups]]\nvehicles = 100\n"
+    (found,) = plots(parse_scenario(text), grid)
+    assert found.sentence.startswith(
+        "map.plot_regions: 4 agents speak of 256 plots of right of way 10 times a second"
+    )
+    assert found.sentence.endswith("set it to 4, for larger ones")
+    assert list(plots(parse_scenario(f"{text}[map]\nplot_regions = 4\n"), grid)) == []
+    assert list(plots(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
 
 
 def test_all_keys_that_are_wrong_are_named_each_once() -> None:

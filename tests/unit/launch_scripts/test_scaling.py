@@ -148,7 +148,8 @@ sizes = st.builds(
 def test_agents_share_regions_and_hear_marks_within_bounds(size: Size) -> None:
     q = quantities_of(size)
     regions = math.ceil(size.side / REGION_CELLS) ** 2
-    assert q.plots == (regions if size.agents >= 3 else 0)
+    assert q.plots == (min(q.plots, regions, 8 * size.agents) if size.agents >= 3 else 0)
+    assert q.shared_plots == q.shared if q.plots == regions else q.agents <= q.shared_plots <= q.shared
     assert q.agents <= q.shared <= min(q.agents * regions, 9 * q.vehicles)
     assert 0 < q.near <= 1
     assert 1 <= q.hearers <= q.agents
@@ -158,6 +159,12 @@ def test_agents_share_regions_and_hear_marks_within_bounds(size: Size) -> None:
 def test_on_one_region_every_agent_hears_every_mark() -> None:
     q = quantities_of(size_of(100, 10, per_agent=10, side=200))
     assert (q.plots, q.shared, q.hearers) == (1, 10, 10)
+
+
+def test_few_agents_on_a_large_map_have_few_plots() -> None:
+    q = quantities_of(size_of(1000, 10, agents=5, side=4096))
+    assert q.plots == 36  # and not 256
+    assert q.shared_plots < q.shared / 3
 
 
 @pytest.mark.parametrize(

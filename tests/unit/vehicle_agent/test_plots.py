@@ -1,0 +1,73 @@
+"""Plots of any size: as many as agents have use for, and one size in one run."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from swarm.errors import StoreError
+from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS, GridSpec
+from swarm.right_of_way.plots import MOST_PLOTS_AN_AGENT, Plots, fitting_regions
+from swarm.wire.messages.traffic import Known, KnownRequest
+from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
+
+GRID = GridSpec(1100, 1100, 1.0)
+AGENTS = ["a0", "a1", "a2"]
+SPAWNS = {agent: {f"{agent}-00": 9 * n} for n, agent in enumerate(AGENTS)}
+WIDE = 2 * REGION_CELLS
+
+
+def rights(own: OwnRecord, side: int = WIDE) -> RightOfWay:
+    return RightOfWay("a0", Plots(GRID, AGENTS, side), SPAWNS, own, {})
+
+
+@given(st.integers(1, 20_000), st.integers(1, 20_000), st.integers(1, 500))
+def test_plots_are_the_least_of_which_there_are_not_too_many(rows: int, cols: int, agents: int) -> None:
+    def count(regions: int) -> int:
+        return Plots(GridSpec(rows, cols, 1.0), (), regions * REGION_CELLS).count
+
+    regions = fitting_regions(rows, cols, agents)
+    assert count(regions) <= MOST_PLOTS_AN_AGENT * agents or regions == MOST_PLOT_REGIONS
+    assert regions == 1 or count(regions - 1) > MOST_PLOTS_AN_AGENT * agents
+
+
+@given(st.integers(0, GRID.cells - 1), st.integers(1, 5))
+def test_a_large_plot_is_made_of_whole_regions(cell: int, regions: int) -> None:
+    small, large = Plots(GRID, AGENTS), Plots(GRID, AGENTS, regions * REGION_CELLS)
+    row, col = divmod(cell, GRID.cols)
+    corner = row // REGION_CELLS * REGION_CELLS * GRID.cols + col // REGION_CELLS * REGION_CELLS
+    assert small.of(cell) == small.of(corner)
+    assert large.of(cell) == large.of(corner)
+
+
+def test_an_agent_whose_plots_are_of_another_size_gets_no_seat_by_the_others_and_gives_them_none() -> None:
+    asked = KnownRequest(agent="a1", disk=7, plot_cells=REGION_CELLS)
+    core = rights(OwnRecord(disk=1))
+    assert core.answer_known(asked) == []
+    assert core.hear_known(Known(agent="a1", disk=1, life=0, plots=[], plot_cells=REGION_CELLS)) == []
+    noted, known = core.answer_known(replace(asked, plot_cells=WIDE))
+    assert isinstance(noted, OwnRecord)
+    assert isinstance(known, Known)
+    assert (noted.noted, known.plot_cells) == ({"a1": 7}, WIDE)
+    (told,) = core.hear_known(Known(agent="a1", disk=1, life=0, plots=[], plot_cells=WIDE))
+    assert isinstance(told, OwnRecord)
+    assert (told.noted_by, told.plot_cells) == (["a1"], WIDE)
+
+
+def test_a_guest_is_told_how_large_plots_are() -> None:
+    (known,) = rights(OwnRecord(disk=1)).answer_known(KnownRequest(agent="guest", disk=0))
+    assert isinstance(known, Known)
+    assert (known.agents, known.plot_cells) == (AGENTS, WIDE)
+
+
+@pytest.mark.parametrize("used", [{"lives": [5]}, {"noted": {"a1": 7}}, {"noted_by": ["a1"]}])
+def test_promises_of_plots_of_another_size_are_refused_with_what_to_do(used: dict[str, object]) -> None:
+    own = OwnRecord(disk=1, **used)  # type: ignore[arg-type]
+    assert rights(own, REGION_CELLS).own is own
+    with pytest.raises(
+        StoreError, match=r"plots of 256 cells, the scenario has 512: set map\.plot_regions to 1, or"
+    ):
+        rights(own)
+    assert rights(replace(own, plot_cells=WIDE)).own.plot_cells == WIDE
