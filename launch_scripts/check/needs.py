@@ -14,13 +14,15 @@ from swarm.config.agents import plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import Scenario
 
-# docs/scale-figures.md, live processes: a thousand vehicles on two cores at 5 Hz, by role. That vehicles and trees
-# cost in proportion to ticks and numbers is the thumb in the rule: up to there the powers found are below one.
-_AGENTS_CORES_AT_5_HZ = 0.709 / 1000
-_PLANNER_CORES = 0.350 / 10
-_OTHERS_CORES = 0.345
+# docs/scale-figures.md and docs/scaling.md: a thousand vehicles of five agents on two cores at 5 Hz, by role. That
+# agents, vehicles and trees cost in proportion to ticks and numbers is the thumb in the rule.
+_AGENT_CORES_AT_5_HZ = 0.012
+_VEHICLE_CORES_AT_5_HZ = 0.424 / 1000
+_PLANNER_CORES = 0.026
+_OTHERS_CORES = 0.31
 _BUSY_SHARE = 2 / 3
 """Beyond this share of the cores ticks are late: 2 % of them at 1.4 cores of 2."""
+_FEW_AGENTS = 5
 _PROCESS_BYTES = 31 << 20
 _VEHICLE_BYTES = 100 << 10
 _CELL_BYTES = 30
@@ -79,6 +81,7 @@ def available_bytes() -> int | None:
 def needs_of(scenario: Scenario, cells: int) -> Needs:
     """cells  of the terrain"""
     vehicles, ticks = scenario.vehicle_count, scenario.vehicles.tick_hz / 5
+    agents = len(plan_agents(scenario))
     trees = len(scenario.target_ids) * (1 + scenario.standbys.planner)
     processes = len(processes_of(scenario))
     memory = (
@@ -87,8 +90,10 @@ def needs_of(scenario: Scenario, cells: int) -> Needs:
     recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
     return Needs(
         processes=processes,
-        agents=len(plan_agents(scenario)),
-        cores=vehicles * ticks * _AGENTS_CORES_AT_5_HZ + trees * _PLANNER_CORES + _OTHERS_CORES,
+        agents=agents,
+        cores=ticks * (agents * _AGENT_CORES_AT_5_HZ + vehicles * _VEHICLE_CORES_AT_5_HZ)
+        + trees * _PLANNER_CORES
+        + _OTHERS_CORES,
         memory_bytes=memory,
         disk_bytes=cells * _CELL_BYTES + recording,
         recording_bytes=recording,
@@ -99,11 +104,12 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
     """Where the machine has less than a run needs."""
     if needs.cores > _BUSY_SHARE * here.cores:
         hz = scenario.vehicles.tick_hz
+        fewer = " a larger vehicles.per_agent," if needs.agents > max(_FEW_AGENTS, 2 * here.cores) else ""
         yield warning(
             "vehicles",
-            f"{scenario.vehicle_count:,} vehicles and {len(scenario.target_ids):,} targets at {hz:g} Hz keep about"
-            f" {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be late; fewer of them, a lower"
-            " vehicles.tick_hz, or more machines (docs/scale-figures.md)",
+            f"{scenario.vehicle_count:,} vehicles of {needs.agents} agents and {len(scenario.target_ids):,} targets"
+            f" at {hz:g} Hz keep about {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be late;"
+            f"{fewer} fewer of them, a lower vehicles.tick_hz, or more machines (docs/scale-figures.md)",
         )
     if here.free_bytes is not None and needs.memory_bytes > here.free_bytes:
         yield warning(

@@ -25,6 +25,7 @@ there is: docs/reference/scenario.md.
     swarm up {name}         run it; Ctrl-C ends it and leaves runs/LAST/
 """
 _NONE = ""
+_AGENTS, _LEAST_PER_AGENT, _MOST_PER_AGENT = 8, 25, 1000
 
 
 @dataclass(frozen=True)
@@ -160,8 +161,18 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
         "cost": cost if chosen.preset else {**cost, "max_slope_deg": 35.0},
         "targets": [{"name": "t", "count": chosen.targets, "walk": chosen.walk, "speed_m_per_s": 4.0}],
         "groups": [{"name": "all", "vehicles": chosen.vehicles, "start": "spread"}],
-        "vehicles": {"per_agent": 25, "tick_hz": 10.0, "sense_range_m": 300.0, "capture_range_m": 150.0},
+        "vehicles": {
+            "per_agent": _per_agent(chosen.vehicles or 0),
+            "tick_hz": 10.0,
+            "sense_range_m": 300.0,
+            "capture_range_m": 150.0,
+        },
     }
+
+
+def _per_agent(vehicles: int) -> int:
+    """An agent costs by itself, in every tick: few of many vehicles cost a machine less than many of few."""
+    return min(max(_LEAST_PER_AGENT, -(-vehicles // _AGENTS)), _MOST_PER_AGENT)
 
 
 def _from(path: Path, name: str | None) -> str:

@@ -27,7 +27,7 @@ def swarm(
     targets: Annotated[int, typer.Option(help="Targets, and as many planners.")] = 10,
     agents: Annotated[
         int | None,
-        typer.Option(help="Processes that host the vehicles.", show_default="one for 100 vehicles, 4 to 40"),
+        typer.Option(help="Processes that host the vehicles.", show_default="one for 500 vehicles, 5 to 40"),
     ] = None,
     per_agent: Annotated[int | None, typer.Option(help="Vehicles of an agent, instead of --agents.")] = None,
     size: Annotated[

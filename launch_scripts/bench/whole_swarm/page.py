@@ -18,7 +18,7 @@ _INTRO = f"""{_TITLE}
 Written by `swarm bench swarm ... --write docs/scale-figures.md`: each run replaces the section of its kind.
 
 The swarm is that of the built-in scenario `thousand`, with a map that grows with the vehicles, 262 cells a vehicle.
-Unless said otherwise it has an agent for each two hundred vehicles, at least 4 and at most 40. *Power* is the
+Unless said otherwise it has an agent for each five hundred vehicles, at least 5 and at most 40. *Power* is the
 exponent of the power of the number of vehicles that fits best. Trust ratios and CPU times more than times by the
 clock, which grow with other work on the machine.
 [Decision 36](decisions/0036-how-a-whole-swarm-is-measured.md) says how it is measured.

@@ -14,8 +14,8 @@ from swarm.right_of_way.plots import fitting_regions
 
 CELLS_PER_VEHICLE = 262.144
 """As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
-_VEHICLES_AN_AGENT = 200
-_FEWEST_AGENTS, _MOST_AGENTS = 4, 40
+_VEHICLES_AN_AGENT = 500
+_FEWEST_AGENTS, _MOST_AGENTS = 5, 40
 _MOST_PER_AGENT = 1000
 _MOST_VEHICLES = 100_000
 LEAST_SIDE, MOST_SIDE = 32, 16_384
@@ -115,8 +115,8 @@ def size_of(
 ) -> Size:
     """The size with everything that is not given. Raises ConfigError, which names the option.
 
-    agents, per_agent  at most one of them; by default an agent for each two hundred vehicles, 4 at least and 40 at
-                       most
+    agents, per_agent  at most one of them; by default an agent for each five hundred vehicles, 5 at least and 40
+                       at most, and a vehicle for each
     side               by default as many cells a vehicle as `thousand` has
     """
     _between("--vehicles", vehicles, 1, _MOST_VEHICLES)
@@ -126,7 +126,7 @@ def size_of(
     if agents is not None and not 1 <= agents <= vehicles:
         raise ConfigError(f"--agents is {agents}, expected 1 to {vehicles}: each of them hosts a vehicle at least")
     if per_agent is None:
-        usual = min(max(-(-vehicles // _VEHICLES_AN_AGENT), _FEWEST_AGENTS), _MOST_AGENTS)
+        usual = min(max(-(-vehicles // _VEHICLES_AN_AGENT), _FEWEST_AGENTS), _MOST_AGENTS, vehicles)
         many = agents or max(usual, -(-vehicles // _MOST_PER_AGENT))
         per_agent = -(-vehicles // many)
         if per_agent > _MOST_PER_AGENT:

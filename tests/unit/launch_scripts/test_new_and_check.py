@@ -22,6 +22,7 @@ from launch_scripts.cli import main
 from launch_scripts.commands.new import Choices, _asked
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.agents import plan_agents
 from swarm.config.commented import commented
 from swarm.config.describe import expected, meanings
 from swarm.config.ground import TerrainConfig
@@ -66,6 +67,15 @@ def test_what_new_writes_is_what_was_chosen_and_check_accepts_it(
     code, out, err = swarm("check my.toml", monkeypatch, capsys)
     assert (code, err) == (0, "")
     assert out.startswith("my.toml can run, no warnings: vehicles 7, targets 2, processes 7")
+
+
+def test_new_shares_many_vehicles_out_over_few_agents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for vehicles, agents in ((20, 1), (200, 8), (1000, 8), (10_000, 10)):
+        name = f"my{vehicles}.toml"
+        assert swarm(f"new {name} --vehicles {vehicles}", monkeypatch, capsys)[0] == 0
+        assert len(plan_agents(load_scenario(tmp_path / name))) == agents
 
 
 def test_every_key_that_new_writes_stands_below_its_meaning(
@@ -300,10 +310,10 @@ def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int]
 
 def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
     """docs/scale-figures.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
-    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.847, 589), (1000, 512, 1.403, 721)):
+    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.692, 715), (1000, 512, 1.200, 882)):
         scenario = parse_scenario(
             f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"
-            f"[vehicles]\ntick_hz = 5\nper_agent = {max(vehicles // 4, 200)}\n"
+            f"[vehicles]\ntick_hz = 5\nper_agent = {min(vehicles // 4, 200)}\n"
         )
         found = needs.needs_of(scenario, cells_a_side**2)
         assert found.cores == pytest.approx(cores, rel=0.15)
@@ -315,8 +325,8 @@ def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
     wanted = needs.needs_of(scenario, 512**2)
     (found,) = needs.against(scenario, wanted, needs.Machine(2, None, None), Path())
     assert found.level == "warning"
-    assert "1,000 vehicles and 10 targets at 5 Hz keep about 1.4 cores busy, and there are 2" in found.text
-    assert "ticks will be late" in found.text
+    assert "1,000 vehicles of 40 agents and 10 targets at 5 Hz keep about 1.5 cores busy, and there" in found.text
+    assert "there are 2: ticks will be late; a larger vehicles.per_agent, fewer of them, a lower" in found.text
     assert list(needs.against(scenario, wanted, needs.Machine(4, None, None), Path())) == []
 
 
