@@ -191,6 +191,37 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
     assert planner.counts["payloads_dropped"] == 4
 
 
+def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
+    planner, inbox, answers = world.bus("planner"), Inbox(), Box()
+    before = threading.enumerate()
+    planner.serve(COST, inbox.post, undecoded=True, target="t0")
+    assert threading.enumerate() == before
+    a, stranger = world.bus("a"), world.bus("stranger").session
+    world.settle()
+    a.ask(COST, CostRequest(cells=[3]), answers, tag="q", timeout_s=1.5, target="t0")
+    question = inbox.take(2.0)
+    assert isinstance(question, Asked)
+    assert (question.request, question.fields, question.timeout_s) == (
+        *(CostRequest(cells=[3]), {"target": "t0"}, 1.5),
+    )
+    question.refuse("not now")
+    question.end()
+    world.until(lambda: answers == [AskEnded("q", COST, 0, "not now")])
+    for selector, payload, complaint in (
+        ("swarm/target/t0/cost", b"garbage", b"cost: "),
+        ("swarm/target/t0/cost?timeout_s=never", encode(CostRequest(cells=[3])), b"not a positive number"),
+    ):
+        replies = stranger.get(selector, payload=payload, timeout=2.0)
+        assert inbox.take(1.0) is None
+        (reply,) = replies
+        assert complaint in reply.err.payload.to_bytes()
+    assert planner.counts["payloads_dropped"] == 2
+    planner.unserve(COST, target="t0")
+    world.settle()
+    assert list(stranger.get("swarm/target/t0/cost", timeout=1.0)) == []
+    assert inbox.take(0) is None
+
+
 def test_garbage_is_logged_once_per_key(world, caplog):
     a, b, box = world.bus("a"), world.bus("b"), Box()
     b.subscribe(POSE, box)
