@@ -222,6 +222,25 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
     assert inbox.take(0) is None
 
 
+def test_threads_that_post_replies_keep_what_python_knows_of_them(world):
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    world.settle()
+    own = threading.local()
+    calls: list[tuple[int, int]] = []
+
+    def post(event: object) -> None:
+        own.calls = getattr(own, "calls", 0) + 1
+        calls.append((threading.get_native_id(), own.calls))
+
+    for n in range(20):
+        a.ask(RUN, Nothing(), post, tag="q")
+        world.until(lambda n=n: len(calls) == 2 * n + 2)
+    for thread in {thread for thread, _ in calls}:
+        counted = [count for each, count in calls if each == thread]
+        assert counted == list(range(1, len(counted) + 1))
+
+
 def test_garbage_is_logged_once_per_key(world, caplog):
     a, b, box = world.bus("a"), world.bus("b"), Box()
     b.subscribe(POSE, box)
