@@ -1,6 +1,7 @@
 """The bus of real processes, on one Zenoh session.
 
-Each subscription and queryable has a thread that reads what comes in. Three choices rest on measurements:
+Each subscription and queryable has a thread that reads what comes in, but for a queryable whose questions an inbox
+decodes: those are posted on Zenoh's own thread (decision 99). Three other choices rest on measurements:
 subscriptions have channels that drop their oldest sample when full, because with a FIFO a stalled reader holds up
 queries on the same link; replies are posted on Zenoh's own thread, because a thread per query is ten times slower;
 questions, tokens and links come seldom and have no channel of Zenoh's, because a thread that waits on one wakes
@@ -13,7 +14,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -256,11 +256,14 @@ class ZenohBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
 
-        def decoded(query: zenoh.Query, answerer: ZenohAnswerer, parameters: dict[str, str]) -> Asked | None:
+        def decoded(
+            query: zenoh.Query, answerer: ZenohAnswerer, parameters: dict[str, str], fault: ProtocolError | None
+        ) -> Asked | None:
             key = str(query.key_expr)
             self._intake.received(answerer.asked)
             try:
-                timeout_of(parameters.pop(TIMEOUT_PARAMETER, ""))
+                if fault is not None:
+                    raise fault
                 self._intake.check(topic, key, query, answerer.asked)
                 request = self._intake.request(request_type, query, answerer.asked, parameters)
             except ProtocolError as error:
@@ -277,9 +280,12 @@ class ZenohBus:
             payload = b"" if query.payload is None else query.payload.to_bytes()
             as_json = says_json(query, payload) or parameters.get("format") == "json"
             answerer = ZenohAnswerer(query, payload, partial(self._reply, topic, concrete, as_json))
-            with suppress(ProtocolError):  # which `decoded` meets again
-                answerer.timeout_s = timeout_of(parameters.get(TIMEOUT_PARAMETER, ""))
-            return Undecoded(topic, answerer, partial(decoded, query, answerer, parameters))
+            fault = None
+            try:
+                answerer.timeout_s = timeout_of(parameters.pop(TIMEOUT_PARAMETER, ""))
+            except ProtocolError as error:
+                fault = error
+            return Undecoded(topic, answerer, partial(decoded, query, answerer, parameters, fault))
 
         def arrive(query: zenoh.Query) -> None:
             asked = undecoded_of(query).decoded()
