@@ -248,8 +248,6 @@ _Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf
 class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     """Many routes as columns, with the fields of `Route`. The numbers of those whose status is OK are finite.
 
-    Whoever makes them of routes knows that; whoever is told them checks it by `check_bounds`.
-
     statuses    uint8    RouteStatus, as its index
     starts      int64    cell, -2^31 ... 2^32 - 1
     steps       uint32   number of steps given
@@ -269,7 +267,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     legs: Legs = b""
 
     def __post_init__(self) -> None:
-        pass
+        """Whoever makes them of routes knows that they are right; whoever decodes them calls `check_bounds`."""
 
     def check_bounds(self) -> None:
         if not self._is_one_found:
