@@ -385,7 +385,7 @@ class PlannerService:
             planner.lead(leads)
         for topic in (ROUTE, COST):
             if leads:
-                self._bus.serve(topic, self._post, target=self._target)
+                self._bus.serve(topic, self._post, undecoded=True, target=self._target)
             else:
                 self._bus.unserve(topic, target=self._target)
         self._candidacy.tell(self._member, now_ns)

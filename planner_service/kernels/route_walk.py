@@ -1,20 +1,19 @@
 """Reading a tree: routes, their costs, and how far one really drives along the parents.
 
 Routes follow parents, without any search. Arrays, beside those of `layout`; n is the number of routes:
-    starts      int64    (n,)    padded cells that have a way
+    starts      int64    (n,)    padded cells
     directions  uint8    (sum of steps,)  direction codes 0..7, one route after the other
     ends        int64    (n,)    where each route stops in `directions`; -1 if it met a hole or a cycle, which is a
                                  bug
     driven      float64  (n,)    s; cost recomputed along the cells
-    diagonals   int64    (n,)    how many of its steps are diagonal
+    length      float64  (n,)    m
     last        int64    (n,)    last padded cell
     status      uint8    (n,)    OK, UNREACHABLE, OUTSIDE or LETHAL_START
-    prices      float64  (4, n)  cost_s, lower_bound_s, length_m and remaining_s; inf, 0, 0, 0 where there is no
-                                 route
     trails      uint8    (4, room)  directions of the routes that were walked in each lane, one after the other
     lanes       int64    (5, 4)     of each lane: its route, the first one that is not its own any more, where its
                                     route begins in the trail, how long the trail is, the padded cell it has come to
     sums        float64  (4,)       s; what each lane's route has cost so far
+    joined      uint8    (4 * room,)  the trails of all lanes, one after the other: `directions`, and room behind
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered, step_price
-from planner_service.kernels.compile import helper, kernel, step_kernel
+from planner_service.kernels.compile import helper, step_kernel
 from planner_service.kernels.layout import (
     GRID,
     INF,
@@ -40,14 +39,19 @@ OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
 """What became of a route that was asked for."""
 
 Moves = tuple[NDArray[np.uint64], NDArray[np.float64]]
-Lanes = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.uint8]]
-_WALKS = "Tuple((i8[::1], f8[::1], i8[::1], i8[::1]))"
-_WALK = "Tuple((i8[:, ::1], f8[::1], u1[:, ::1]))"
+Ways = tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float64], int, int]
+"""(parent, offsets, lengths, root, stride): the parents, what `moves_of` returns, the padded root."""
+Lanes = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.uint8], NDArray[np.uint8]]
+_WAYS = "Tuple((u1[::1], u8[::1], f8[::1], i8, i8))"
+_WALKS = "Tuple((u1[::1], i8[::1], f8[::1], f8[::1], i8[::1]))"
+_WALK = "Tuple((i8[:, ::1], f8[::1], u1[:, ::1], u1[::1]))"
 
 _LANES = 4
 """Routes that are walked side by side. A step waits for the one before it, but not for another route's."""
 _ROUTE, _UNTIL, _BEGUN, _FILL, _CELL = range(5)
 """Rows of `lanes`."""
+NO_ROOM, BROKEN = -1, -2
+"""What `walk_routes` returns instead of a number of steps."""
 _STRETCH = 32
 """Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
 
@@ -86,9 +90,9 @@ def _driven(cell_cost, climbs, lengths, before, cell, code):
 
 
 @helper
-def _walk_on(cell_cost, climbs, parent, moves, lanes, sums, trails, steps):
+def _walk_on(cell_cost, climbs, ways, lanes, sums, trails, steps):
     """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
-    offsets, lengths = moves
+    parent, offsets, lengths, _, _ = ways
     a, b, c, d = (
         np.uint64(lanes[_CELL, 0]),
         np.uint64(lanes[_CELL, 1]),
@@ -141,50 +145,114 @@ def moves_of(stride: int, rule: int) -> Moves:
 
 
 def make_lanes() -> Lanes:
-    """(lanes, sums, trails), for routes of usual length; `longer` for others."""
-    return np.empty((5, _LANES), np.int64), np.empty(_LANES, np.float64), np.empty((_LANES, 1024), np.uint8)
+    """(lanes, sums, trails, joined), for routes of usual length; `longer` for others."""
+    return np.empty((5, _LANES), np.int64), np.empty(_LANES, np.float64), *_trails(1024)
+
+
+def _trails(room: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    return np.empty((_LANES, room), np.uint8), np.empty(_LANES * room, np.uint8)
 
 
 def longer(walk: Lanes) -> Lanes:
     """The same lanes, their trails with twice the room."""
-    lanes, sums, trails = walk
+    lanes, sums, trails, _ = walk
     room = trails.shape[1]
-    twice = np.empty((_LANES, 2 * room), np.uint8)
+    twice, joined = _trails(2 * room)
     twice[:, :room] = trails
-    return lanes, sums, twice
+    return lanes, sums, twice, joined
 
 
-@step_kernel(
-    f"(f4[::1], CLIMBS, u1[::1], Tuple((u8[::1], f8[::1])), i8, i8[::1], UniTuple(i8, 2), {_WALKS}, {_WALK}, b1)",
-    CLIMBS,
-)
-def walk_routes(cell_cost, climbs, parent, moves, root, starts, most, walks, walk, anew):
-    """The routes from `starts` to a padded root. `join_routes` is to follow.
+@helper
+def _find_starts(cell_cost, ways, starts, status):
+    """Cells of the grid become padded ones: the root where there is no route, so that none is walked."""
+    parent, _, _, root, stride = ways
+    cols = stride - 2
+    cells = (cell_cost.size // stride - 2) * cols
+    for i in range(starts.size):
+        cell = starts[i]
+        starts[i] = root
+        if cell < 0 or cell >= cells:
+            status[i] = OUTSIDE
+            continue
+        v = (cell // cols + 1) * stride + cell % cols + 1
+        if not cell_cost[v] < INF:
+            status[i] = LETHAL_START
+        elif parent[v] == NONE and v != root:
+            status[i] = UNREACHABLE
+        else:
+            status[i] = OK
+            starts[i] = v
 
-    moves  as `moves_of` returns them
-    most   (steps of a route, 0 for all of it; no route can be longer than so many)
-    walks  (ends, driven, diagonals, last), written: all but `diagonals`, and `ends` in the lane's trail
-    walk   as `make_lanes` returns them
-    anew   begin with the first routes; if not, go on
-    Raises ValueError where a start is no padded cell. Returns how many steps all routes have; -1 if the trails have
-    no room for the next ones: call it again with longer ones to go on.
-    """
-    ends, driven, _, last = walks
-    lanes, sums, trails = walk
+
+@helper
+def _begin(lanes, sums, starts, root):
+    """Each lane has a share of the routes, and its trail holds them in order."""
     count = starts.size
+    for j in range(_LANES):
+        first = count * j // _LANES
+        lanes[_ROUTE, j] = first
+        lanes[_UNTIL, j] = count * (j + 1) // _LANES
+        lanes[_BEGUN, j] = 0
+        lanes[_FILL, j] = 0
+        lanes[_CELL, j] = starts[first] if first < lanes[_UNTIL, j] else root
+        sums[j] = 0.0
+
+
+@helper
+def _join(walks, walk, metres):
+    """Put the trails of all lanes into one row. Ends of routes in their lane's trail become their ends in that row;
+    lengths are written. Returns how many steps all have; BROKEN if a route that was looked for has no end."""
+    status, ends, driven, length, _ = walks
+    lanes, _, trails, joined = walk
+    resolution, diagonal = metres
+    count = ends.size
+    n = 0
+    for j in range(_LANES):
+        for i in range(lanes[_FILL, j]):
+            joined[n + i] = trails[j, i]
+        for r in range(count * j // _LANES, count * (j + 1) // _LANES):
+            ends[r] += n if ends[r] >= 0 else 0
+        n += lanes[_FILL, j]
+    begin = 0
+    for r in range(count):
+        odd = 0
+        for i in range(begin, ends[r]):
+            odd += joined[i] & 1
+        end = max(begin, ends[r])
+        length[r] = (np.float64(end - begin) + np.float64(odd) * (diagonal - 1.0)) * resolution
+        begin = end
+        if r < status.size and status[r] != OK:
+            driven[r] = np.inf
+        elif r < status.size and ends[r] < 0:
+            return np.int64(BROKEN)
+    return n
+
+
+@step_kernel(f"(f4[::1], CLIMBS, {_WAYS}, i8[::1], UniTuple(i8, 3), UniTuple(f8, 2), {_WALKS}, {_WALK})", CLIMBS)
+def walk_routes(cell_cost, climbs, ways, starts, most, metres, walks, walk):
+    """The routes from `starts` to the root.
+
+    starts  padded cells that have a way; or, if `status` is not empty, any numbers of cells of the grid. Then these
+            become padded cells, and `status` is written
+    most    (steps of a route, 0 for all of it; no route can be longer than so many; 1 to begin, 0 to go on)
+    metres  (resolution, m; length of a diagonal in straight steps)
+    walks   (status, ends, driven, length, last), written; inf, 0 m and the root where `status` says that there is
+            no route
+    walk    as `make_lanes` returns them; `joined` is written
+    Raises ValueError where a start is no padded cell. Returns how many steps all routes have; NO_ROOM if the trails
+    have none for the next ones: call it again with longer ones to go on; BROKEN if a route with a status has no
+    end.
+    """
+    parent, _, _, root, _ = ways
+    status, ends, driven, _, last = walks
+    lanes, sums, trails, _ = walk
     limit = most[1]
     longest = limit if most[0] <= 0 else min(limit, most[0])
-    if anew:
+    if most[2]:
+        if status.size:
+            _find_starts(cell_cost, ways, starts, status)
         check_cells(starts, parent.size)
-        # Each lane has a share of the routes, and its trail holds them in order.
-        for j in range(_LANES):
-            first = count * j // _LANES
-            lanes[_ROUTE, j] = first
-            lanes[_UNTIL, j] = count * (j + 1) // _LANES
-            lanes[_BEGUN, j] = 0
-            lanes[_FILL, j] = 0
-            lanes[_CELL, j] = starts[first] if first < lanes[_UNTIL, j] else root
-            sums[j] = 0.0
+        _begin(lanes, sums, starts, root)
     while True:
         steps = np.int64(0)  # a literal would have `_walk_on` compiled twice
         room = trails.shape[1]
@@ -196,8 +264,8 @@ def walk_routes(cell_cost, climbs, parent, moves, root, starts, most, walks, wal
         if steps == 0:
             break
         if steps > room:
-            return -1
-        _walk_on(cell_cost, climbs, parent, moves, lanes, sums, trails, steps)
+            return np.int64(NO_ROOM)
+        _walk_on(cell_cost, climbs, ways, lanes, sums, trails, steps)
         for j in range(_LANES):
             r = lanes[_ROUTE, j]
             if r == lanes[_UNTIL, j]:
@@ -219,30 +287,7 @@ def walk_routes(cell_cost, climbs, parent, moves, root, starts, most, walks, wal
             lanes[_BEGUN, j] = end
             lanes[_CELL, j] = starts[r] if r < lanes[_UNTIL, j] else root
             sums[j] = 0.0
-    return lanes[_FILL, 0] + lanes[_FILL, 1] + lanes[_FILL, 2] + lanes[_FILL, 3]
-
-
-@kernel(f"({_WALKS}, {_WALK}, u1[::1])")
-def join_routes(walks, walk, directions):
-    """Put the trails of all lanes into one row, `directions`. Ends of routes in their lane's trail become their
-    ends in that row; `diagonals` is written."""
-    ends, _, diagonals, _ = walks
-    lanes, _, trails = walk
-    count = ends.size
-    n = 0
-    for j in range(_LANES):
-        for i in range(lanes[_FILL, j]):
-            directions[n + i] = trails[j, i]
-        for r in range(count * j // _LANES, count * (j + 1) // _LANES):
-            ends[r] += n if ends[r] >= 0 else 0
-        n += lanes[_FILL, j]
-    n = 0
-    for r in range(count):
-        odd = 0
-        for i in range(n, ends[r]):
-            odd += directions[i] & 1
-        diagonals[r] = odd
-        n = max(n, ends[r])
+    return _join(walks, walk, metres)
 
 
 @helper
@@ -252,11 +297,9 @@ def _hash(cell):
 
 
 @step_kernel(
-    "(f4[::1], CLIMBS, u1[::1], Tuple((u8[::1], f8[::1])), i8, i8[::1],"
-    " Tuple((u4[::1], f8[::1])), Tuple((u4[::1], f8[::1])), f8[::1])",
-    CLIMBS,
+    f"(f4[::1], CLIMBS, {_WAYS}, i8[::1], Tuple((u4[::1], f8[::1])), Tuple((u4[::1], f8[::1])), f8[::1])", CLIMBS
 )
-def drive_rests(cell_cost, climbs, parent, moves, root, starts, known, trail, rests):
+def drive_rests(cell_cost, climbs, ways, starts, known, trail, rests):
     """What is driven from each start along the parents to the root, in float64; inf where there is no way.
 
     known  (cells, sums), the rests that are known already of a 16th of all cells, the milestones: their routes
@@ -266,7 +309,7 @@ def drive_rests(cell_cost, climbs, parent, moves, root, starts, known, trail, re
     A rest is the sum up to the first milestone plus the milestone's own, and so the same whoever else is asked for.
     Returns False if a route does not end.
     """
-    offsets, lengths = moves
+    parent, offsets, lengths, root, _ = ways
     known_cells, known_sums = known
     trail_cells, trail_sums = trail
     check_cells(starts, parent.size)
@@ -307,58 +350,4 @@ def drive_rests(cell_cost, climbs, parent, moves, root, starts, known, trail, re
             known_cells[slot] = trail_cells[j]
             known_sums[slot] = rest
         rests[i] = own + rest
-    return True
-
-
-@kernel("(f4[::1], u1[::1], i8, i8, i8[::1], i8[::1], u1[::1])")
-def find_starts(cell_cost, parent, stride, root, asked, starts, status):
-    """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
-
-    Written: starts (int64; the root where there is no route, so that none is walked), status (uint8).
-    """
-    cols = stride - 2
-    cells = (cell_cost.size // stride - 2) * cols
-    for i in range(asked.size):
-        cell = asked[i]
-        starts[i] = root
-        if cell < 0 or cell >= cells:
-            status[i] = OUTSIDE
-            continue
-        v = (cell // cols + 1) * stride + cell % cols + 1
-        if not cell_cost[v] < INF:
-            status[i] = LETHAL_START
-        elif parent[v] == NONE and v != root:
-            status[i] = UNREACHABLE
-        else:
-            status[i] = OK
-            starts[i] = v
-
-
-@kernel(f"(UniTuple(f8, 2), {_WALKS}, f8[::1], u1[::1], f8[:, ::1])")
-def price_routes(metres, walks, rests, status, prices):
-    """What walked routes cost and how long they are.
-
-    metres  (resolution, m; length of a diagonal in straight steps)
-    walks   (ends, driven, diagonals, last) as `walk_routes` and `join_routes` wrote them
-    rests   float64 (n,), s; what is driven from where each ends
-    prices  written, but for the bound of a route that there is
-    Returns False if a route does not end where it should.
-    """
-    resolution, diagonal = metres
-    ends, driven, diagonals, _ = walks
-    begin = 0
-    for i in range(status.size):
-        if status[i] != OK:
-            prices[0, i] = np.inf
-            prices[1, i] = 0.0
-            prices[2, i] = 0.0
-            prices[3, i] = 0.0
-            continue
-        if ends[i] < 0:
-            return False
-        length = (np.float64(ends[i] - begin) + np.float64(diagonals[i]) * (diagonal - 1.0)) * resolution
-        begin = ends[i]
-        prices[0, i] = driven[i] + rests[i]
-        prices[2, i] = length
-        prices[3, i] = rests[i]
     return True

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from planner_service.kernels.arrivals import arrivals
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import NONE, step_offsets
-from planner_service.kernels.route_walk import OK, price_routes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.padded_climbs import turned_round
 from shared_map.arrays import Floats
@@ -131,11 +130,11 @@ class Ways:
         root, starts = int(on_way[-1]), on_way[:1]
         walks = costs.walk(parent, root, starts, max_cells, costs.time_cost)
         rests = costs.rests(parent, root, walks.last, costs.time_cost)
-        statuses, prices = np.array([OK], np.uint8), np.zeros((4, 1))
-        if not price_routes((costs.grid.resolution_m, costs.diagonal), walks[1:], rests, statuses, prices):
+        if walks.ends[0] < 0:
             raise AssertionError("a way does not end at its goal")
-        if not np.isfinite(prices).all():
+        cost_s = walks.driven + rests
+        if not np.isfinite(cost_s).all():
             return RouteBatch.none(np.array(way.cells[at : at + 1], np.int64), SEARCHING)
-        statuses[0] = SEARCHING
-        begun = np.array(way.cells[at : at + 1], np.int64)
-        return RouteBatch(statuses, begun, walks.directions, walks.ends, *prices)
+        begun, statuses = np.array(way.cells[at : at + 1], np.int64), np.array([SEARCHING], np.uint8)
+        unproven = np.zeros(1)
+        return RouteBatch(statuses, begun, walks.directions, walks.ends, cost_s, unproven, walks.length, rests)

@@ -11,7 +11,6 @@ from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.pieces import PieceTree
-from planner_service.tree.rounding import Rounding
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
@@ -27,8 +26,6 @@ class LowerBounds:
         """float32, padded, s: the exact cost of an earlier root, lowered where the map became cheaper. A consistent
         heuristic: no step costs less than it falls by. `take` sets it, `learn` lowers it, or drops it (None) where
         that would visit too many cells."""
-        self._rim: tuple[Rounding, NDArray[np.float64], float] | None = None
-        """Of which map and rim `_rounding_of_rim` was asked last, and what it said: each query asks again."""
 
     def take(self, exact_cost: Floats) -> None:
         """Go by this exact padded cost from now on; nobody may write to it any more."""
@@ -56,34 +53,22 @@ class LowerBounds:
     ) -> NDArray[np.float64]:
         """Proven lower bounds, s, on the time from padded cells to the target now.
 
-        cost  float64 (n,), what `tree.cost_at` says of these cells, where that is known
+        cost  float64 (n,), what `tree.cost_at` says of these cells, where that is known; of those with inf, nothing
+              is proven
         Raises ValueError where a start is no padded cell.
         """
         grid = self._grid
         cost = tree.cost_at(starts) if cost is None else cost
-        rounding = grid.rounding.at(cost)
-        if tree.exact:
-            bound = cost - tree.slack(cost, rounding)
-        else:
-            bound = np.zeros(starts.size)
-            part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
-            heuristic = _NONE if self._heuristic is None else self._heuristic
-            root = grid.pad(tree.root)
-            most = self._rounding_of_rim(rim_cost)
-            kernels.bound_by_heuristic(
-                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, rounding, most, bound
-            )
-        # Of the optimum only the share that is travel time counts.
-        return bound * grid.time_share
-
-    def _rounding_of_rim(self, rim_cost: NDArray[np.float64]) -> float:
-        """How far float32 may put the window's own costs of its rim off, relatively."""
-        rounding = self._grid.rounding
-        if self._rim is None or self._rim[0] is not rounding or self._rim[1] is not rim_cost:
-            most = float(rounding.at(rim_cost.max(initial=0.0)))
-            self._rim = rounding, rim_cost, most
-        return self._rim[2]
+        heuristic = _NONE if self._heuristic is None else self._heuristic
+        bound = np.empty(starts.size)
+        kernels.bound_costs(
+            *(cost, starts, grid.rounding.cheapest, tree.slack if tree.exact else _NOT_EXACT),
+            *((heuristic, grid.pad(tree.root), grid.stride), tree.window_bound or NO_WINDOW),
+            *(grid.time_share, bound),  # of the optimum only the share that is travel time counts
+        )
+        return bound
 
 
+_NOT_EXACT = (-1.0, 0.0, 0.0)
 _NONE: Floats = np.empty(0, np.float32)
 _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)

@@ -37,6 +37,7 @@ from swarm.grid import GridSpec, Window
 log = logging.getLogger(__name__)
 
 _NONE: Floats = np.empty(0, np.float32)
+_NO_STATUSES: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
 def rule_of(config: PlannerConfig) -> int:
@@ -61,7 +62,7 @@ class Walks(NamedTuple):
     directions: NDArray[np.uint8]
     ends: Cells
     driven: NDArray[np.float64]
-    diagonals: Cells
+    length: NDArray[np.float64]
     last: Cells
 
 
@@ -122,6 +123,8 @@ class CostGrid:
         """What kernels write to: one thread's."""
         self._lanes = route_walk.make_lanes()
         """Scratch of `walk`, which makes it longer where routes are."""
+        self._trail: tuple[NDArray[np.uint32], NDArray[np.float64]] | None = None
+        """Scratch of `rests`, which makes it: room for all cells, of which only what routes need becomes memory."""
         self._repair_scratch: repair.Scratch | None = None
         """Made by the first repair of a small map."""
         if self.climbs is not None:
@@ -374,40 +377,53 @@ class CostGrid:
         bounds = self.lowest_cell_cost, self.highest_cell_cost, self.dearest_step
         return grow_tree(self.padded, self.climbs, bounds, root, cost, parent)
 
-    def walk(self, parent: NDArray[np.uint8], root: int, starts: Cells, most: int, cell_cost: Floats) -> Walks:
+    def walk(
+        self,
+        parent: NDArray[np.uint8],
+        root: int,
+        starts: Cells,
+        most: int,
+        cell_cost: Floats,
+        statuses: NDArray[np.uint8] = _NO_STATUSES,
+    ) -> Walks:
         """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
 
-        most  steps of a route; 0 for all of it
+        most      steps of a route; 0 for all of it
+        statuses  (n,), written: then `starts` are any numbers of cells of the grid, which become padded ones. Those
+                  without a route become the root, and what is driven from there is inf
         Raises ValueError where a start or the root is no padded cell.
         """
-        if not 0 <= root < self.size:
-            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
         count = starts.size
-        ends, driven = np.empty(count, np.int64), np.empty(count, np.float64)
-        walks = ends, driven, np.empty(count, np.int64), np.empty(count, np.int64)
-        longest = (most, self.grid.cells)
-        walk = route_walk.walk_routes
-        read = cell_cost, self.climbs, parent, self._moves, root, starts, longest, walks
-        steps = walk(*read, self._lanes, True)
-        while steps < 0:
+        ends, last = np.empty(count, np.int64), np.empty(count, np.int64)
+        driven, length = np.empty(count), np.empty(count)
+        walks = statuses, ends, driven, length, last
+        read = cell_cost, self.climbs, self._ways(parent, root), starts
+        longest, metres = self.grid.cells, (self.grid.resolution_m, self.diagonal)
+        steps = route_walk.walk_routes(*read, (most, longest, 1), metres, walks, self._lanes)
+        while steps == route_walk.NO_ROOM:
             self._lanes = route_walk.longer(self._lanes)
-            steps = walk(*read, self._lanes, False)
-        directions = np.empty(steps, np.uint8)
-        route_walk.join_routes(walks, self._lanes, directions)
-        return Walks(directions, *walks)
+            steps = route_walk.walk_routes(*read, (most, longest, 0), metres, walks, self._lanes)
+        if steps == route_walk.BROKEN:
+            raise AssertionError("a route does not end at the target: the tree is broken")
+        return Walks(self._lanes[-1][:steps].copy(), ends, driven, length, last)
 
     def rests(self, parent: NDArray[np.uint8], root: int, starts: Cells, cell_cost: Floats) -> NDArray[np.float64]:
         """float64, s: what is driven from padded cells along the parents to a padded root; inf where there is no
-        way. Raises ValueError where a start is no padded cell."""
+        way. Raises ValueError where a start or the root is no padded cell."""
         rests = np.empty(starts.size)
         many = min(1 << 16, 64 << starts.size.bit_length())
         known = np.zeros(many, np.uint32), np.empty(many)
-        trail = np.empty(self.grid.cells + 1, np.uint32), np.empty(self.grid.cells + 1)
-        if not route_walk.drive_rests(
-            cell_cost, self.climbs, parent, self._moves, root, starts, known, trail, rests
-        ):
+        if self._trail is None:
+            self._trail = np.empty(self.grid.cells + 1, np.uint32), np.empty(self.grid.cells + 1)
+        ways = self._ways(parent, root)
+        if not route_walk.drive_rests(cell_cost, self.climbs, ways, starts, known, self._trail, rests):
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
+
+    def _ways(self, parent: NDArray[np.uint8], root: int) -> route_walk.Ways:
+        if not 0 <= root < self.size:
+            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
+        return parent, *self._moves, root, self.stride
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

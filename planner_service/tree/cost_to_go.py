@@ -229,10 +229,11 @@ class CostToGoTree:
         _, parent, root = self._labels
         return self.cost_grid.rests(parent, root, cells, cell_cost)
 
-    def slack(self, cost: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
-        """float64, s: by how much what is driven in an exact tree may exceed the optimum, from cells that cost so
-        much; `rounding` is the cost grid's of these costs."""
-        return cost * np.minimum(2.0 * rounding, 1.0)
+    @property
+    def slack(self) -> tuple[float, float, float]:
+        """By how much what is driven in an exact tree may exceed the optimum, and never by more than all of it: a
+        share of it, a share for each unit of the cost grid's rounding of it, and s for each of its steps."""
+        return 0.0, 2.0, 0.0
 
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.

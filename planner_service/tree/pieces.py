@@ -173,14 +173,11 @@ class PieceTree:
             return self.cost_at(cells)
         return grid.rests(self.parent, grid.pad(self.root), cells, grid.time_cost)
 
-    def slack(self, cost: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
-        """float64, s: by how much what is driven in an exact tree may exceed the optimum, from cells that cost so
-        much; `rounding` is the cost grid's of these costs. Cell costs are float32, by a few roundings; all else is
-        left over step by step."""
+    @property
+    def slack(self) -> tuple[float, float, float]:
+        """As of a `CostToGoTree`. Cell costs are float32, a few roundings; the rest is left over step by step."""
         farthest = self._ends[1].max() + self._tiles[2].max()
-        steps = rounding * 2.0**24
-        slack: NDArray[np.float64] = np.minimum(cost * 2.0**-21 + steps * (MOST_SLACK * farthest), cost)
-        return slack
+        return 2.0**-21, 0.0, float(MOST_SLACK * farthest)
 
     def tighten(self, cells: Cells) -> None:
         """Costs are what is driven at all times."""

@@ -46,11 +46,11 @@ class Rounding:
         than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
         that, where the lowest cell cost alone would say a step for each of it.
         """
-        return np.minimum((np.interp(cost, *self._cheapest) + 8.0) * 2.0**-24, 1.0)
+        return np.minimum((np.interp(cost, *self.cheapest) + 8.0) * 2.0**-24, 1.0)
 
     @cached_property
-    def _cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What the cheapest cells cost together at least, s, and how many they are."""
+    def cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What the cheapest cells cost together at least, s, and how many they are; both begin with 0."""
         classes = np.flatnonzero(self.classes[:_LETHAL])
         counts = self.classes[classes]
         least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)

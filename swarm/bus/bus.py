@@ -58,16 +58,11 @@ class HeardMany:
     samples: Sequence[tuple[str, Message]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Asked:
-    """A query on a topic that we serve. Send any number of answers, or refuse; then call `end`, at any later time.
+class Question:
+    """A query on a topic that we serve, decoded or not. It waits until `end` is called."""
 
-    fields  the chunks of the key that was asked, `*` where any will do
-    """
-
+    __slots__ = ()
     topic: Topic
-    fields: Mapping[str, str]
-    request: Message
     answerer: Answerer
 
     @property
@@ -85,11 +80,6 @@ class Asked:
         """Whether the asker has left: it began to wait before the query arrived."""
         return self.waited_s >= self.timeout_s
 
-    def answer(self, message: Message, **fields: str | int) -> None:
-        """Send one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
-        among those asked for is not sent. Raises RuntimeError after `end`."""
-        self.answerer.answer(message, fields)
-
     def refuse(self, reason: str) -> None:
         """Say in a sentence why there is no answer. It becomes `AskEnded.failure`."""
         self.answerer.refuse(reason)
@@ -97,6 +87,36 @@ class Asked:
     def end(self) -> None:
         """There are no more answers. A query that is never ended ends by the timeout of `ask`."""
         self.answerer.end()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked(Question):
+    """A decoded query. Send any number of answers, or refuse; then call `end`, at any later time.
+
+    fields  the chunks of the key that was asked, `*` where any will do
+    """
+
+    topic: Topic
+    fields: Mapping[str, str]
+    request: Message
+    answerer: Answerer
+
+    def answer(self, message: Message, **fields: str | int) -> None:
+        """Send one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
+        among those asked for is not sent. Raises RuntimeError after `end`."""
+        self.answerer.answer(message, fields)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Undecoded(Question):
+    """A query as it came. An `Inbox` decodes it when its turn comes, so that services get `Asked`.
+
+    decoded  what it asks; None if it is rejected, which ends it
+    """
+
+    topic: Topic
+    answerer: Answerer
+    decoded: Callable[[], Asked | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +181,7 @@ class WorkDone:
     took_ns: int
 
 
-Event = Heard | HeardMany | Asked | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
+Event = Heard | HeardMany | Asked | Undecoded | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
 Post = Callable[[Event], None]
 
 
@@ -256,8 +276,11 @@ class Bus(Protocol):
         under way may be posted after it."""
         ...
 
-    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        """Post `Asked` for every query on the key. Raises TypeError on a topic without requests."""
+    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+        """Post `Asked` for every query on the key. Raises TypeError on a topic without requests.
+
+        undecoded  `post` is an inbox's, and may be given `Undecoded`: no thread has to wake up only to decode it
+        """
         ...
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:

@@ -212,7 +212,7 @@ class MemoryBus:
         if subscriptions is not None:
             subscriptions.remove(self, narrow)
 
-    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         self.queryables.setdefault(topic.name, []).append(declare(self, topic, fields, post))

@@ -21,12 +21,15 @@ class Reply(Protocol):
 
 
 class ZenohAnswerer:
-    """The `Answerer` of one query, which arrives when this is made. `_query` is None after the end."""
+    """The `Answerer` of one query, which arrives when this is made. `_query` is None after the end.
 
-    def __init__(self, query: zenoh.Query, reply: Reply) -> None:
+    asked  its payload
+    """
+
+    def __init__(self, query: zenoh.Query, asked: bytes, reply: Reply) -> None:
         self._query: zenoh.Query | None = query
         self._reply = reply
-        self.asked = b"" if query.payload is None else query.payload.to_bytes()
+        self.asked = asked
         self._arrived_s = time.monotonic()
         self.timeout_s = USUAL_TIMEOUT_S
 

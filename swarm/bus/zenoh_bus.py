@@ -1,6 +1,7 @@
 """The bus of real processes, on one Zenoh session.
 
-Each subscription and queryable has a thread that reads what comes in. Three choices rest on measurements:
+Each subscription and queryable has a thread that reads what comes in, but for a queryable whose questions an inbox
+decodes: those are posted on Zenoh's own thread (decision 99). Three other choices rest on measurements:
 subscriptions have channels that drop their oldest sample when full, because with a FIFO a stalled reader holds up
 queries on the same link; replies are posted on Zenoh's own thread, because a thread per query is ten times slower;
 questions, tokens and links come seldom and have no channel of Zenoh's, because a thread that waits on one wakes
@@ -29,6 +30,7 @@ from swarm.bus.bus import (
     LinkChanged,
     Post,
     Replied,
+    Undecoded,
     check_subscription,
 )
 from swarm.bus.endpoints import listening, wait_for_router
@@ -233,7 +235,7 @@ class ZenohBus:
             query.reply_err(message.encode())
             return
         key = topic.keyed(self._namespace, **{**concrete, **fields})
-        if not query.key_expr.intersects(zenoh.KeyExpr(key)):
+        if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
         payload = encode_readable(message) if as_json else encode(message)
         self._intake.sent(payload)
@@ -248,38 +250,60 @@ class ZenohBus:
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
 
-    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
         request_type = topic.request
         if request_type is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
 
-        def arrive(query: zenoh.Query) -> None:
+        def decoded(
+            query: zenoh.Query, answerer: ZenohAnswerer, parameters: dict[str, str], fault: ProtocolError | None
+        ) -> Asked | None:
             key = str(query.key_expr)
-            parameters = dict(list(query.parameters))  # type: ignore[call-overload]
-            timeout = parameters.pop(TIMEOUT_PARAMETER, "")
-            in_json = query.payload is not None and says_json(query, query.payload.to_bytes())
-            as_json = in_json or parameters.get("format") == "json"
-            answerer = ZenohAnswerer(query, partial(self._reply, topic, concrete, as_json))
             self._intake.received(answerer.asked)
             try:
-                answerer.timeout_s = timeout_of(timeout)
+                if fault is not None:
+                    raise fault
                 self._intake.check(topic, key, query, answerer.asked)
                 request = self._intake.request(request_type, query, answerer.asked, parameters)
             except ProtocolError as error:
                 self._intake.drop(key, error)
                 answerer.refuse(f"{topic.name}: {error}")
                 answerer.end()
-                return
+                return None
             # A tool may ask with `**`, which no key template parses: all that we serve is meant.
             asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
-            post(Asked(topic, asked, request, answerer))
+            return Asked(topic, asked, request, answerer)
+
+        def undecoded_of(query: zenoh.Query) -> Undecoded:
+            parameters = dict(list(query.parameters))  # type: ignore[call-overload]
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            as_json = says_json(query, payload) or parameters.get("format") == "json"
+            answerer = ZenohAnswerer(query, payload, partial(self._reply, topic, concrete, as_json))
+            fault = None
+            try:
+                answerer.timeout_s = timeout_of(parameters.pop(TIMEOUT_PARAMETER, ""))
+            except ProtocolError as error:
+                fault = error
+            return Undecoded(topic, answerer, partial(decoded, query, answerer, parameters, fault))
+
+        def arrive(query: zenoh.Query) -> None:
+            asked = undecoded_of(query).decoded()
+            if asked is not None:
+                post(asked)
+
+        def leave(query: zenoh.Query) -> None:
+            post(undecoded_of(query))
 
         expression = topic.expression(self._namespace, **fields)
         arrivals = Arrivals(_QUERY_BUFFER)
-        queryable = self._session.declare_queryable(expression, _into(arrivals))
+        into = zenoh.handlers.Callback(guarded(leave), indirect=False) if undecoded else _into(arrivals)
+        queryable = self._session.declare_queryable(expression, into)
         self._queryables.setdefault(expression, []).append(queryable)
-        self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
+        if undecoded:
+            self._entities.append(queryable)
+        else:
+            self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -67,10 +68,27 @@ def taken_after(channel: Any, closing: threading.Event, wait_s: float) -> list[A
     return [] if closing.wait(wait_s) else [first, *taken_from(channel, MOST_TOGETHER)]
 
 
+_own = threading.local()
+"""`kept` is set where the state of a thread of Zenoh's is kept: in that state, so that it ends with it."""
+
+
+def _keep_state() -> None:
+    """Keep what the interpreter knows of this thread of Zenoh's until the interpreter ends.
+
+    Python makes a state when such a thread calls it and clears it away when the call is over, with the memory of
+    its frames, which takes longer than most calls (decision 99). A state counts who needs it, and this is one more.
+    Zenoh's threads are few and live as long as the process.
+    """
+    if not hasattr(_own, "kept"):
+        _own.kept = True
+        ctypes.pythonapi.PyGILState_Ensure()
+
+
 def guarded(callback: Callable[..., None]) -> Callable[..., None]:
     """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
 
     def guard(*arguments: Any) -> None:
+        _keep_state()
         try:
             callback(*arguments)
         except Exception as error:

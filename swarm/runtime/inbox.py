@@ -6,16 +6,16 @@ import threading
 from collections import OrderedDict
 from collections.abc import Hashable
 
-from swarm.bus.bus import Asked, Event, Heard, HeardMany
+from swarm.bus.bus import Event, Heard, HeardMany, Question, Undecoded
 
 CAPACITY = 4096
-"""Unread samples, or questions, per topic: more than a process gets in a second. Beyond it the oldest goes."""
+"""Undecoded samples, or questions, per topic: more than a process gets in a second. Beyond it the oldest goes."""
 LATE_S = 0.5
 """Once the oldest question of a topic has waited this long, or half of its asker's timeout, the newest is taken
 first: an answer to it still finds its asker."""
 
 _UNREAD_BATCHES = 2
-"""Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
+"""Undecoded batches beyond which `post` blocks: one to be read while the next is decoded."""
 _KEPT = ""
 """Name of the queue of what is never dropped."""
 
@@ -28,7 +28,8 @@ class Inbox:
 
     Samples    `CAPACITY` per topic, then the oldest goes. Of topics whose samples each carry the whole state of
                their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
-    Questions  `CAPACITY` per topic, then the oldest is refused. One whose asker has left is refused, too.
+    Questions  `CAPACITY` per topic, then the oldest is refused. One whose asker has left is refused, too. One that
+               is `Undecoded` is decoded in its turn.
     Batches    (`HeardMany`) are bounded by blocking their poster.
     The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
 
@@ -53,7 +54,7 @@ class Inbox:
         self._closed = False
         """Set by `close`, for good."""
         self._queues: OrderedDict[str, _Queue] = OrderedDict()
-        """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
+        """Undecoded events by kind and topic. The queue whose turn was longest ago comes first."""
         self._unread = 0
         """Events in all queues."""
         self._next = 0
@@ -73,9 +74,9 @@ class Inbox:
         if isinstance(event, Heard):
             newest = tuple(event.fields.values()) if event.topic.newest else None
             self._put(event, event.topic.name, newest)
-        elif isinstance(event, Asked):
+        elif isinstance(event, Question):
             dropped = self._put(event, f"? {event.topic.name}")
-            if isinstance(dropped, Asked):
+            if isinstance(dropped, Question):
                 _refuse(dropped, "too many questions wait")
         elif isinstance(event, HeardMany):
             with self._lock:
@@ -120,8 +121,8 @@ class Inbox:
         return dropped
 
     def take(self, timeout_s: float) -> Event | None:
-        """The next event; None if there is none within the timeout. Raises the error that `fail` was given, in its
-        turn. Called by the owner only."""
+        """The next event; None if there is none within the timeout, or if it is a question that is rejected. Raises
+        the error that `fail` was given, in its turn. Called by the owner only."""
         with self._lock:
             self._asleep = not self._unread and timeout_s > 0
             asleep = self._asleep
@@ -130,7 +131,7 @@ class Inbox:
                 if not self._asleep:  # a poster released the bell between the timeout and this line
                     self._bell.acquire()
                 self._asleep = False
-        expired: list[Asked] = []
+        expired: list[Question] = []
         with self._lock:
             event = self._pop(expired)
         for asked in expired:
@@ -141,9 +142,9 @@ class Inbox:
             self._batch_taken.set()
         if isinstance(event, BaseException):
             raise event
-        return event
+        return event.decoded() if isinstance(event, Undecoded) else event
 
-    def _pop(self, expired: list[Asked]) -> Event | BaseException | None:
+    def _pop(self, expired: list[Question]) -> Event | BaseException | None:
         """Remove the next event. Questions whose time is over are removed on the way, into `expired`."""
         while self._unread:
             name, newest_first = self._choose(expired)
@@ -151,12 +152,12 @@ class Inbox:
                 break
             _, (_, event) = self._queues[name].popitem(last=newest_first)
             self._unread -= 1
-            if not (isinstance(event, Asked) and event.expired):
+            if not (isinstance(event, Question) and event.expired):
                 return event
             self._expire(event, expired)  # newer than the oldest, but its asker had less time
         return None
 
-    def _choose(self, expired: list[Asked]) -> tuple[str | None, bool]:
+    def _choose(self, expired: list[Question]) -> tuple[str | None, bool]:
         """The queue whose turn it is, and whether its newest event is to be taken instead of its oldest."""
         oldest: str | None = None
         oldest_number = 0
@@ -164,7 +165,7 @@ class Inbox:
         for name, queue in self._queues.items():
             while queue:
                 number, event = next(iter(queue.values()))
-                if isinstance(event, Asked):
+                if isinstance(event, Question):
                     waited_s, timeout_s = event.waited_s, event.timeout_s
                     if waited_s >= timeout_s:
                         queue.popitem(last=False)
@@ -182,7 +183,7 @@ class Inbox:
         self._queues.move_to_end(turn)
         return turn, turn in late
 
-    def _expire(self, asked: Asked, expired: list[Asked]) -> None:
+    def _expire(self, asked: Question, expired: list[Question]) -> None:
         self.counts["asks_expired"] += 1
         expired.append(asked)
 
@@ -205,6 +206,6 @@ class Inbox:
         return self._unread
 
 
-def _refuse(asked: Asked, why: str) -> None:
+def _refuse(asked: Question, why: str) -> None:
     asked.refuse(f"{asked.topic.name}: {why}")
     asked.end()

@@ -51,9 +51,9 @@ class Obedience:
         self._ask_due_ns = 0
 
     def start(self, now_ns: int) -> None:
-        own = {"role": self._obeyed.role, "id": self._obeyed.id}
-        self._bus.serve(OBEYED, self._post, **own)
-        self._bus.serve(ORDERS, self._post, **own)
+        role, id = self._obeyed.role, self._obeyed.id
+        self._bus.serve(OBEYED, self._post, role=role, id=id)
+        self._bus.serve(ORDERS, self._post, role=role, id=id)
         self._bus.subscribe(ORDERS, self._post, role="keeper")
         self._ask(now_ns)
 

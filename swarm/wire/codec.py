@@ -82,9 +82,11 @@ def _read(payload: bytes, message_type: type[M]) -> M:
         decoder = _DECODERS.get(message_type) or _DECODERS.setdefault(
             message_type, msgspec.msgpack.Decoder(message_type)
         )
-        with contextlib.suppress(Exception):  # its own errors, those of our rules, RecursionError
+        try:  # `suppress` takes a fifth of the time of a short message
             message: M = decoder.decode(payload)
             return message
+        except Exception:  # its own errors, those of our rules, RecursionError
+            pass
     return _converted(_unpacked(payload), message_type)
 
 

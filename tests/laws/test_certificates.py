@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.effort import few
 from support.planner_strategies import random_pace
+from support.slow_twins import lower_bound
 
 from launch_scripts.bench.planning.certificate_checks import Findings, Life, run_checks
 from planner_service.kernels.layout import NONE
+from planner_service.kernels.pieces import MOST_SLACK
 from planner_service.target_tree import TargetTree
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.pieces import PieceTree
+from planner_service.tree.route_reading import read_routes
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, Window
+from swarm.grid import GridSpec, Window, walk
+from swarm.wire.routes import Route, RouteStatus
 
 GRID = GridSpec(40, 60, 2.0)
 
@@ -98,6 +105,78 @@ def test_costs_asked_of_a_tree_are_those_of_its_parents_and_to_the_bit_the_same_
     np.testing.assert_array_equal(together[::7], alone)
     assert np.isinf(together).any()
     assert tree.cost_at(np.array([tree.cost_grid.pad(tree.root)]))[0] == 0
+
+
+@pytest.mark.parametrize("length_weight", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(4))
+def test_bounds_are_what_their_slow_twin_proves(seed: int, length_weight: float) -> None:
+    tree, _ = a_tree(seed, length_weight)
+    cells = tree.cost_grid.pad_all(np.arange(GRID.cells))
+    known, bounds = tree.cost.copy(), LowerBounds(tree.cost_grid)
+
+    def holds(heuristic: NDArray[np.float32] | None) -> bool:
+        costs = tree.cost_at(cells)
+        proven = [lower_bound(tree, heuristic, *each) for each in zip(cells.tolist(), costs.tolist(), strict=True)]
+        assert np.isinf(costs).any()
+        np.testing.assert_array_equal(bounds.at(tree, cells), proven)
+        return bool(np.any(proven))
+
+    assert holds(None)
+    near = [GRID.cell(20 + south, 30 + east) for south, east in ((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1))]
+    root = next(at for at in near if known[tree.cost_grid.pad(at)] < np.inf)
+    assert tree.move(root, GRID.around(root, 6))
+    assert holds(None)
+    bounds.take(known)
+    assert holds(known)
+    tree.window_bound = None
+    assert holds(known)
+    bounds.forget()
+    assert not holds(None)
+
+
+def test_an_exact_tree_in_pieces_proves_all_but_what_its_pieces_may_lack() -> None:
+    tree, _ = a_tree(1)
+    costs = tree.cost_grid
+    pieces = PieceTree(costs)
+    pieces.grow(tree.root)
+    cells = costs.pad_all(np.arange(GRID.cells))
+    cells = cells[np.isfinite(pieces.cost_at(cells))]
+    cost = pieces.cost_at(cells)
+    own, by_rounding, by_step = pieces.slack
+    assert (own, by_rounding) == (2.0**-21, 0.0)
+    assert by_step >= MOST_SLACK * cost.max()
+    slack = np.minimum(cost * 2.0**-21 + costs.rounding.at(cost) * 2.0**24 * by_step, cost)
+    np.testing.assert_array_equal(LowerBounds(costs).at(pieces, cells), cost - slack)
+
+
+@pytest.mark.parametrize("most", [0, 1, 7])
+@pytest.mark.parametrize("seed", range(3))
+def test_of_any_cells_it_is_said_whether_there_is_a_route_and_each_is_read_as_alone(seed: int, most: int) -> None:
+    tree, pace = a_tree(seed)
+    bounds, cost = LowerBounds(tree.cost_grid), tree.inner(tree.cost).reshape(-1)
+    asked = np.random.default_rng(seed).integers(-9, GRID.cells + 9, 300)
+    asked[-1] = tree.root
+    batch = read_routes(tree, bounds, asked, most)
+    seen = set()
+    for cell, route in zip(asked.tolist(), batch, strict=True):
+        if not 0 <= cell < GRID.cells:
+            status = RouteStatus.OUTSIDE
+        elif not np.isfinite(pace.flat[cell]):
+            status = RouteStatus.LETHAL_START
+        else:
+            status = RouteStatus.OK if np.isfinite(cost[cell]) else RouteStatus.UNREACHABLE
+        seen.add(status)
+        assert route.status is status
+        assert route == read_routes(tree, bounds, np.array([cell]), most)[0]
+        if status is not RouteStatus.OK:
+            assert route == Route(status=status, start=cell)
+            continue
+        way = walk(GRID, cell, route.directions)
+        diagonal = sum(code % 2 for code in route.directions)
+        assert route.length_m == pytest.approx(2 * (len(way) - 1 + diagonal * (math.sqrt(2) - 1)), rel=1e-13)
+        assert route.remaining_s == tree.time_at(tree.cost_grid.pad_all(np.array(way[-1:])))[0]
+        assert way[-1] == tree.root or len(way) == most + 1
+    assert seen == {RouteStatus.OK, RouteStatus.UNREACHABLE, RouteStatus.LETHAL_START, RouteStatus.OUTSIDE}
 
 
 def test_a_tree_with_a_cycle_is_told_of_and_walked_no_further() -> None:

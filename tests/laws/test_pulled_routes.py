@@ -255,7 +255,9 @@ def test_legs_that_do_not_end_with_their_route_are_refused(legs: list[int]) -> N
     columns = routes.columns()
     assert [columns.batch.statuses[n] for n in (0, 1)] == [OK, NO_TARGET]
     with pytest.raises(ValueError, match="legs"):
-        Routes(**{name: getattr(columns, name) for name in Routes.__struct_fields__ if name != "legs"}, legs=bad)
+        Routes(
+            **{name: getattr(columns, name) for name in Routes.__struct_fields__ if name != "legs"}, legs=bad
+        ).check_bounds()
 
 
 def test_a_client_refuses_a_segment_that_ends_where_it_begins() -> None:

@@ -36,7 +36,7 @@ class Slow:
         self._bus, self._inbox = bus, inbox
 
     def start(self, now_ns: int) -> None:
-        self._bus.serve(COST, self._inbox.post, target="t0")
+        self._bus.serve(COST, self._inbox.post, undecoded=True, target="t0")
 
     def handle(self, event: Event, now_ns: int) -> None:
         assert isinstance(event, Asked)

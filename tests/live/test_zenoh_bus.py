@@ -191,6 +191,56 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
     assert planner.counts["payloads_dropped"] == 4
 
 
+def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
+    planner, inbox, answers = world.bus("planner"), Inbox(), Box()
+    before = threading.enumerate()
+    planner.serve(COST, inbox.post, undecoded=True, target="t0")
+    assert threading.enumerate() == before
+    a, stranger = world.bus("a"), world.bus("stranger").session
+    world.settle()
+    a.ask(COST, CostRequest(cells=[3]), answers, tag="q", timeout_s=1.5, target="t0")
+    question = inbox.take(2.0)
+    assert isinstance(question, Asked)
+    assert (question.request, question.fields, question.timeout_s) == (
+        *(CostRequest(cells=[3]), {"target": "t0"}, 1.5),
+    )
+    question.refuse("not now")
+    question.end()
+    world.until(lambda: answers == [AskEnded("q", COST, 0, "not now")])
+    for selector, payload, complaint in (
+        ("swarm/target/t0/cost", b"garbage", b"cost: "),
+        ("swarm/target/t0/cost?timeout_s=never", encode(CostRequest(cells=[3])), b"not a positive number"),
+    ):
+        replies = stranger.get(selector, payload=payload, timeout=2.0)
+        assert inbox.take(1.0) is None
+        (reply,) = replies
+        assert complaint in reply.err.payload.to_bytes()
+    assert planner.counts["payloads_dropped"] == 2
+    planner.unserve(COST, target="t0")
+    world.settle()
+    assert list(stranger.get("swarm/target/t0/cost", timeout=1.0)) == []
+    assert inbox.take(0) is None
+
+
+def test_threads_that_post_replies_keep_what_python_knows_of_them(world):
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    world.settle()
+    own = threading.local()
+    calls: list[tuple[int, int]] = []
+
+    def post(event: object) -> None:
+        own.calls = getattr(own, "calls", 0) + 1
+        calls.append((threading.get_native_id(), own.calls))
+
+    for n in range(20):
+        a.ask(RUN, Nothing(), post, tag="q")
+        world.until(lambda n=n: len(calls) == 2 * n + 2)
+    for thread in {thread for thread, _ in calls}:
+        counted = [count for each, count in calls if each == thread]
+        assert counted == list(range(1, len(counted) + 1))
+
+
 def test_garbage_is_logged_once_per_key(world, caplog):
     a, b, box = world.bus("a"), world.bus("b"), Box()
     b.subscribe(POSE, box)

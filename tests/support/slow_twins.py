@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from shared_map.terrain.step_climb import Climb
 from swarm.grid import STEP_COL, STEP_ROW
 
@@ -211,3 +212,31 @@ def follow(
         total += float(pace[r, c]) * step_length(direction, edge) * factor
         row, col = r, c
     return row * cols + col, total
+
+
+def lower_bound(tree: CostToGoTree, heuristic: NDArray[np.float32] | None, cell: int, cost: float) -> float:
+    """s, what is proven of a padded cell that costs so much, as docs/certificates.md has it."""
+    grid = tree.cost_grid
+
+    def rounding(cost: float) -> float:
+        return float(grid.rounding.at(np.array([cost]))[0])
+
+    if cost == math.inf:
+        return 0.0
+    own = rounding(cost)
+    if tree.exact:
+        return (cost - cost * min(2.0 * own, 1.0)) * grid.time_share
+    part, (row0, col0, row1, col1), rim, rim_cost = tree.window_bound or NO_WINDOW
+    inner = rim_cost * (1.0 - rounding(rim_cost.max(initial=0.0)))
+    way, shift = inner.min(initial=math.inf), -math.inf
+    if heuristic is not None:
+        falls = heuristic.astype(np.float64)
+        fall = falls[cell] * (1.0 - own) if falls[cell] < math.inf else 0.0
+        shift = fall - falls[grid.pad(tree.root)]
+        if rim.size:
+            way = max(way, fall - (falls[rim] - inner).max())
+    row, col = (at - 1 for at in divmod(cell, grid.stride))
+    if row0 <= row < row1 and col0 <= col < col1:
+        inside = float(part.reshape(row1 - row0 + 2, -1)[row - row0 + 1, col - col0 + 1])
+        way = min(way, inside * (1.0 - own) if inside < math.inf else math.inf)
+    return max(0.0, shift, way if way < math.inf else 0.0) * grid.time_share

@@ -128,9 +128,9 @@ class BoundaryBus:
         self._says("unsubscribe", topic, fields)
         self._bus.unsubscribe(topic, **fields)
 
-    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
         self._says("serve", topic, fields)
-        self._bus.serve(topic, post, **fields)
+        self._bus.serve(topic, post, undecoded=undecoded, **fields)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._says("unserve", topic, fields)

@@ -79,6 +79,9 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     tracker_lost: bool = False
     vehicle_class: Id = GROUND
 
+    def check(self) -> None:
+        self.routes.check_bounds()
+
 
 class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-route")):
     """A newer route for a vehicle that follows this target."""

@@ -6,7 +6,18 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Event, Heard, LinkChanged, Replied, WorkDone
+from swarm.bus.bus import (
+    Appeared,
+    Asked,
+    AskEnded,
+    Disappeared,
+    Event,
+    Heard,
+    LinkChanged,
+    Replied,
+    Undecoded,
+    WorkDone,
+)
 from swarm.liveness import Peer
 from swarm.runtime.inbox import CAPACITY, Inbox
 from swarm.wire.messages.base import Nothing
@@ -26,12 +37,19 @@ class Asker:
     time: Time
     timeout_s: float = 2.0
     topic: Topic = COST
+    rejected: bool = False
     refusals: list[str] = field(default_factory=list)
+    decoded: int = 0
     ended_s: float | None = None
 
     def __post_init__(self) -> None:
         self.asked_s = self.time.now_s
         self.question = Asked(self.topic, {}, Nothing(), self)
+        self.undecoded = Undecoded(self.topic, self, self.decode)
+
+    def decode(self) -> Asked | None:
+        self.decoded += 1
+        return None if self.rejected else self.question
 
     def waited_s(self) -> float:
         return self.time.now_s - self.asked_s
@@ -122,6 +140,36 @@ def test_a_question_whose_asker_has_left_is_refused_and_never_taken():
     assert short.refusals == ["cost: no answer within the 1 s of its asker: too many questions"]
     assert inbox.counts == {"events_dropped": 0, "asks_expired": 2}
     assert len(inbox) == 0
+
+
+def test_an_undecoded_question_is_decoded_once_when_its_turn_comes():
+    inbox, time = Inbox(), Time()
+    asker = Asker(time)
+    for event in (note(1), asker.undecoded, note(2)):
+        inbox.post(event)
+    assert inbox.take(0) == note(1)
+    assert asker.decoded == 0
+    assert inbox.take(0) is asker.question
+    assert asker.decoded == 1
+    assert drain(inbox) == [note(2)]
+
+
+def test_a_question_that_is_rejected_when_its_turn_comes_is_no_event():
+    inbox, time = Inbox(), Time()
+    inbox.post(Asker(time, rejected=True).undecoded)
+    inbox.post(note(1))
+    assert [inbox.take(0), inbox.take(0)] == [None, note(1)]
+
+
+def test_an_undecoded_question_that_nobody_answers_is_refused_and_never_decoded():
+    inbox, time = Inbox(), Time()
+    askers = [Asker(time, timeout_s=1.0) for _ in range(CAPACITY + 1)]
+    for asker in askers:
+        inbox.post(asker.undecoded)
+    time.now_s = 3.0
+    assert drain(inbox) == []
+    assert inbox.counts == {"events_dropped": 1, "asks_expired": CAPACITY}
+    assert all(len(asker.refusals) == 1 and asker.decoded == 0 for asker in askers)
 
 
 def test_without_overload_questions_and_samples_come_in_the_order_of_their_arrival():

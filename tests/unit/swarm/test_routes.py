@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import chain, combinations
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ from planner_service.kernels import route_walk
 from swarm.errors import ProtocolError
 from swarm.wire import routes as named
 from swarm.wire.codec import decode, encode
+from swarm.wire.fields import Bounded
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.routes import (
     OK,
@@ -23,6 +25,7 @@ from swarm.wire.routes import (
     UNREACHABLE,
     Route,
     RouteBatch,
+    Routes,
     RouteStatus,
     pack_directions,
     unpack_directions,
@@ -55,14 +58,21 @@ def test_routes_come_off_the_wire_as_they_were(some: list[Route]) -> None:
 
 @given(st.binary(max_size=100))
 def test_eight_directions_take_three_bytes(raw: bytes) -> None:
-    codes = np.frombuffer(raw, np.uint8) & 7
+    codes = bytes(each & 7 for each in raw)
     packed = pack_directions(codes)
     assert len(packed) == 3 * math.ceil(len(codes) / 8)
-    np.testing.assert_array_equal(unpack_directions(packed, len(codes)), codes)
+    assert unpack_directions(packed, len(codes)) == codes
+    bits = sum(code << 3 * n for n, code in enumerate(codes))
+    assert int.from_bytes(packed, "little") == bits
+
+
+def test_what_is_no_direction_is_not_packed() -> None:
+    with pytest.raises(ValueError, match="invalid literal"):
+        pack_directions(b"\1\10")
 
 
 def test_the_first_direction_is_in_the_lowest_bits() -> None:
-    assert pack_directions(np.array([1, 2, 3], np.uint8)) == bytes([1 | 2 << 3 | (3 << 6) % 256, 3 >> 2, 0])
+    assert pack_directions(bytes([1, 2, 3])) == bytes([1 | 2 << 3 | (3 << 6) % 256, 3 >> 2, 0])
 
 
 def test_a_thousand_routes_take_few_bytes() -> None:
@@ -113,6 +123,44 @@ def test_columns_that_do_not_fit_each_other_are_refused_in_words(change: dict, c
     reply["routes"] = msgspec.to_builtins(COLUMNS, builtin_types=(bytes,)) | change
     with pytest.raises(ProtocolError, match=complaint):
         decode(msgspec.msgpack.encode(reply), RouteReply)
+
+
+def packed(values: list[float], dtype: str) -> list[bytes]:
+    """A column of each of these, and such of a wrong length."""
+    return [np.array([value], dtype).tobytes() for value in values] + [b"", b"\0", bytes(16)]
+
+
+NUMBERS = ("cost_s", "lower_bound_s", "length_m", "remaining_s")
+NUMBER = packed([0.0, -0.0, 1e308, math.inf, -math.inf, math.nan, -5e-324], "<f8")
+CHANGES = dict.fromkeys(NUMBERS, NUMBER) | {
+    "statuses": [b"\1", b"\11", b"\0\0", b""],
+    "starts": packed([-(1 << 31), -(1 << 31) - 1, (1 << 32) - 1, 1 << 32], "<i8"),
+    "steps": packed([0, 8, 9, 17, 4 << 20, (4 << 20) + 1], "<u4"),
+    "directions": [b"", bytes(3), bytes(9), bytes(3 << 19), bytes((3 << 19) + 3)],
+    "legs": [np.array(legs, "<u4").tobytes() for legs in ([9], [4, 5], [8], [0, 9])],
+}
+
+
+def test_one_route_is_judged_at_a_glance_as_by_the_rules() -> None:
+    found = Route(status=RouteStatus.OK, start=5, cost_s=2.0, lower_bound_s=1.0, directions=bytes(9))
+    right = msgspec.structs.asdict(RouteBatch.of([found]).columns())
+
+    def fault(check: Callable[[Routes], None], columns: Routes) -> str | None:
+        try:
+            check(columns)
+        except ValueError as error:
+            return str(error)
+        return None
+
+    values = [(name, value) for name, each in CHANGES.items() for value in each]
+    faults = set()
+    for changes in chain(combinations(values, 1), combinations(values, 2)):
+        columns = Routes(**right | dict(changes))
+        by_rules = fault(Bounded.check_bounds, columns)
+        assert fault(Routes.check_bounds, columns) == by_rules, changes
+        faults.add(by_rules)
+    assert None in faults
+    assert len(faults) > 30
 
 
 FEW = np.array([0, 1, 2, 3, 5, 8])
