@@ -7,7 +7,7 @@ process waits for it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import rerun as rr
 
@@ -17,10 +17,11 @@ from launch_scripts.monitor.ground.ground_view import GroundView
 from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
-from launch_scripts.monitor.loading import FRAME_HZ
 from launch_scripts.monitor.movers.movers_view import MoversView
+from launch_scripts.monitor.serving.loopback_guard import Audience
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.report.paced_reading import PacedReading
 from launch_scripts.report.recorder import RECORDED, Recorder
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
@@ -43,15 +44,16 @@ log = logging.getLogger(__name__)
 
 _GONE = "gone"
 """Tag of the question what processes that are gone have counted."""
-_DRAWN: dict[Topic, float] = {
-    FLEET: 0.5 / FRAME_HZ,
-    POSE: 0.0,
-    FOLLOWED: 0.5,
-    SIGHTED: 0.0,
-    BODY: 0.0,
-    BELIEVED: 0.5,
+_DRAWN: dict[Topic, float] = {FLEET: 0.0, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0, BELIEVED: 0.5}
+"""What is drawn, and how often the newest of each key is taken; 0 for each frame."""
+_READ: dict[Topic, float] = {
+    topic: every_s for topic, every_s in {**RECORDED, **_DRAWN}.items() if topic is not MARKS
 }
-"""What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
+"""Marks come by way of the map's sync."""
+_UNSEEN = 2
+"""While nobody looks each frame but the second is left out: what is drawn is for the recording only."""
+_ANEW_NS = 10 * NS_PER_S
+"""For viewers that come, what is drawn on change only is drawn anew, but not more often than this."""
 _ENDED_KEPT = 4096
 _ANSWER_S = 5.0
 _LAST_WORD_NS = NS_PER_S // 2
@@ -67,6 +69,7 @@ class MonitorService:
     truth      the true ground, where this process knows it
     zones      of the scenario
     layers     tabs of the view; the photo if there are none
+    audience   who looks at the stream; somebody always does if this is not given
     member     one that has joined already; None: one that joins when the service starts
     """
 
@@ -84,6 +87,7 @@ class MonitorService:
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
         layers: Sequence[Layer] = (),
+        audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
         member: Member | None = None,
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
@@ -121,6 +125,13 @@ class MonitorService:
             legend,
             list(class_numbers(setup.scenario)),
         )
+        self._reading = PacedReading(bus, _READ)
+        self._audience = audience
+        self._drawn_for = 0
+        """So many viewers had ever come when all was drawn anew last."""
+        self._anew_due_ns = 0
+        self._turn = 0
+        """Ticks so far; `_frame` counts those in which something was drawn."""
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -139,9 +150,8 @@ class MonitorService:
         self._started_ns = now_ns
         if self._joins:
             self._member.join()
-        for topic, every_s in {**RECORDED, **_DRAWN}.items():
-            if topic is not MARKS:
-                self._bus.subscribe(topic, self._post, every_s=every_s)
+        for topic in _READ:
+            self._bus.collect(topic)
         self._bus.watch_alive(self._post)
         self._bus.ask(STATS, Nothing(), self._post, tag=_GONE)
         self.recorder.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
@@ -160,39 +170,25 @@ class MonitorService:
                 self.recorder.heard(stats, {}, now_ns)
             case Replied(message=CostReply() as costs):
                 self._ground.hear_costs(costs, now_ns)
-        if not isinstance(event, Heard):
-            return
-        self.recorder.heard(event.message, event.fields, now_ns)
-        self._movers.hear(event.message, now_ns)
-        match event.message:
-            case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
-                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
-            case PlannerStatus() as status:
-                self._ground.hear_status(status)
-            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
-                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
-            case Note() as note:
-                self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
+            case Heard():
+                self._hear(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Draws one frame."""
-        self._sync.tick(now_ns)
+        """Takes in what has come and draws one frame, if one is due."""
         self._member.tick(now_ns)
-        self._tell_gone(now_ns - _LAST_WORD_NS)
-        self._frame += 1
-        self._drawing.set_time(self._frame, self._seconds())
-        self._watch_recording(now_ns)
-        self._ground.tick(now_ns)
-        if (target := self._ground.samples.next_target(now_ns)) is not None:
-            request = self._ground.samples.request
-            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
-        self._movers.tick(now_ns)
-        self._draw_plots(now_ns)
+        self._turn += 1
+        audience = self._audience()
+        watched = audience.now > 0
+        if watched or self._turn % _UNSEEN == 0:
+            self._draw_frame(now_ns, watched, audience.ever)
 
     def stop(self, now_ns: int) -> None:
+        for heard in self._reading.take_all():
+            self._hear(heard, now_ns)
         self._tell_gone(now_ns)
         self.recorder.finish(now_ns)
         self._figures_due_ns = now_ns
+        self._ground.finish()
         self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
         self.over = True
         self._member.publish_stats(now_ns)
@@ -203,6 +199,19 @@ class MonitorService:
         return self._seconds()
 
     # --- in -----------------------------------------------------------------------------------------------------
+
+    def _hear(self, heard: Heard, now_ns: int) -> None:
+        self.recorder.heard(heard.message, heard.fields, now_ns)
+        self._movers.hear(heard.message, now_ns)
+        match heard.message:
+            case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
+                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
+            case PlannerStatus() as status:
+                self._ground.hear_status(status)
+            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
+                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
+            case Note() as note:
+                self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.recorder.alive(peer, up, now_ns)
@@ -243,6 +252,28 @@ class MonitorService:
         return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S
 
     # --- out ----------------------------------------------------------------------------------------------------
+
+    def _draw_frame(self, now_ns: int, watched: bool, viewers: int) -> None:
+        """viewers  how many have ever come"""
+        self._sync.tick(now_ns)
+        for heard in self._reading.take(now_ns):
+            self._hear(heard, now_ns)
+        self._tell_gone(now_ns - _LAST_WORD_NS)
+        self._frame += 1
+        self._drawing.set_time(self._frame, self._seconds())
+        self._watch_recording(now_ns)
+        if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
+            self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
+            self._ground.draw_anew()
+            self._movers.draw_anew()
+        self._ground.tick(now_ns, watched)
+        if (target := self._ground.next_target(now_ns, watched)) is not None:
+            request = self._ground.samples.request
+            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
+        self._movers.tick(now_ns)
+        self._draw_plots(now_ns)
+        if watched:
+            self._rec.flush(timeout_sec=0)  # else rerun packs what is logged within a second together
 
     def _draw_plots(self, now_ns: int) -> None:
         samples = self.recorder.samples.newest

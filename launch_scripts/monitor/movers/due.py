@@ -6,9 +6,6 @@ from collections.abc import Mapping
 
 from swarm.clock import NS_PER_S
 
-WHOLE_S = 10.0
-"""What is drawn on change only is drawn anew so often: a late viewer has only what its server still holds."""
-
 
 class Due:
     """When each of several things is done next.

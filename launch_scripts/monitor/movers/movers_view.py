@@ -73,12 +73,16 @@ class MoversView:
     def begin(self) -> None:
         """Logs styles; all else is drawn anew."""
         self._drawing.begin()
-        self._vehicles.draw_anew()
-        self._targets.draw_anew()
-        self._searches.draw_anew()
+        self.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             middle = self._mesh.width_m / 2, self._mesh.depth_m / 2
             self._drawing.followed(followed_point(self._mesh, middle))
+
+    def draw_anew(self) -> None:
+        """What is drawn on change only is drawn once more, when it is due."""
+        self._vehicles.draw_anew()
+        self._targets.draw_anew()
+        self._searches.draw_anew()
 
     def hear(self, message: Message, now_ns: int) -> None:
         match message:

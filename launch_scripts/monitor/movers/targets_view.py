@@ -8,7 +8,7 @@ import numpy as np
 
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.details import MOST_LABELS, body_details, target_labels
-from launch_scripts.monitor.movers.due import WHOLE_S, Due
+from launch_scripts.monitor.movers.due import Due
 from launch_scripts.monitor.movers.looks import Looks
 from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
 from launch_scripts.monitor.movers.points import (
@@ -39,7 +39,7 @@ class TargetsView:
         """Sightings as drawn last; as of `_pins` and `_bodies`, None if they are to be drawn anew."""
         self._pins: object = None
         self._bodies: Sequence[Body] | None = None
-        self._due = Due({"pins": 0.2, "details": 1.0, "trails": 0.5, "ages": 2.0, "bodies": 0.2, "whole": WHOLE_S})
+        self._due = Due({"pins": 0.2, "details": 1.0, "trails": 0.5, "ages": 2.0, "bodies": 0.2})
 
     def draw_anew(self) -> None:
         self._shown = self._pins = self._bodies = None
@@ -60,8 +60,6 @@ class TargetsView:
         """
         if not self._due.now("pins", now_ns):
             return
-        if self._due.now("whole", now_ns):
-            self.draw_anew()
         self._seen_ns = {
             id: self._seen_ns[id] if self._seen.get(id) == sighted else now_ns for id, sighted in seen.items()
         }

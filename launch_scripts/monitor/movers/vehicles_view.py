@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, TerrainMesh
 from launch_scripts.monitor.movers.details import vehicle_details
-from launch_scripts.monitor.movers.due import WHOLE_S, Due
+from launch_scripts.monitor.movers.due import Due
 from launch_scripts.monitor.movers.levels import Level
 from launch_scripts.monitor.movers.looks import Looks, dimmed
 from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
@@ -80,7 +80,6 @@ class VehiclesView:
                 "trails": level.trail_every_s,
                 "details": level.details_s,
                 "routes": level.routes_s / max(len(self._target_ids), 1),
-                "whole": WHOLE_S,
             }
         )
 
@@ -113,8 +112,6 @@ class VehiclesView:
         trails_due = self._due.now("trails", now_ns)
         if self._frame % self._level.frames and not trails_due:
             return
-        if self._due.now("whole", now_ns):
-            self.draw_anew()
         if vehicles.ids != self._roll.ids:
             self._colours, self._roll = None, self._enrolled(vehicles.ids, groups(), classes())
         points = vehicle_points(self._mesh, vehicles)
