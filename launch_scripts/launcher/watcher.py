@@ -121,7 +121,7 @@ class Watcher:
             return
         self.routes_served = True
         if not isinstance(self.known, OwnPart):
-            self._reading.slow_down(FOLLOWED, RECORDED[FOLLOWED], self._clock.now_ns())
+            self._reading.pace(FOLLOWED, RECORDED[FOLLOWED], self._clock.now_ns())
             return
         for topic in (FOLLOWED, STATUS):
             self._bus.unsubscribe(topic)

@@ -21,7 +21,7 @@ class PacedReading:
         self._every_ns = {topic.name: int(seconds * NS_PER_S) for topic, seconds in every_s.items()}
         self._due_ns = dict.fromkeys(self._topics, 0)
 
-    def slow_down(self, topic: Topic, every_s: float, now_ns: int) -> None:
+    def pace(self, topic: Topic, every_s: float, now_ns: int) -> None:
         """Take a topic so often from now on."""
         self._every_ns[topic.name] = int(every_s * NS_PER_S)
         self._due_ns[topic.name] = now_ns + self._every_ns[topic.name]

@@ -29,8 +29,8 @@ _MEMORY = "64MiB"
 """What the stream keeps for viewers that come later; the oldest goes first. The process grows by twice as much."""
 
 _PACK_S = 1.0
-"""Within this time rerun packs what is logged of an entity into one chunk, unless the service flushes it for those who
-watch. Ten chunks a second take its threads five times the CPU, and twice the space."""
+"""Within this time rerun packs what is logged of an entity into one chunk, unless the service flushes it for those
+who watch. Ten chunks a second take its threads five times the CPU, and twice the space."""
 
 T = TypeVar("T")
 
