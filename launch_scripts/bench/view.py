@@ -218,7 +218,7 @@ def _measured(scenario: Scenario, seconds: float, path: Path) -> dict[str, Any]:
     service = MonitorService(setup, terrain, network.bus("monitor"), lambda event: None, sinks.streams, mesh=mesh)
     service.start(0)
     for role, id in [("keeper", "k0"), ("targets", "0"), *(("planner", id) for id in scenario.target_ids)]:
-        service.recorder.alive(Peer(role, id, 1), True, 0)
+        service.figures.alive(Peer(role, id, 1), True, 0)
     took_ms, told_ms = np.zeros(frames), np.zeros(frames)
     first = int(_WARM_UP_S * FRAME_HZ)
     sinks.rec.flush(timeout_sec=10)

@@ -55,6 +55,8 @@ from swarm.runtime.role import RoleSetup
 log = logging.getLogger(__name__)
 
 _TURN_S = 0.05
+_CALM_TURN_S = 0.1
+"""Once all processes are up: each turn takes a third of a millisecond."""
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
 
@@ -273,7 +275,7 @@ class _Run:
             if self._take_over is not None:
                 self._take_over.look(time.monotonic())
             self._raise_refusals(self._swarm.poll())
-            watcher.listen(_TURN_S)
+            watcher.listen(_TURN_S if self._startup_s is None else _CALM_TURN_S)
             self._tell(watcher)
             now_s = time.monotonic()
             if watcher.routes_served and not self._routed:
@@ -373,6 +375,7 @@ class _Run:
         self._terminal.say(f"stopping{asked}")
         with self._terminal.busy(self._stopping):
             failures = self._swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
+            watcher.finish()
         if names := self._swarm.cut_short:
             self._terminal.say(f"killed, as asked: {', '.join(names)}", "yellow")
         return failures

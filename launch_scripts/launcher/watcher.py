@@ -7,6 +7,7 @@ from collections.abc import Collection
 
 from launch_scripts.launcher.own_part import OwnPart
 from launch_scripts.process_table import ProcessSpec
+from launch_scripts.report.paced_reading import PacedReading
 from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.report.run_state.model import HEARD
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
@@ -40,15 +41,17 @@ class Watcher:
         self.web_port = 0
         """Where the live view's page is; 0 until that is known."""
         self.routes_served = False
-        self._hears = _OF_PART if isinstance(known, OwnPart) else RECORDED
         self._bus = bus
         self._clock = clock
         self._inbox = Inbox()
+        # The first route tells that routes are served, sooner than any figures do.
+        hears = _OF_PART if isinstance(known, OwnPart) else {**RECORDED, FOLLOWED: 0.0}
+        self._everywhere = list(hears)
+        self._reading = PacedReading(bus, {STATS: 0.0, NOTE: 0.0, **hears})
 
     def begin(self) -> None:
-        for topic, every_s in self._hears.items():
-            # The first route tells that routes are served, sooner than any figures do.
-            self._bus.subscribe(topic, self._inbox.post, every_s=0.0 if topic is FOLLOWED else every_s)
+        for topic in self._everywhere:
+            self._bus.collect(topic)
         self._bus.watch_alive(self._inbox.post)
         if not isinstance(self.known, OwnPart):
             self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG)  # of a run that this is a part of
@@ -62,19 +65,26 @@ class Watcher:
             self._bus.unsubscribe(STATS, role=spec.role, id=spec.id)
             self._bus.unsubscribe(NOTE, role=spec.role, id=spec.id)
         for spec in own - self.known.own:
-            self._bus.subscribe(STATS, self._inbox.post, role=spec.role, id=spec.id)
-            self._bus.subscribe(NOTE, self._inbox.post, role=spec.role, id=spec.id)
+            self._bus.collect(STATS, role=spec.role, id=spec.id)
+            self._bus.collect(NOTE, role=spec.role, id=spec.id)
             self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG, role=spec.role, id=spec.id)
         self.known.own = own
 
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
         time.sleep(for_s)
+        for heard in self._reading.take(self._clock.now_ns()):
+            self._inbox.post(heard)
         until_s = time.monotonic() + _READ_S
         while (event := self._inbox.take(0.0)) is not None:
             self._take(event)
             if time.monotonic() >= until_s:
                 return
+
+    def finish(self) -> None:
+        """Takes in what has arrived and was not due yet: nobody speaks any more."""
+        for heard in self._reading.take_all():
+            self._take(heard)
 
     def now_ns(self) -> int:
         return self._clock.now_ns()
@@ -110,10 +120,11 @@ class Watcher:
         if self.routes_served:
             return
         self.routes_served = True
-        for topic in (FOLLOWED, STATUS) if isinstance(self.known, OwnPart) else (FOLLOWED,):
-            self._bus.unsubscribe(topic)
         if not isinstance(self.known, OwnPart):
-            self._bus.subscribe(FOLLOWED, self._inbox.post, every_s=RECORDED[FOLLOWED])
+            self._reading.pace(FOLLOWED, RECORDED[FOLLOWED], self._clock.now_ns())
+            return
+        for topic in (FOLLOWED, STATUS):
+            self._bus.unsubscribe(topic)
 
 
 def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:

@@ -17,7 +17,7 @@ from swarm.runtime.process import Service
 from swarm.runtime.stats import Counters
 
 FRAME_HZ = 10.0
-"""How often the view is drawn."""
+"""How often the view is drawn for those who look."""
 _TAG = "view"
 _Make = Callable[[Member], Service]
 

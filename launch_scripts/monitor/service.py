@@ -7,7 +7,7 @@ process waits for it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import rerun as rr
 
@@ -17,11 +17,14 @@ from launch_scripts.monitor.ground.ground_view import GroundView
 from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
-from launch_scripts.monitor.loading import FRAME_HZ
 from launch_scripts.monitor.movers.movers_view import MoversView
+from launch_scripts.monitor.serving.loopback_guard import Audience
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
-from launch_scripts.report.recorder import RECORDED, Recorder
+from launch_scripts.report.paced_reading import PacedReading
+from launch_scripts.report.recorder import ROUTES_S
+from launch_scripts.report.run_figures import RunFigures
+from launch_scripts.report.run_state.model import HEARD
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
@@ -37,21 +40,23 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
+from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, NOTE, SIGHTED, STATS, Topic
 
 log = logging.getLogger(__name__)
 
 _GONE = "gone"
 """Tag of the question what processes that are gone have counted."""
-_DRAWN: dict[Topic, float] = {
-    FLEET: 0.5 / FRAME_HZ,
-    POSE: 0.0,
-    FOLLOWED: 0.5,
-    SIGHTED: 0.0,
-    BODY: 0.0,
-    BELIEVED: 0.5,
-}
-"""What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
+_READ: dict[Topic, float] = {
+    **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, BODY: 0.0, BELIEVED: 0.5
+}  # fmt: skip
+"""What is shown, and how often the newest of each key is taken; 0 for each frame. Marks come by way of the map's
+sync."""
+_ROUTES_SEEN_S = 0.5
+"""For those who look routes are taken so often."""
+_UNSEEN = 2
+"""While nobody looks each frame but the second is left out: what is drawn is for the recording only."""
+_ANEW_NS = 10 * NS_PER_S
+"""For viewers that come, what is drawn on change only is drawn anew, but not more often than this."""
 _ENDED_KEPT = 4096
 _ANSWER_S = 5.0
 _LAST_WORD_NS = NS_PER_S // 2
@@ -67,6 +72,7 @@ class MonitorService:
     truth      the true ground, where this process knows it
     zones      of the scenario
     layers     tabs of the view; the photo if there are none
+    audience   who looks at the stream; somebody always does if this is not given
     member     one that has joined already; None: one that joins when the service starts
     """
 
@@ -84,9 +90,10 @@ class MonitorService:
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
         layers: Sequence[Layer] = (),
+        audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
         member: Member | None = None,
     ) -> None:
-        self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
+        self.figures = RunFigures(setup.scenario, terrain.grid, setup.started_ns)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
         self._setup = setup
@@ -105,7 +112,7 @@ class MonitorService:
         self._rec = rec
         self._recording = recording
         self._drawing = Drawing(rec, self._target_ids)
-        self._movers = MoversView(rec, self._mesh, setup.scenario, self.recorder, self.counters, replica.filter)
+        self._movers = MoversView(rec, self._mesh, setup.scenario, self.figures, self.counters, replica.filter)
         legend = self._movers.looks.legend()
         shown = layers or [PHOTO]
         self._ground = GroundView(
@@ -121,6 +128,14 @@ class MonitorService:
             legend,
             list(class_numbers(setup.scenario)),
         )
+        self._reading = PacedReading(bus, _READ)
+        self._audience = audience
+        self._watched = False
+        self._drawn_for = 0
+        """So many viewers had ever come when all was drawn anew last."""
+        self._anew_due_ns = 0
+        self._turn = 0
+        """Ticks so far; `_frame` counts those in which something was drawn."""
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -139,12 +154,11 @@ class MonitorService:
         self._started_ns = now_ns
         if self._joins:
             self._member.join()
-        for topic, every_s in {**RECORDED, **_DRAWN}.items():
-            if topic is not MARKS:
-                self._bus.subscribe(topic, self._post, every_s=every_s)
+        for topic in _READ:
+            self._bus.collect(topic)
         self._bus.watch_alive(self._post)
         self._bus.ask(STATS, Nothing(), self._post, tag=_GONE)
-        self.recorder.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
+        self.figures.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
         self._begin_drawing()
@@ -157,42 +171,30 @@ class MonitorService:
             return
         match event:
             case Replied(message=Stats() as stats):
-                self.recorder.heard(stats, {}, now_ns)
+                self.figures.heard(stats, {}, now_ns)
             case Replied(message=CostReply() as costs):
                 self._ground.hear_costs(costs, now_ns)
-        if not isinstance(event, Heard):
-            return
-        self.recorder.heard(event.message, event.fields, now_ns)
-        self._movers.hear(event.message, now_ns)
-        match event.message:
-            case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
-                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
-            case PlannerStatus() as status:
-                self._ground.hear_status(status)
-            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
-                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
-            case Note() as note:
-                self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
+            case Heard():
+                self._hear(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Draws one frame."""
-        self._sync.tick(now_ns)
+        """Takes in what has come and draws one frame, if one is due."""
         self._member.tick(now_ns)
-        self._tell_gone(now_ns - _LAST_WORD_NS)
-        self._frame += 1
-        self._drawing.set_time(self._frame, self._seconds())
-        self._watch_recording(now_ns)
-        self._ground.tick(now_ns)
-        if (target := self._ground.samples.next_target(now_ns)) is not None:
-            request = self._ground.samples.request
-            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
-        self._movers.tick(now_ns)
-        self._draw_plots(now_ns)
+        self._turn += 1
+        audience = self._audience()
+        if self._watched != (watched := audience.now > 0):
+            self._watched = watched
+            self._reading.pace(FOLLOWED, _ROUTES_SEEN_S if watched else ROUTES_S, now_ns)
+        if watched or self._turn % _UNSEEN == 0:
+            self._draw_frame(now_ns, audience.ever)
 
     def stop(self, now_ns: int) -> None:
+        for heard in self._reading.take_all():
+            self._hear(heard, now_ns)
         self._tell_gone(now_ns)
-        self.recorder.finish(now_ns)
+        self.figures.finish(now_ns)
         self._figures_due_ns = now_ns
+        self._ground.finish()
         self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
         self.over = True
         self._member.publish_stats(now_ns)
@@ -204,8 +206,21 @@ class MonitorService:
 
     # --- in -----------------------------------------------------------------------------------------------------
 
+    def _hear(self, heard: Heard, now_ns: int) -> None:
+        self.figures.heard(heard.message, heard.fields, now_ns)
+        self._movers.hear(heard.message, now_ns)
+        match heard.message:
+            case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
+                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
+            case PlannerStatus() as status:
+                self._ground.hear_status(status)
+            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
+                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
+            case Note() as note:
+                self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
+
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        self.recorder.alive(peer, up, now_ns)
+        self.figures.alive(peer, up, now_ns)
         if now_ns - self._started_ns <= 2 * NS_PER_S:  # those that were there before are not news
             return
         if up:
@@ -244,14 +259,36 @@ class MonitorService:
 
     # --- out ----------------------------------------------------------------------------------------------------
 
+    def _draw_frame(self, now_ns: int, viewers: int) -> None:
+        """viewers  how many have ever come"""
+        self._sync.tick(now_ns)
+        for heard in self._reading.take(now_ns):
+            self._hear(heard, now_ns)
+        self._tell_gone(now_ns - _LAST_WORD_NS)
+        self._frame += 1
+        self._drawing.set_time(self._frame, self._seconds())
+        self._watch_recording(now_ns)
+        if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
+            self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
+            self._ground.draw_anew()
+            self._movers.draw_anew()
+        self._ground.tick(now_ns, self._watched)
+        if (target := self._ground.next_target(now_ns, self._watched)) is not None:
+            request = self._ground.samples.request
+            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
+        self._movers.tick(now_ns, self._watched)
+        self._draw_plots(now_ns)
+        if self._watched:
+            self._rec.flush(timeout_sec=0)  # else rerun packs what is logged within a second together
+
     def _draw_plots(self, now_ns: int) -> None:
-        samples = self.recorder.samples.newest
+        samples = self.figures.samples.newest
         if samples and samples[-1].time_s != self._last_sample_s:
             self._last_sample_s = samples[-1].time_s
             self._drawing.plots(samples[-1], samples[-1].messages_per_s)
         if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
             return
         self._figures_due_ns = now_ns + NS_PER_S
-        summary = self.recorder.shown(now_ns)
+        summary = self.figures.shown(now_ns)
         self._movers.summarised(summary)
         self._drawing.summary(summary_markdown(self._setup, summary))

@@ -64,6 +64,7 @@ def load_view(
             truth=truth,
             zones=zones,
             layers=layers,
+            audience=sinks.audience,
             member=member,
         )
         give_back_memory()  # a hundred megabytes of a large map, of which its picture was made

@@ -1,4 +1,4 @@
-"""Records a run: takes messages, returns numbers. Launcher, monitor and simulation share it.
+"""Records a run: takes messages, returns numbers. Launcher and simulation share it.
 
 Pure: time is an argument, and the owner of a bus passes it what comes on `RECORDED`.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,11 @@ from launch_scripts.report.begun_routes import BegunRoutes
 from launch_scripts.report.latest_state import MarkedCells
 from launch_scripts.report.results.certified_gap import of_excess
 from launch_scripts.report.results.results import Driven, results
+from launch_scripts.report.run_figures import RunFigures
 from launch_scripts.report.run_state.facts import for_report
-from launch_scripts.report.run_state.model import HEARD, RunModel
-from launch_scripts.report.run_state.plan import plan_of
+from launch_scripts.report.run_state.model import HEARD
 from launch_scripts.report.run_state.state import RunState
-from launch_scripts.report.samples import Sample, Samples, at_once, buckets_of, certified_gaps, messages_per_s
+from launch_scripts.report.samples import Sample, at_once, certified_gaps, messages_per_s
 from launch_scripts.report.tracks import TrackKey, Tracks
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
@@ -46,9 +46,6 @@ RECORDED: dict[Topic, float] = {
 """What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
 
 _TRACK_NS = int(TRACK_S * NS_PER_S)
-_SAMPLE_NS = NS_PER_S
-_SHOWN_NS = 5 * NS_PER_S // 4
-"""So old may be what is shown: a sample is taken with the first message after its second."""
 _NOTES_KEPT = 1000
 _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
@@ -65,19 +62,15 @@ class Capture:
 _ON_THE_WAY = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
 
 
-class Recorder:
-    """Samples, tracks, captures and notes of a run, in memory which does not grow with the rate of messages."""
+class Recorder(RunFigures):
+    """Samples, tracks, routes, captures and notes of a run, in memory which does not grow with the rate of
+    messages."""
 
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
-        """started_ns  when the run began; None: with the first message"""
-        self.scenario = scenario
-        self.grid = grid
-        self.model = RunModel(plan_of(scenario, started_ns), grid)
-        self.observed, self.tracked, self.book = self.model.observed, self.model.tracked, self.model.book
+        super().__init__(scenario, grid, started_ns)
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
-        self.samples = Samples()
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Where and when targets were captured; how often, `Observed` counts."""
         self.routes = BegunRoutes()
@@ -89,9 +82,6 @@ class Recorder:
         self._track_ids: list[str] = []
         self._track_keys: list[TrackKey] = []
         """Of the vehicles heard of last."""
-        self._sample_due_ns: int | None = None
-        self._sampled: tuple[int, RunState] | None = None
-        """When the last sample was taken or shown, and of which state."""
         self._gap_max: float | None = None
 
     def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
@@ -111,10 +101,12 @@ class Recorder:
         self._look(now_ns)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        """A liveliness token rose or fell."""
         self._touch(now_ns)
-        self.model.alive(peer, up, now_ns)
-        self._look(now_ns)
+        super().alive(peer, up, now_ns)
+
+    def finish(self, now_ns: int) -> None:
+        self._touch(now_ns)
+        super().finish(now_ns)
 
     def seconds(self, now_ns: int) -> float:
         """Time of the run."""
@@ -140,16 +132,12 @@ class Recorder:
         self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
 
     def _look(self, now_ns: int) -> None:
-        tracks_due = self.vehicle_tracks.due(now_ns)
-        sample_due = self._sample_due_ns is None or now_ns >= self._sample_due_ns
-        if tracks_due or sample_due:
-            vehicles = self.observed.vehicles()
-            if tracks_due:
-                self._sample_tracks(now_ns, vehicles)
-            if sample_due:
-                self._add_sample(now_ns)
-            if self.ready_ns is None and self.routed and not self.missing():
-                self.ready_ns = now_ns
+        tracks_due, sample_due = self.vehicle_tracks.due(now_ns), self._sample_due(now_ns)
+        if tracks_due:
+            self._sample_tracks(now_ns, self.observed.vehicles())
+        super()._look(now_ns)
+        if (tracks_due or sample_due) and self.ready_ns is None and self.routed and not self.missing():
+            self.ready_ns = now_ns
 
     def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
         moving = np.isin(vehicles.states, _ON_THE_WAY)
@@ -164,43 +152,9 @@ class Recorder:
         places = [self.observed.place_m(pose) for _, pose in poses]
         self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
 
-    def finish(self, now_ns: int) -> None:
-        """The run is over: its last sample is of its end."""
-        self._touch(now_ns)
-        self._add_sample(now_ns)
-
-    def _add_sample(self, now_ns: int) -> None:
-        self._sample_due_ns = now_ns + _SAMPLE_NS
-        state = self.summary(now_ns)
-        self._sampled = now_ns, state
-        self.samples.add(
-            Sample(
-                time_s=state.elapsed_s,
-                states=tuple(state.states.values()),
-                captures=state.captures,
-                marks=state.marks,
-                reroute_requests=state.reroute_requests,
-                routes_served=state.routes_served,
-                messages_per_s=state.messages_per_s,
-                alive=state.alive,
-                gaps={line.id: line.gap.mean for line in state.targets if line.gap and line.gap.mean is not None},
-                growth_ms={line.id: line.growth_ms for line in state.targets if line.growth_ms is not None},
-                gap_excess=buckets_of(self.observed.histogram("followed_gap_excess").buckets),
-                waiting_s=float(self.driven.waiting_s.sum()),
-                standing_s=float(self.driven.standing_s.sum()),
-            )
-        )
-
-    def summary(self, now_ns: int) -> RunState:
-        """What the run is at a time."""
-        return self.model.state(now_ns)
-
-    def shown(self, now_ns: int) -> RunState:
-        """What people are shown: the state of the last sample, so that it is made once a second for all. Anew where
-        the swarm has said nothing since, as that is news, too."""
-        if self._sampled is None or not 0 <= now_ns - self._sampled[0] <= _SHOWN_NS:
-            self._sampled = now_ns, self.summary(now_ns)
-        return self._sampled[1]
+    def _sample(self, state: RunState) -> Sample:
+        waiting_s, standing_s = float(self.driven.waiting_s.sum()), float(self.driven.standing_s.sum())
+        return replace(super()._sample(state), waiting_s=waiting_s, standing_s=standing_s)
 
     def report(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Mapping
 
@@ -106,6 +107,7 @@ class Histogram:
         return math.fsum(value * count for value, count in self.values()) / total
 
 
+@functools.lru_cache(maxsize=4096)
 def _value(bucket: int) -> float:
     return 0.0 if bucket == ZERO_BUCKET else math.exp(bucket * _LOG_BASE)
 

@@ -126,6 +126,9 @@ class Logged:
     def set_time(self, *args: object, **kwargs: object) -> None:
         pass
 
+    def flush(self, *, timeout_sec: float) -> None:
+        pass
+
     def details(self, *paths: str) -> list[str]:
         """What people read who point at things of these entities."""
         return [text for path in paths for text in self.newest.get(f"{path}:details", ())]

@@ -13,6 +13,7 @@ from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.layers import shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
+from launch_scripts.monitor.serving.loopback_guard import Audience
 from launch_scripts.monitor.serving.sinks import Sinks
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
@@ -32,6 +33,7 @@ from swarm.wire.topics import BELIEVED, BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
 FRAME_NS = NS_PER_S // 10
+NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)
 
 
 def little_scenario() -> Scenario:
@@ -64,7 +66,10 @@ class Rig(SwarmModel):
         path: Path | None,
         web_port: int = 0,
         config: MonitorConfig = SILENT,
+        audience: Audience = SOMEBODY,
     ) -> None:
+        """audience  who looks; set `self.audience` for those who come and go"""
+        self.audience = audience
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
         mesh = TerrainMesh(terrain)
@@ -74,7 +79,15 @@ class Rig(SwarmModel):
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup, terrain, bus, post, self.sinks.streams, mesh=mesh, web_port=web_port, layers=layers
+                setup,
+                terrain,
+                bus,
+                post,
+                self.sinks.streams,
+                mesh=mesh,
+                web_port=web_port,
+                layers=layers,
+                audience=lambda: self.audience,
             ),
         )
 

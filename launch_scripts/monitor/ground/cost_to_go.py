@@ -52,11 +52,14 @@ class CostSamples:
         """A planner told its state."""
         self._targets.setdefault(target, None)
 
-    def next_target(self, now_ns: int) -> str | None:
-        """The target to ask about now, if it is time."""
+    def next_target(self, now_ns: int, slower: int = 1) -> str | None:
+        """The target to ask about now, if it is time.
+
+        slower  by how many times as seldom as somebody needs who looks
+        """
         if now_ns < self._due_ns or not self._targets:
             return None
-        self._due_ns = now_ns + _ASK_NS
+        self._due_ns = now_ns + slower * _ASK_NS
         self._asked += 1
         others = [target for target in self._targets if target != self._shown]
         if self._shown in self._targets and (self._asked % 2 or not others):

@@ -36,10 +36,11 @@ from swarm.wire.messages.planning import CostReply, PlannerStatus
 
 _WINDOWS_NS = NS_PER_S
 _LAYER_NS = 5 * NS_PER_S
+_UNSEEN = 4
+"""While nobody looks the ground is drawn so many times as seldom, for the recording."""
 _ALL_NAMED, _NAMED_SHARE = 4, 0.12
 """So many windows all have names. Of more, those of a share of the terrain's width: in a small one stands its
 target, which has a name."""
-_ZONES_AGAIN_NS = 10 * NS_PER_S
 _MOST_TARGETS = 256
 """Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""
 _NEAREST_NS = 8 * NS_PER_S
@@ -48,11 +49,10 @@ _NEAREST_NS = 8 * NS_PER_S
 @dataclass(eq=False)
 class _Tiles:
     """A layer of tiles: which are out of date. Marks come many times a second to the same tiles, and each of their
-    pictures is drawn once for all.
+    pictures is drawn once for all; one that looks as before is not logged again.
 
     layer      whose tiles these are
-    every_ns   how often tiles that are out of date are drawn; one more is sent again, as a viewer that joins late
-               has only what the server still holds
+    every_ns   how often tiles that are out of date are drawn
     at_once    how many at most
     """
 
@@ -64,12 +64,22 @@ class _Tiles:
 
     def __post_init__(self) -> None:
         self.stale: dict[int, None] = {}
-        self._next = 0
+        self._shown: dict[int, int] = {}
+        """Tile -> hash of its pixels as they were logged last."""
 
-    def refresh(self, tiles: int) -> None:
-        """One more of so many tiles is out of date, also while others are: in a busy swarm some always are."""
-        self.stale[self._next] = None
-        self._next = (self._next + 1) % tiles
+    def draw_anew(self, tiles: int) -> None:
+        """All of so many tiles are to be logged, whatever they look like, and soon."""
+        self.stale = dict.fromkeys(range(tiles))
+        self._shown.clear()
+        self.due_ns = 0
+
+    def looks_new(self, tile: int, image: Bytes) -> bool:
+        """Whether a tile has other pixels than when this was asked last."""
+        pixels = hash(image.tobytes())
+        if self._shown.get(tile) == pixels:
+            return False
+        self._shown[tile] = pixels
+        return True
 
 
 class GroundView:
@@ -119,7 +129,7 @@ class GroundView:
         self._pictures = TargetPictures(mesh, colours, self.samples)
         self._nearest_due_ns = 0
         self._ordered: list[Area] = []
-        self._zones_version, self._zones_due_ns = 0, 0
+        self._zones_version = 0
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
         self._windows_new, self._windows_due_ns = False, 0
@@ -132,9 +142,20 @@ class GroundView:
         if NEAREST in self._shown:
             self._drawing.legend(NEAREST.name, nearest_legend(self._target_ids, self._movers))
         self._pictures.full_s = 0.0  # so that the next answer draws a legend
+        self.draw_anew()
+        self.finish()
+
+    def draw_anew(self) -> None:
+        """What is drawn on change only is drawn once more, when it is due."""
         self._drawing.ordered(self._ordered)
+        self._windows_new = bool(self._windows)
         for layer in self._layers:
-            layer.stale = dict.fromkeys(range(self._mesh.tiles))
+            layer.draw_anew(self._mesh.tiles)
+
+    def finish(self) -> None:
+        """Draws all tiles that are out of date."""
+        self._look_for_changes()
+        for layer in self._layers:
             self._draw_tiles(layer, self._mesh.tiles)
 
     def hear_status(self, status: PlannerStatus) -> None:
@@ -157,26 +178,35 @@ class GroundView:
             self._nearest_due_ns = now_ns + _NEAREST_NS
             self._drawing.texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
-    def tick(self, now_ns: int) -> None:
+    def tick(self, now_ns: int, watched: bool) -> None:
         """Draws what has changed, now and then."""
-        for window in self._cost_map.take_dirty():
-            changed = dict.fromkeys(self._mesh.tiles_touching(window))
-            for layer in self._layers:
-                layer.stale.update(changed)
+        slower = 1 if watched else _UNSEEN
+        self._look_for_changes()
         self._draw_ordered(now_ns)
         for layer in self._layers:
             if now_ns >= layer.due_ns:
-                layer.due_ns = now_ns + layer.every_ns
-                layer.refresh(self._mesh.tiles)
+                layer.due_ns = now_ns + slower * layer.every_ns
                 self._draw_tiles(layer, layer.at_once)
         if self._windows_new and now_ns >= self._windows_due_ns:
             self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
             self._draw_windows()
 
+    def next_target(self, now_ns: int, watched: bool) -> str | None:
+        """The target whose planner is to be asked for costs now, if it is time."""
+        return self.samples.next_target(now_ns, 1 if watched else _UNSEEN)
+
+    def _look_for_changes(self) -> None:
+        for window in self._cost_map.take_dirty():
+            changed = dict.fromkeys(self._mesh.tiles_touching(window))
+            for layer in self._layers:
+                layer.stale.update(changed)
+
     def _draw_tiles(self, layer: _Tiles, most: int) -> None:
         for tile in list(layer.stale)[:most]:
             del layer.stale[tile]
-            self._drawing.texture(layer.layer.entity, tile, layer.picture(self._mesh.tile_window(tile)))
+            image = layer.picture(self._mesh.tile_window(tile))
+            if layer.looks_new(tile, image):
+                self._drawing.texture(layer.layer.entity, tile, image)
 
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
@@ -187,15 +217,13 @@ class GroundView:
             self._drawing.legend(layer.name, to_target_legend(target, self._pictures.full_s, self._movers))
 
     def _draw_ordered(self, now_ns: int) -> None:
-        """Draws operators' zones when they change, and now and then for viewers that join late."""
+        """Draws operators' zones when they change."""
         version = self._replica.zones_version
-        if version == self._zones_version and (not self._ordered or now_ns < self._zones_due_ns):
+        if version == self._zones_version:
             return
-        self._zones_due_ns = now_ns + _ZONES_AGAIN_NS
-        if version != self._zones_version:
-            self._zones_version = version
-            self._ordered = ordered_areas(self._replica, now_ns, self._classes)
-            self._colours.close(closed_cells([*self._zones, *self._ordered]))
+        self._zones_version = version
+        self._ordered = ordered_areas(self._replica, now_ns, self._classes)
+        self._colours.close(closed_cells([*self._zones, *self._ordered]))
         self._drawing.ordered(self._ordered)
 
     def _draw_windows(self) -> None:

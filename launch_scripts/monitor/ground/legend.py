@@ -89,10 +89,13 @@ def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> byt
             draw.text((left + _SWATCH_PX[0] + 12, middle), entry.meaning, _TEXT, font, anchor="lm")
         left += width
     file = io.BytesIO()
-    image.save(file, "PNG")
+    image.save(
+        file, "PNG", compress_level=1
+    )  # of a scale that changes all the time most of the work was to pack it
     return file.getvalue()
 
 
+@functools.cache
 def _swatch(look: Look) -> Image.Image:
     width, height = (_FINE * side for side in _SWATCH_PX)
     image = Image.new("RGB", (width, height), BACKGROUND)

@@ -6,9 +6,6 @@ from collections.abc import Mapping
 
 from swarm.clock import NS_PER_S
 
-WHOLE_S = 10.0
-"""What is drawn on change only is drawn anew so often: a late viewer has only what its server still holds."""
-
 
 class Due:
     """When each of several things is done next.
@@ -20,9 +17,9 @@ class Due:
         self._every_ns = {name: int(seconds * NS_PER_S) for name, seconds in every_s.items()}
         self._next_ns = dict.fromkeys(every_s, 0)
 
-    def now(self, name: str, now_ns: int) -> bool:
-        """Whether it is time; if so, the next time is counted from now."""
+    def now(self, name: str, now_ns: int, slower: int = 1) -> bool:
+        """Whether it is time; if so, the next time is counted from now, and comes so many times as late."""
         if now_ns < self._next_ns[name]:
             return False
-        self._next_ns[name] = now_ns + self._every_ns[name]
+        self._next_ns[name] = now_ns + slower * self._every_ns[name]
         return True

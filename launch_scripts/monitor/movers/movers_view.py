@@ -18,7 +18,7 @@ from launch_scripts.monitor.movers.strips import poles
 from launch_scripts.monitor.movers.targets_view import TargetsView
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.serving.sinks import Streams
-from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.run_figures import RunFigures
 from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.replication.filter import MarkFilter
@@ -32,12 +32,15 @@ from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Fleet, Followed
 from vehicle_agent.bodies import Bodies
 
+_UNSEEN = 2
+"""While nobody looks pins, routes and sentences are drawn so many times as seldom, for the recording."""
+
 
 class MoversView:
     """Vehicles, guests, targets, sightings, bodies, routes and trails.
 
-    recorder  has heard each message before `hear`
-    filter    whose sightings count
+    figures  have heard each message before `hear`
+    filter   whose sightings count
     """
 
     def __init__(
@@ -45,11 +48,11 @@ class MoversView:
         rec: rr.RecordingStream | Streams,
         mesh: TerrainMesh,
         scenario: Scenario,
-        recorder: Recorder,
+        figures: RunFigures,
         counters: Counters,
         filter: MarkFilter,
     ) -> None:
-        self._recorder = recorder
+        self._figures = figures
         self._mesh = mesh
         self._counters = counters
         level = level_for(scenario.vehicle_count)
@@ -73,12 +76,16 @@ class MoversView:
     def begin(self) -> None:
         """Logs styles; all else is drawn anew."""
         self._drawing.begin()
-        self._vehicles.draw_anew()
-        self._targets.draw_anew()
-        self._searches.draw_anew()
+        self.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             middle = self._mesh.width_m / 2, self._mesh.depth_m / 2
             self._drawing.followed(followed_point(self._mesh, middle))
+
+    def draw_anew(self) -> None:
+        """What is drawn on change only is drawn once more, when it is due."""
+        self._vehicles.draw_anew()
+        self._targets.draw_anew()
+        self._searches.draw_anew()
 
     def hear(self, message: Message, now_ns: int) -> None:
         match message:
@@ -97,8 +104,8 @@ class MoversView:
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say, so that all places say the same; draws alarms where they are."""
         self._details = {line.id: target_details(line) for line in summary.targets}
-        plan, observed = self._recorder.model.plan, self._recorder.observed
-        self._crew = frozenset(plan.crew_now(plan.targets_now(self._recorder.book)))
+        plan, observed = self._figures.model.plan, self._figures.observed
+        self._crew = frozenset(plan.crew_now(plan.targets_now(self._figures.book)))
         marks = alarm_marks(
             summary.alarms, summary.elapsed_s, observed.targets(), observed.vehicles(), self._mesh.grid
         )
@@ -110,19 +117,20 @@ class MoversView:
             texts = [mark.text for mark in marks]
             self._drawing.alarms(points.positions, strips, [mark.colour for mark in marks], texts)
 
-    def tick(self, now_ns: int) -> None:
+    def tick(self, now_ns: int, watched: bool) -> None:
         """Draws what is due in one frame."""
-        observed = self._recorder.observed
+        slower = 1 if watched else _UNSEEN
+        observed = self._figures.observed
         if self._fleets_new:
             self._fleets_new = False
             vehicles = observed.driven(self._crew, now_ns)
-            self._vehicles.draw(vehicles, observed.groups, observed.classes, now_ns)
+            self._vehicles.draw(vehicles, observed.groups, observed.classes, now_ns, slower)
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
-        lost = self._recorder.tracked.lost(now_ns)
+        lost = self._figures.tracked.lost(now_ns)
         # A target that an operator removed is in no table either.
         places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
-        self._targets.draw(places_m, lost, self._sightings.best(now_ns), self._details, now_ns)
+        self._targets.draw(places_m, lost, self._sightings.best(now_ns), self._details, now_ns, slower)
         if (beliefs := self._searches.take_changed(now_ns)) is not None:
             self._drawing.searched(*searched_points(self._mesh, beliefs))
         self._bodies.tick(now_ns)
@@ -134,7 +142,7 @@ class MoversView:
         """Draws the vehicle or target that the camera follows, where it is now; nothing while nobody knows."""
         if self._follow is None:
             return
-        place_m = self._recorder.observed.targets().get(self._follow)
+        place_m = self._figures.observed.targets().get(self._follow)
         n = bisect_left(vehicles.ids, self._follow)
         if n < len(vehicles) and vehicles.ids[n] == self._follow:
             place_m = float(vehicles.east_m[n]), float(vehicles.south_m[n])

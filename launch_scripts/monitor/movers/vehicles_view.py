@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, TerrainMesh
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.movers.details import vehicle_details
-from launch_scripts.monitor.movers.due import WHOLE_S, Due
+from launch_scripts.monitor.movers.due import Due
 from launch_scripts.monitor.movers.levels import Level
 from launch_scripts.monitor.movers.looks import Looks, dimmed
 from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
@@ -69,6 +69,8 @@ class VehiclesView:
         self._roll = self._enrolled([], {}, {})
         self._colours: Bytes | None = None
         """As drawn last; None if all is to be drawn anew."""
+        self._positions: Floats | None = None
+        """As drawn last."""
         self._routes: dict[str, RouteNow] = {}
         self._route_lines = RouteLines(mesh, level.route_stride)
         self._routes_drawn: dict[str, Strips] = {}
@@ -80,7 +82,6 @@ class VehiclesView:
                 "trails": level.trail_every_s,
                 "details": level.details_s,
                 "routes": level.routes_s / max(len(self._target_ids), 1),
-                "whole": WHOLE_S,
             }
         )
 
@@ -107,14 +108,16 @@ class VehiclesView:
         groups: Callable[[], Mapping[str, str]],
         classes: Callable[[], Mapping[str, str]],
         now_ns: int,
+        slower: int,
     ) -> None:
-        """Draws what is due; once for each frame in which something is new."""
+        """Draws what is due; once for each frame in which something is new.
+
+        slower  by how many times as seldom as for somebody who looks routes and sentences are drawn
+        """
         self._frame += 1
         trails_due = self._due.now("trails", now_ns)
         if self._frame % self._level.frames and not trails_due:
             return
-        if self._due.now("whole", now_ns):
-            self.draw_anew()
         if vehicles.ids != self._roll.ids:
             self._colours, self._roll = None, self._enrolled(vehicles.ids, groups(), classes())
         points = vehicle_points(self._mesh, vehicles)
@@ -122,12 +125,12 @@ class VehiclesView:
             cells = [cell_at(self._mesh.grid, *place) for place in _places(vehicles, rows)]
             points.positions[rows, 2] += over_m.reshape(-1)[cells]
         colours = self._coloured(vehicles)
-        self._draw_balls(vehicles, points, colours, now_ns)
+        self._draw_balls(vehicles, points, colours, now_ns, slower)
         if trails_due:
             strips, moved = self._trails.advance(points.ids, points.positions)
             if len(strips):
                 self._drawing.lines("world/trails/vehicles", strips, dimmed(colours[moved]))
-        if self._due.now("routes", now_ns):
+        if self._due.now("routes", now_ns, slower):
             self._draw_routes(vehicles)
 
     def _enrolled(self, ids: list[str], groups: Mapping[str, str], classes: Mapping[str, str]) -> _Roll:
@@ -146,13 +149,19 @@ class VehiclesView:
             rows = np.array([*self._looks.rows(vehicles.target_ids), -1], np.intp)[vehicles.targets]
         return self._looks.vehicles(rows, vehicles.states)
 
-    def _draw_balls(self, vehicles: VehicleColumns, points: Points, colours: Bytes, now_ns: int) -> None:
+    def _draw_balls(
+        self, vehicles: VehicleColumns, points: Points, colours: Bytes, now_ns: int, slower: int
+    ) -> None:
         roll, whole = self._roll, self._colours is None
         changed = colours if self._colours is None or not np.array_equal(colours, self._colours) else None
         self._colours = colours
         details = None
-        if self._due.now("details", now_ns) or whole:
+        if self._due.now("details", now_ns, slower) or whole:
             details = vehicle_details(vehicles, roll.who, self._routes, now_ns)
+        moved = self._positions is None or not np.array_equal(points.positions, self._positions)
+        self._positions = points.positions
+        if not moved and changed is None and details is None:
+            return
         for entity, members in (("world/vehicles", roll.own), ("world/guests", roll.guests)):
             if not len(members) and not whole:
                 continue

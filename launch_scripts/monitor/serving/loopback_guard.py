@@ -7,13 +7,14 @@ name lead there (DNS rebinding). Such a request carries the other site's name as
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import socketserver
 import threading
 import time
 import urllib.parse
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 LOOPBACK = "127.0.0.1"
 MOST_CONNECTIONS = 24
@@ -39,6 +40,13 @@ def _name_of(url: str) -> str | None:
         return None
 
 
+class Audience(NamedTuple):
+    """Connections that last: how many there are now, and how many there have ever been."""
+
+    now: int
+    ever: int
+
+
 class BoundedServer(socketserver.ThreadingTCPServer):
     """A thread for each connection, of which there are `MOST_CONNECTIONS` at most: who comes beyond is closed.
 
@@ -60,6 +68,8 @@ class BoundedServer(socketserver.ThreadingTCPServer):
         self._lock = threading.Lock()
         self._open: dict[socket.socket, float] = {}
         """Connection -> when it is cut, on the monotonic clock."""
+        self._kept = 0
+        """Connections for which `keep` was ever called."""
         super().__init__((address, port), handler)
 
     @property
@@ -79,7 +89,13 @@ class BoundedServer(socketserver.ThreadingTCPServer):
         """Let a connection last."""
         with self._lock:
             if connection in self._open:
-                self._open[connection] = float("inf")
+                self._open[connection] = math.inf
+                self._kept += 1
+
+    def audience(self) -> Audience:
+        """Who watches: those whose connections `keep` lets last."""
+        with self._lock:
+            return Audience(sum(until_s == math.inf for until_s in self._open.values()), self._kept)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         with self._lock:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from launch_scripts.monitor import die_with_parent
-from launch_scripts.monitor.serving.loopback_guard import LOOPBACK, BoundedServer, refusal
+from launch_scripts.monitor.serving.loopback_guard import LOOPBACK, Audience, BoundedServer, refusal
 from launch_scripts.monitor.serving.stream_gate import SEND_WITHIN_S, join_sockets
 from swarm.errors import StoreError
 
@@ -76,6 +76,10 @@ class ViewerPage:
 
     def close(self) -> None:
         self._server.close()
+
+    def audience(self) -> Audience:
+        """Who takes the stream through the page's port."""
+        return self._server.audience()
 
     def entrance(self, host: str) -> str:
         """Where a visit without a query is sent. The stream comes through the page's own port: so a tunnel needs

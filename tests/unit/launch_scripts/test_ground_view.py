@@ -237,7 +237,35 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
                     following=0, gap_mean=None, gap_p95=None, gap_max=None,
                 )
             )  # fmt: skip
-        view.tick(len(drawn) * 2 * NS_PER_S)
+        view.tick(len(drawn) * 2 * NS_PER_S, watched=True)
         assert {name for name in drawn[-1] if name} == {f"window of {target}" for target in named}
         assert len(drawn[-1]) == count
     rec.disconnect()
+
+
+def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
+    terrain = flat()
+    cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
+    view = GroundView(
+        rr.RecordingStream("same", recording_id="r"), TerrainMesh(terrain), terrain, cost_map, replica,
+        [PHOTO, COST], ["t0"],
+    )  # fmt: skip
+    logged: list[str] = []
+    view._drawing.texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
+    both = [PHOTO.entity, COST.entity]
+
+    def logged_when(at_s: int) -> list[str]:
+        logged.clear()
+        for layer in view._layers:
+            layer.stale[0] = None  # as after any mark in this tile
+        view.tick(at_s * NS_PER_S, watched=True)
+        return logged
+
+    view.begin()
+    assert logged == both
+    assert logged_when(10) == []
+    cost_map.ground_s_per_m[3, 3] = 0.5
+    assert logged_when(20) == both
+    assert logged_when(30) == []
+    view.draw_anew()
+    assert logged_when(40) == both

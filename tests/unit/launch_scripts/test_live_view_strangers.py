@@ -18,7 +18,7 @@ import rerun as rr
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.serving import loopback_guard, stream_gate
-from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS, refusal
+from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS, Audience, refusal
 from launch_scripts.monitor.serving.sinks import Sinks
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
@@ -165,6 +165,25 @@ def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytes
         while threading.active_count() > before and time.monotonic() < deadline_s:
             time.sleep(0.1)
         assert threading.active_count() <= before
+
+
+def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -> None:
+    page, stream = ports(sinks)
+    before = sinks.audience()
+    ask(stream, "POST", READ, {"Host": "evil.example", **GRPC_WEB})
+    ask(page, "GET", "/", {})
+    assert sinks.audience() == before
+    head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
+    with contextlib.ExitStack() as stack:
+        for port in (page, stream):
+            viewer = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+            viewer.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
+            assert viewer.recv(4) == b"HTTP"
+        assert sinks.audience() == Audience(now=before.now + 2, ever=before.ever + 2)
+    deadline_s = time.monotonic() + 10
+    while sinks.audience().now > before.now and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    assert sinks.audience() == Audience(now=before.now, ever=before.ever + 2)
 
 
 def test_rerun_itself_listens_where_nobody_looks(sinks: Sinks) -> None:

@@ -21,11 +21,22 @@ import msgspec
 import numpy as np
 import pytest
 from support.fake_run import fake_run
-from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain, say
+from support.monitor_rig import (
+    LIVE,
+    NOBODY,
+    SOMEBODY,
+    Rig,
+    hidden_truth,
+    little_scenario,
+    little_terrain,
+    say,
+)
+from support.target_reports import fleet
 
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.serving.loopback_guard import Audience
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
@@ -82,8 +93,8 @@ def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: T
     rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
     rows = rows_by_entity(tmp_path / "run.rrd")
-    assert rows["/world/vehicles"] >= 12
-    assert rows["/world/targets/balls"] >= 12
+    assert rows["/world/vehicles"] >= 11
+    assert rows["/world/targets/balls"] >= 11
     for name in ("world/targets/poles", "world/trails/vehicles", "world/windows", "summary"):
         assert rows[f"/{name}"] >= 3, name
     for name in ("world/routes/t0", "world/routes/t1", "log"):
@@ -130,14 +141,71 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
 def test_whoever_opens_the_view_late_has_all_of_it_soon(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
-    """As if the server had dropped what is old: its last ten seconds hold every component."""
+    """As if the server had dropped what is old: what is drawn after they came holds every component."""
     longer = msgspec.structs.replace(scenario, seconds=16.0)
-    rig = Rig(longer, terrain, tmp_path / "run.rrd")
-    rig.play(fake_run(terrain, hidden_truth(terrain), longer))
+    rig = Rig(longer, terrain, tmp_path / "run.rrd", audience=NOBODY)
+    told = list(fake_run(terrain, hidden_truth(terrain), longer))
+    rig.play(each for each in told if each[0] < 11 * NS_PER_S)
+    came_s = rig.service.at_s
+    rig.audience = SOMEBODY
+    rig.play(each for each in told if each[0] >= 12 * NS_PER_S)
     rig.close()
-    for entity in ("/world/vehicles", "/world/targets/balls", "/world/targets/names", "/world/routes/t0"):
-        whole, late = (components(tmp_path / "run.rrd", entity, since_s).keys() for since_s in (0.0, 6.0))
+    tiles = [f"/world/ground/{tile}" for tile in range(rig.service._mesh.tiles)]
+    for entity in ("/world/vehicles", "/world/targets/balls", "/world/targets/names", "/world/routes/t0", *tiles):
+        whole, late = (components(tmp_path / "run.rrd", entity, since_s).keys() for since_s in (0.0, came_s))
         assert whole == late, entity
+
+
+def test_viewers_who_come_and_go_all_the_time_have_all_drawn_anew_every_ten_seconds(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd", audience=NOBODY)
+    for ever in range(200):
+        rig.audience = Audience(now=ever % 2, ever=ever)
+        rig.run(0.1)
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/ground/0"] in (3, 4), (
+        "at the beginning and every ten seconds"
+    )
+
+
+def test_while_nobody_looks_half_the_frames_are_drawn_and_packed_together(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    frames, packs = {}, {}
+    for name, audience in (("seen", SOMEBODY), ("unseen", NOBODY)):
+        rig = Rig(scenario, terrain, tmp_path / name, audience=audience)
+        rig.play(
+            (tick * NS_PER_S // 10, fleet(20.0 * tick, ("a0-00", 0), at_m=(tick, 0.0))) for tick in range(1, 41)
+        )
+        rig.close()
+        frames[name] = rows_by_entity(tmp_path / name)["/world/vehicles"]
+        packs[name] = sum(str(chunk.entity_path) == "/world/vehicles" for chunk in chunks(tmp_path / name))
+    assert packs["seen"] == frames["seen"] == 40
+    assert frames["unseen"] in (20, 21)
+    assert packs["unseen"] < 10, "by the clock of the wall, once a second"
+
+
+def test_who_stands_still_is_not_drawn_again(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+    rig.play((tick * NS_PER_S // 10, fleet(20.0 * tick, ("a0-00", 0))) for tick in range(1, 41))
+    rig.close()
+    positions = components(tmp_path / "run.rrd", "/world/vehicles")["positions"]
+    assert len(positions) <= 5, "with what is said of it, once a second"
+
+
+def test_the_recording_ends_with_what_was_said_last_also_if_no_frame_was_due(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd", audience=NOBODY)
+    rig.run(3)
+    stats = Stats(
+        role="targets", id="0", incarnation=7, stamp_ns=1, counts={"captures": 7}, gauges={}, histograms={}
+    )
+    say(rig.speaker, terrain, stats)
+    rig.run(0.01)
+    rig.close()
+    assert components(tmp_path / "run.rrd", "/plots/captures_and_marks")["scalars"][-1][0] == 7
 
 
 def test_guests_have_a_box_and_vehicles_that_left_are_gone(
@@ -244,7 +312,7 @@ def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
     rig.run(20)
     rig.play((now_ns + 20 * NS_PER_S, told) for now_ns, told in fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
-    assert rows_by_entity(tmp_path / "late.rrd")["/world/vehicles"] >= 12
+    assert rows_by_entity(tmp_path / "late.rrd")["/world/vehicles"] >= 11
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -> None:

@@ -6,8 +6,6 @@ import msgspec
 import pytest
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground.ground_view import _Tiles
-from launch_scripts.monitor.ground.layers import PHOTO
 from launch_scripts.monitor.shown_text import in_markdown, shown
 from swarm.wire.messages.planning import PlannerStatus
 
@@ -27,17 +25,6 @@ def test_a_strange_text_is_one_line_of_characters_that_every_viewer_has(text: st
 
 def test_markdown_of_others_is_shown_and_not_read() -> None:
     assert in_markdown("![x](http://a/) | **b**") == r"\!\[x\](http://a/) \| \*\*b\*\*"
-
-
-def test_tiles_are_sent_again_also_while_others_change() -> None:
-    tiles = _Tiles(PHOTO, lambda window: pytest.fail("nothing is drawn"), 1, 80)
-    sent = set()
-    for _ in range(5):
-        tiles.stale[0] = None
-        tiles.refresh(5)
-        sent |= set(tiles.stale)
-        tiles.stale.clear()
-    assert sent == set(range(5))
 
 
 def test_names_that_planners_make_up_do_not_fill_the_view() -> None:

@@ -70,6 +70,20 @@ def test_the_first_route_that_is_begun_says_that_routes_are_served_and_the_other
     assert sum(isinstance(message, Followed) for message in heard) == 1
 
 
+def test_what_is_said_last_is_recorded_also_if_it_was_not_due_yet() -> None:
+    swarm = SwarmModel()
+    watcher, heard = begun(swarm)
+    agent = swarm.bus("agent")
+    for tick in range(3):
+        report = fleet(100.0 * tick, ("a0-00", tick))
+        agent.publish(FLEET, report, region=0, author=report.author)
+        swarm.run(0.05)
+        watcher.listen(0.0)
+    assert [message.seq for message in heard if isinstance(message, Fleet)] == [0]
+    watcher.finish()
+    assert [message.seq for message in heard if isinstance(message, Fleet)] == [0, 2]
+
+
 def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone() -> None:
     swarm = SwarmModel()
     watcher, _ = begun(swarm)
