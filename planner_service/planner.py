@@ -344,6 +344,8 @@ class Planner:
         """Note what work on this thread cost."""
         if self._stopwatch is None:
             took_ns = update.cells * (MODEL_EXACT_NS_PER_CELL if update.kind == "exact" else MODEL_NS_PER_CELL)
+        if update.repair_ns:
+            self.counters.observe("repair_ms", update.repair_ns / 1e6)
         if update.kind in ("full", "exact"):
             self._exact_ns = now_ns
             self._record_growth(took_ns - update.repair_ns, exact_move=update.kind == "exact")

@@ -193,7 +193,8 @@ class TargetTree:
             if repaired is None or self.times.is_quick(self._grid.cells):
                 return self._grow_full(target_cell)
             return self._leave_to_worker() if target_cell != tree.root else repaired
-        tree = self._tree = grown.tree_on(self._costs, self._in_pieces)
+        in_pieces = self._in_pieces or not self.times.is_quick(self._grid.cells)  # as it is, if that takes long
+        tree = self._tree = grown.tree_on(self._costs, in_pieces)
         self._reach.note_whole(grown.target_cell)
         self._is_better_bound = grown.heuristic is None
         if grown.heuristic is None:

@@ -20,6 +20,8 @@ REGION_CELLS = REGION_TILES * TILE_CELLS
 """Side of a region, in cells."""
 MOST_PLOT_REGIONS = 64
 """Side of the largest plot of right of way, in regions: that of the largest square grid."""
+MOST_PLOTS = 1 << 21
+"""Numbers of plots are less."""
 
 MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""

@@ -18,7 +18,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.places import cell_of
-from swarm.right_of_way.plots import Plots, fitting_regions
+from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY, Plots, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 
@@ -44,12 +44,12 @@ def plots(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
     """More plots of right of way than the agents have use for."""
     agents = sum(not flies(scenario, plan.group.vehicle_class) for plan in plan_agents(scenario))
     fitting = fitting_regions(grid.rows, grid.cols, agents)
-    if agents and fitting > scenario.map.plot_regions:
+    if agents >= FEWEST_FOR_MAJORITY and fitting > scenario.map.plot_regions:  # fewer keep plots for themselves
         many = Plots(grid, (), scenario.map.plot_regions * REGION_CELLS).count
         yield warning(
             "map.plot_regions",
-            f"{agents} agents speak of {many} plots of right of way {scenario.vehicles.tick_hz:g} times a second;"
-            f" set it to {fitting}, for larger ones",
+            f"{agents} agents share {many} plots of right of way, and speak of each in which vehicles drive"
+            f" {scenario.vehicles.tick_hz:g} times a second; set it to {fitting}, for larger ones",
         )
 
 

@@ -108,8 +108,8 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
         yield warning(
             "vehicles",
             f"{scenario.vehicle_count:,} vehicles of {needs.agents} agents and {len(scenario.target_ids):,} targets"
-            f" at {hz:g} Hz keep about {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be late;"
-            f"{fewer} fewer of them, a lower vehicles.tick_hz, or more machines (docs/scale-figures.md)",
+            f" at {hz:g} Hz keep about {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be"
+            f" late;{fewer} fewer of them, a lower vehicles.tick_hz, or more machines (docs/scale-figures.md)",
         )
     if here.free_bytes is not None and needs.memory_bytes > here.free_bytes:
         yield warning(

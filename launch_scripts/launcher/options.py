@@ -163,12 +163,21 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
 
 
+_LATER_KEYS = (("map", "plot_regions"),)
+"""Sections and keys that the version before does not know: at their default they change no id, so that parts of
+both versions agree on one."""
+
+
 def common_run_id(scenario: Scenario) -> str:
     """Run id derived from the scenario, so that separately started parts agree on it."""
     same = msgspec.structs.replace(
         scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
     )
-    digest = hashlib.blake2b(msgspec.json.encode(same, order="deterministic"), digest_size=4).hexdigest()
+    settings, defaults = (msgspec.to_builtins(each, order="deterministic") for each in (same, Scenario()))
+    for section, key in _LATER_KEYS:
+        if settings[section][key] == defaults[section][key]:
+            del settings[section][key]
+    digest = hashlib.blake2b(msgspec.json.encode(settings), digest_size=4).hexdigest()
     return f"{scenario.name}-{digest}"
 
 

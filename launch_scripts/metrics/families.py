@@ -43,6 +43,7 @@ _RENAMED = {
     "growths": "tree_growths",
     "growth_ms": "tree_growth_ms",
     "window_ms": "tree_window_growth_ms",
+    "repair_ms": "tree_repair_ms",
     "cpu_s": "cpu_seconds",
 }
 """Counters, gauges and histograms whose names say little beside those of other programs."""
@@ -76,6 +77,7 @@ HELP = {
     "bytes_in": "Bytes of payloads received",
     "growth_ms": "Time to grow a tree whole",
     "window_ms": "Time to grow a window of a tree",
+    "repair_ms": "Time to take changes of the map into a tree",
     "route_query_ms": "Time from an agent's question to the route",
     "body_ms": "Time to take in bodies at a tick",
     "tick_ms": "Time that a tick took",

@@ -44,7 +44,7 @@ class Guest:
 
     def __init__(self, plots: Plots, name: str, lives: Sequence[int] = ()) -> None:
         self.vehicle = f"{name}-00"
-        self._plots = plots
+        self.plots = plots
         self._host = Host(plots, name, [self.vehicle], lambda vehicle, cells: None)
         self._lives = list(lives)
         self._cell: int | None = None
@@ -86,8 +86,8 @@ class Guest:
         there is none."""
         if self.cells:
             raise ValueError(f"it holds cell {self.cells[0]}: leave before it enters elsewhere")
-        if self._plots.of(cell) < 0:
-            raise ValueError(f"cell {cell} is outside the map of {self._plots.grid.cells} cells")
+        if self.plots.of(cell) < 0:
+            raise ValueError(f"cell {cell} is outside the map of {self.plots.grid.cells} cells")
         self._cell = cell
         if self._host.holdings.life and not self.replaced:
             self._host.holdings.enter(self.vehicle, cell)
@@ -105,7 +105,7 @@ class Guest:
             where = f"cell {held[0]}" if held else "no cell"
             raise ValueError(f"the path must begin where the vehicle stands: it holds {where}")
         for tail, head in pairwise(path):
-            if self._plots.of(head) < 0 or not self._plots.adjacent(tail, head):
+            if self.plots.of(head) < 0 or not self.plots.adjacent(tail, head):
                 raise ValueError(f"cell {head} of the path is not next to cell {tail}")
         same = next(
             (n for n, (a, b) in enumerate(zip(held, path, strict=False)) if a != b), min(len(held), len(path))
@@ -113,7 +113,7 @@ class Guest:
         if same < len(held):
             self._host.holdings.give_back(self.vehicle, same)
         self._path = tuple(path)
-        self._aside = tuple(cell for cell in aside if self._plots.adjacent(held[0], cell))
+        self._aside = tuple(cell for cell in aside if self.plots.adjacent(held[0], cell))
 
     def left(self, cell: int) -> None:
         """It has driven out of a cell, into the next that it holds. Raises ValueError if it holds none after it."""
@@ -195,6 +195,7 @@ class Removal:
     """
 
     def __init__(self, plots: Plots, name: str) -> None:
+        self.plots = plots
         self._host = Host(plots, name, None, lambda vehicle, cells: None)
         self._lives: set[int] = set()
 

@@ -141,16 +141,17 @@ class GuestService:
             self._perform(self.guest.tick(now_ns), now_ns)
 
     def _hear_known(self, known: Known) -> None:
-        if self.guest is None and known.agents:
+        if known.agents and (self.guest is None or _tells_of_larger(known, self.guest)):
             if self.name in known.agents:
                 self._warn_once((f"{self.name} is an agent of this run's scenario: a guest needs another name",))
                 return
-            self.guest = Guest(Plots(self._grid, known.agents, known.plot_cells), self.name, self._lives.lives)
+            plots = Plots(self._grid, known.agents, known.plot_cells)
+            self.guest = Guest(plots, self.name, self._lives.lives)
             for peer in self._tokens:
                 self.guest.hear_token(peer, up=True)
             if self._cell is not None:
                 self.guest.enter(self._cell)
-        if self.guest is not None:
+        if self.guest is not None and known.plot_cells == self.guest.plots.side:
             self.guest.hear_known(known)
 
     def _hear_token(self, peer: Peer, *, up: bool) -> None:
@@ -183,3 +184,9 @@ class GuestService:
             if text not in self._warned and len(self._warned) < 100:
                 self._warned.add(text)
                 self._warn(text)
+
+
+def _tells_of_larger(known: Known, guest: Guest) -> bool:
+    """Whether plots are larger than the guest takes them to be. An agent says so only if this is so for the whole
+    run; one that says less may not belong."""
+    return known.plot_cells > guest.plots.side and not guest.cells

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from hashlib import blake2s
 
-from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS, GridSpec
+from swarm.errors import ConfigError
+from swarm.grid import MOST_PLOT_REGIONS, MOST_PLOTS, REGION_CELLS, GridSpec
 
 MOST_PLOTS_AN_AGENT = 8
 """With few plots for each agent some are wardens of much more than others; many cost messages."""
+_LAYERS = 2
 FEWEST_FOR_MAJORITY = 3
 """Members of a plot; a layer of fewer agents has one for each plot."""
 
@@ -40,7 +42,11 @@ class Plots:
     layer   0 is the ground, 1 the air
     others  the agents of the other layer: no guest may take their names
 
-    all  the numbers of the layer's plots
+    all    the numbers of the layer's plots. Those of two sides are never the same: whoever speaks of plots of
+           another side is not understood, instead of being taken for somebody who gives cells back
+    spare  how many agents of the layer may have plots of another side while ours have seats (`has_quorum`)
+
+    Raises ConfigError where the numbers of so narrow a grid do not fit into a message.
     """
 
     def __init__(
@@ -60,9 +66,16 @@ class Plots:
         self.count = _count(grid.rows, grid.cols, side)
         self.layer = layer
         self.others = frozenset(others)
-        self._first = layer * self.count
+        smaller = sum(_count(grid.rows, grid.cols, n * REGION_CELLS) for n in range(1, side // REGION_CELLS))
+        self._first = _LAYERS * smaller + layer * self.count
         self.all = range(self._first, self._first + self.count)
+        if smaller and self.all.stop > MOST_PLOTS:
+            raise ConfigError(
+                f"map.plot_regions is {side // REGION_CELLS}: a grid of {grid.rows} x {grid.cols} cells is too"
+                " narrow for plots larger than a region"
+            )
         self.majority = 2 if len(self.agents) >= FEWEST_FOR_MAJORITY else 1
+        self.spare = FEWEST_FOR_MAJORITY - 1 if self.majority > 1 else 0
 
     def of(self, cell: int) -> int:
         """The plot of a cell; -1 of a cell outside the grid."""
@@ -70,6 +83,14 @@ class Plots:
             return -1
         cols, side = self._cols, self.side
         return self._first + cell // cols // side * self._across + cell % cols // side
+
+    def has_quorum(self, agents: Collection[str]) -> bool:
+        """Whether no other layout can have seats, if these agents are of this one.
+
+        Three agents make a seat in a plot of a region, whatever the rest are; so of larger plots so many have to be
+        that no three are left, and all where one has a seat by itself.
+        """
+        return self.side <= REGION_CELLS or len(set(self.agents).difference(agents)) <= self.spare
 
     def members(self, plot: int) -> tuple[str, ...]:
         members = self._members.get(plot)

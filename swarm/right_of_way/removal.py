@@ -40,8 +40,10 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
             case Replied(message=Known() as known) if known.agents:
                 if name in known.agents:
                     raise ConfigError(f"{name} is an agent of the scenario, not a guest: start it again instead")
-                removal = removal or Removal(Plots(grid, known.agents, known.plot_cells), name)
-                removal.hear_known(known)
+                if removal is None or (not begun and known.plot_cells > removal.plots.side):
+                    removal = Removal(Plots(grid, known.agents, known.plot_cells), name)
+                if known.plot_cells == removal.plots.side:
+                    removal.hear_known(known)
             case AskEnded() if removal is not None and not begun and removal.settled:
                 if not removal.known:
                     raise ConfigError(f"no agent has ever heard of a guest {name!r}")

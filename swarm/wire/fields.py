@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from swarm.grid import MOST_PLOTS
 from swarm.lazy_numpy import np, numpy_loaded
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ Tile = Annotated[int, Meta(ge=0, lt=1 << 22)]
 """A tile of the largest grid."""
 Region = Annotated[int, Meta(ge=0, lt=1 << 16)]
 """A region of the largest grid."""
-Plot = Annotated[int, Meta(ge=0, lt=1 << 21)]
+Plot = Annotated[int, Meta(ge=0, lt=MOST_PLOTS)]
 """A plot of the largest grid, on the ground or in the air."""
 
 ZERO_BUCKET = -20_000

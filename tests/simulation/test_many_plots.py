@@ -70,8 +70,9 @@ def test_nobody_meets_where_plots_are_larger_than_regions(seed):
     assert report["vehicles_routed"] == 24
     assert report["captures"] > 0
     assert min(messages.values()) > 0
-    plots = {plot for service in agents_of(simulation) for plot in service._right_of_way.core.holdings.plots}
-    assert plots <= {0, 1}  # 280 x 800 cells
+    cores = [service._right_of_way.core for service in agents_of(simulation)]
+    assert {core.plots.count for core in cores} == {2}  # 280 x 800 cells
+    assert {plot for core in cores for plot in core.holdings.plots} <= set(cores[0].plots.all)
 
 
 def test_agents_that_drove_alone_and_died_are_not_driven_into():

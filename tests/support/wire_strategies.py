@@ -56,6 +56,7 @@ sides = st.integers(1, 1 << 16)
 tiles = st.integers(0, (1 << 22) - 1)
 regions = st.integers(0, (1 << 16) - 1)
 plots = st.integers(0, (1 << 20) - 1)
+plot_sides = st.integers(1, 64).map(lambda regions: 256 * regions)
 millis = st.floats(0, 1e12)
 ages = st.floats(min_value=0, allow_nan=False)
 lengths = st.floats(0, 1e15)
@@ -245,11 +246,11 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     Stored: st.builds(Stored, plot=plots, agent=ids, epoch=naturals, seq=naturals),
     Claim: st.builds(Claim, epoch=naturals),
     KnownRequest: st.builds(
-        KnownRequest, agent=ids, disk=naturals, layer=st.integers(0, 1), plot_cells=st.integers(256, 16_384)
+        KnownRequest, agent=ids, disk=naturals, layer=st.integers(0, 1), plot_cells=plot_sides
     ),
     Known: st.builds(
         Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3),
-        agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3), plot_cells=st.integers(256, 16_384),
+        agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3), plot_cells=plot_sides,
     ),
     RemoveVehicles: st.builds(RemoveVehicles, vehicles=st.lists(ids, max_size=3)),
     Removed: st.builds(

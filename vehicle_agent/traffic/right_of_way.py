@@ -38,11 +38,6 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     noted_by: list[str] = []
     plot_cells: int = REGION_CELLS
 
-    @property
-    def is_new(self) -> bool:
-        """Whether nothing that was promised can be on the file."""
-        return not (self.lives or self.noted or self.noted_by)
-
 
 Action = MemberAction | Tell | OwnRecord | Known | AskKnown
 
@@ -75,7 +70,7 @@ class RightOfWay:
     ) -> None:
         self.agent = agent
         self.plots = plots
-        if own.is_new:
+        if not (saved or own.noted or own.noted_by):  # nobody builds on it: it takes any size
             own = replace(own, plot_cells=plots.side)
         elif own.plot_cells != plots.side:
             raise StoreError(
@@ -120,6 +115,8 @@ class RightOfWay:
         if request.agent == self.agent or self.silent or self._is_guest:
             return []
         if request.agent not in self._spawns or not request.disk:
+            if not self._has_quorum:
+                return []
             known = self._known_of(request.agent, request.disk)
             return [replace(known, lives=self._lives_of(request.agent), agents=list(self.plots.agents))]
         if request.plot_cells != self.plots.side:
@@ -155,6 +152,11 @@ class RightOfWay:
     def hear_token(self, peer: Peer, *, up: bool) -> None:
         """The liveliness token of another process has risen or fallen."""
         self._host.hear_token(peer, up=up)
+
+    @property
+    def _has_quorum(self) -> bool:
+        """Whether we know that this run has plots of our size."""
+        return self.plots.has_quorum({self.agent, *self.own.noted_by})
 
     def _known_of(self, agent: str, disk: int) -> Known:
         life, plots = self._known(agent)
@@ -239,7 +241,8 @@ class RightOfWay:
 
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
-        not known to be the first, and what was promised in the first is not in it."""
+        not known to be the first, and what was promised in the first is not in it; or while agents of plots of
+        another size could have seats."""
         if self.silent:
             return None
         known = self._members.get(plot)
@@ -247,6 +250,8 @@ class RightOfWay:
             return known
         members = self.plots.members(plot)
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
+            return None
+        if not self._has_quorum:
             return None
         promised, stored = self._saved.get(plot) or (0, self._at_start(plot))
         made = self._members[plot] = Member(self.plots, self.agent, promised, stored, self._spawns, now_ns)

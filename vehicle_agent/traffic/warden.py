@@ -31,7 +31,7 @@ MOST_GUESTS = 256
 MOST_CELLS_OF_GUEST = 1024
 """Cells of one plot that one guest holds."""
 MOST_CELLS_OF_GUESTS = 1 << 14
-"""Cells of one plot that all guests together hold: a quarter of it."""
+"""Cells of one plot that all guests together hold: a quarter of one as large as a region."""
 _MOST_BESIDE = 1 << 12
 _NO_CELLS: Sequence[int] = []
 _MOST_CELLS = 64

@@ -16,7 +16,7 @@ Stamp = tuple[Natural, Natural]
 Held = Annotated[list[Cell], Meta(max_length=64)]
 """Cells of one vehicle in driving order."""
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
-PlotSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_PLOT_REGIONS * REGION_CELLS)]
+PlotSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_PLOT_REGIONS * REGION_CELLS, multiple_of=REGION_CELLS)]
 """In cells."""
 
 

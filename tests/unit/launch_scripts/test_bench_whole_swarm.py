@@ -62,7 +62,9 @@ def test_every_size_has_a_valid_scenario_with_its_vehicles_agents_and_density(
         assert size.side**2 / vehicles == pytest.approx(CELLS_PER_VEHICLE, rel=0.05)
 
 
-@pytest.mark.parametrize(("vehicles", "agents"), [(2, 2), (20, 5), (1000, 5), (3000, 6), (10_000, 20), (30_000, 40)])
+@pytest.mark.parametrize(
+    ("vehicles", "agents"), [(2, 2), (20, 5), (1000, 5), (3000, 6), (10_000, 20), (30_000, 40)]
+)
 def test_there_is_an_agent_for_each_five_hundred_vehicles_but_five_at_least_and_forty_at_most(
     vehicles: int, agents: int
 ) -> None:

@@ -241,6 +241,16 @@ def test_growths_are_timed_by_the_stopwatch_that_is_handed_in() -> None:
     assert ("observe", 3_000_000) in world.tree.calls
 
 
+def test_what_a_repair_took_is_observed_by_itself_and_not_with_the_growth_after_it() -> None:
+    times = iter([10_000_000, 60_000_000])
+    world = World(stopwatch=lambda: next(times))
+    world.tree.answers = [Update("exact", GRID.window, 4, repair_ns=45_000_000)]
+    world.pose(10, 20)
+    world.tick()
+    assert world.planner.status(0).growth_ms == 5.0
+    assert world.counters.histograms["repair_ms"].count == 1
+
+
 def test_without_a_stopwatch_growths_take_what_the_model_says(ready: World) -> None:
     assert ready.planner.status(0).growth_ms == pytest.approx(GRID.cells * 15e-6)
     assert ready.tree.named("observe") == []

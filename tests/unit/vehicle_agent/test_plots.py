@@ -7,9 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS, GridSpec
 from swarm.right_of_way.plots import MOST_PLOTS_AN_AGENT, Plots, fitting_regions
+from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Known, KnownRequest
 from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
 
@@ -62,7 +64,7 @@ def test_a_guest_is_told_how_large_plots_are() -> None:
     assert (known.agents, known.plot_cells) == (AGENTS, WIDE)
 
 
-@pytest.mark.parametrize("used", [{"lives": [5]}, {"noted": {"a1": 7}}, {"noted_by": ["a1"]}])
+@pytest.mark.parametrize("used", [{"noted": {"a1": 7}}, {"noted_by": ["a1"]}])
 def test_promises_of_plots_of_another_size_are_refused_with_what_to_do(used: dict[str, object]) -> None:
     own = OwnRecord(disk=1, **used)  # type: ignore[arg-type]
     assert rights(own, REGION_CELLS).own is own
@@ -71,3 +73,9 @@ def test_promises_of_plots_of_another_size_are_refused_with_what_to_do(used: dic
     ):
         rights(own)
     assert rights(replace(own, plot_cells=WIDE)).own.plot_cells == WIDE
+
+
+def test_every_process_says_how_large_plots_are() -> None:
+    scenario = parse_scenario("[[targets]]\n[[groups]]\n[map]\nplot_regions = 3\n")
+    info = RoleSetup(scenario, "r", "planner", "t0", 1, 0).info(GRID, "digest")
+    assert info.plot_cells == 3 * REGION_CELLS
