@@ -59,7 +59,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     cell_costs.changed_cells,
     route_walk.drive_rests,
     lower_bounds.bound_costs,
-    cell_costs.cell_cost_range,
+    cell_costs.block_ranges,
     cell_costs.count_classes,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
