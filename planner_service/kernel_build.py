@@ -31,6 +31,7 @@ from planner_service.kernels import (
     lower_bounds,
     mend,
     parents,
+    pieces_changes,
     pieces_labels,
     pieces_mend,
     pieces_totals,
@@ -59,7 +60,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     cell_costs.changed_cells,
     route_walk.drive_rests,
     lower_bounds.bound_costs,
-    cell_costs.cell_cost_range,
+    cell_costs.block_ranges,
     cell_costs.count_classes,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
@@ -81,9 +82,9 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     pieces_mend.mend_tiles,
     pieces_labels.relabel_tiles,
     pieces_totals.add_up,
-    pieces_mend.cut_ways,
-    pieces_mend.merge_parents,
-    pieces_mend.drop_lost,
+    pieces_changes.cut_ways,
+    pieces_changes.merge_parents,
+    pieces_changes.drop_lost,
     pieces_totals.costs_at,
     arrivals.arrivals,
 )

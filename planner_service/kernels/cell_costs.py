@@ -22,6 +22,8 @@ CHEAPEST_S, DEAREST_S = np.float32(2.0**-40), np.float32(2.0**40)
 quotient of two costs, leaves float32."""
 _INF_BITS = np.int32(0x7F800000)
 _ONE = np.uint64(1)
+BLOCK = 1 << 10
+"""Cells of a block, whose range is kept."""
 
 
 @helper
@@ -55,13 +57,11 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
 
     pace           none of the window is NaN, zero or negative
     cells, before  int64 padded cells and float32 cost before, written; both have room for the whole window
-    Returns (count of changed cells; lowest, highest finite new cell cost: inf, 0 if there is none).
+    Returns how many cells have changed.
     """
     row0, col0, row1, col1 = box
     resolution, extra = np.float32(resolution), np.float32(extra)
     count = 0
-    lowest = INF
-    highest = np.float32(0.0)
     for row in range(row0, row1):
         base = (row + 1) * stride + 1
         for col in range(col0, col1):
@@ -72,9 +72,7 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
                 before[count] = old
                 count += 1
                 cell_cost[base + col] = new
-                lowest = min(lowest, new)
-                highest = max(highest, new if new < INF else highest)
-    return count, lowest, highest
+    return count
 
 
 @kernel("(i4[::1], i8[::1])")
@@ -84,25 +82,31 @@ def count_classes(bits, counts):
         counts[np.uint64(bits[i] >> 20)] += 1
 
 
-@kernel("(i4[::1],)")
-def cell_cost_range(bits):
-    """(lowest, highest finite, highest) cell cost, as bits; the first two those of (inf, 0) if all cells are
-    lethal."""
-    lowest = _INF_BITS
-    highest = np.int32(0)
-    last = np.int32(0)
-    for i in range(bits.size):
-        c = bits[i]
-        lowest = min(lowest, c)
-        highest = max(highest, c if c < _INF_BITS else np.int32(0))
-        last = max(last, c)
-    return lowest, highest, last
+@kernel("(i4[::1], i8[::1], i4[:, ::1])")
+def block_ranges(bits, which, ranges):
+    """ranges := (lowest, highest finite, highest) cell cost of blocks, as bits; the first two those of (inf, 0)
+    where all cells are lethal.
+
+    which   int64, of the blocks of `BLOCK` cells those that are looked at
+    ranges  int32 (3, n), of all blocks
+    """
+    for j in range(which.size):
+        lowest = _INF_BITS
+        highest = np.int32(0)
+        last = np.int32(0)
+        begin = np.uint64(which[j] * BLOCK)
+        for i in range(begin, min(begin + np.uint64(BLOCK), np.uint64(bits.size))):
+            c = bits[i]
+            lowest = min(lowest, c)
+            highest = max(highest, c if c < _INF_BITS else np.int32(0))
+            last = max(last, c)
+        ranges[0, which[j]], ranges[1, which[j]], ranges[2, which[j]] = lowest, highest, last
 
 
 @kernel(f"(i4[::1], i8, {BOX}, i4[::1])")
 def cut_window(cell_cost_bits, stride, box, part_bits):
-    """part := the cell costs of a window, behind a lethal border. Returns the first two of their
-    `cell_cost_range`."""
+    """part := the cell costs of a window, behind a lethal border. Returns the lowest and the highest finite one, as
+    bits; those of (inf, 0) if all are lethal."""
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
     lowest = _INF_BITS

@@ -16,21 +16,27 @@ Arrays, beside those of `layout`; tiles are numbered row by row, `across` in a r
     rim      float64  (n * ROOM,)   s; from each cell on the border of a tile to its piece's exit, by the name that
                                     a piece has whose exit it is. What cells inside cost follows from the parents
     total    float64  (n * ROOM, 4) s; of each piece, ROOM names a tile: TOTAL, from its exit to the root, inf of
-                                    NO_PIECE and where there is no way; BEFORE, what that was by the last
-                                    evaluation; LENGTH, from its exit to the next piece's
+                                    NO_PIECE and where there is no way; BEFORE, what that was before the last
+                                    evaluation that has changed a total of its tile, and where it had no way, less
+                                    than 0, what it was when it had one; LENGTH, from its exit to the next piece's
     hook     int32    (n * ROOM, 8) the same memory, for what of a piece is used together to lie together: HOOK, the
                                     piece that its exit leads into, -1 at the root; STAMP, the evaluation by which
                                     TOTAL is right
     exits    uint8    (n * ROOM,)   names of the pieces that a tile has, as many as `many` says
     many     int32    (n,)
     span     float64  (n,)          s; no cell of a tile costs more inside it
-    wanted   uint8    (n,)          LOOK, REHOOK or both: what is to be done to a tile before the tree is right
-                                    again
-    falls    float64  (3, n)        s; the least and the greatest change of a piece's total in the last evaluation,
-                                    and how much less a cell may be offered by all changes since its tile was looked
-                                    at
+    wanted   uint8    (n,)          what is to be done to a tile before the tree is right again: `LOOK` and others
+    falls    float64  (3, n)        s; the least and the greatest change of a piece's total while these are noted,
+                                    else 0, or inf and -inf where there is no piece; and how much less a cell may be
+                                    offered by all changes since its tile was looked at
     ends     float64  (2, n)        s; the least and the greatest total of a tile; inf and 0 if there is none
+
+While a tree is mended, tiles are taken in an order:
+    order    int64    (n,)          all tiles, those nearest the root first
+    place    int64    (n,)          where in the order each tile is
     stack    int32    (n * ROOM,)   scratch
+    sets     uint8    (6, m)        whether a tile is in `HOOKS` and others, by its place; m is n or a few more
+    words    int64    (6, m / 8)    the same memory, so that what is empty is passed over by eight
 
 A tile is worked on with one cell around, WIDE ** 2 cells that are called its bench, which is scratch:
     names    int16    (ROOM,)       of each name, the cell of a tile
@@ -48,6 +54,7 @@ A tile is worked on with one cell around, WIDE ** 2 cells that are called its be
     code     uint8    (WIDE ** 2,)  parents; NONE around the tile
     name     uint8    (WIDE ** 2,)  pieces
     around   int64    (8,)          what each direction adds to a cell of these arrays
+    changes  float64  (16,)         s; different changes of totals of a tile
 """
 
 from __future__ import annotations
@@ -71,7 +78,14 @@ HOOK, STAMP = 6, 7
 ROOT_PIECE = np.uint8(252)
 NO_PIECE = np.uint8(255)
 
-LOOK, REHOOK = np.uint8(1), np.uint8(2)
+LOOK, REHOOK, LED, LOST, SEEK, BLIND, FOUND = (np.uint8(1 << bit) for bit in range(7))
+"""What is wanted or known of a tile: it is to be looked at; its pieces may lead elsewhere, or be longer; those of
+them may that lead into a tile with `REHOOK`; it has pieces without a way; it is to be looked at as long as it has;
+it was looked at while it or a tile about it had; a piece of it has found a way, which is said while changes are
+noted."""
+HOOKS, WAITS, CHANGED, NOTED, NEAR, TODO = range(6)
+"""Sets of tiles: whose pieces may lead elsewhere; whose totals are to be added up; whose totals have changed; have,
+and are so noted; about which something has changed; which are to be looked at."""
 DEARER, ALTERED = np.uint8(1), np.uint8(2)
 """What has changed in a tile: cells got dearer, or lost their way; or anything else, perhaps that too."""
 FINEST = 2.0**-46
@@ -110,18 +124,29 @@ Bench = tuple[
     NDArray[np.int32],
     NDArray[np.int32],
     NDArray[np.int32],
+    NDArray[np.float64],
 ]
-"""(names, cost, own, inner, less, queue, keys, code, name, around, kept, place, holder, spot)."""
+"""(names, cost, own, inner, less, queue, keys, code, name, around, kept, place, holder, spot, changes)."""
 
-Turns = tuple[NDArray[np.int64], NDArray[np.float64], int, NDArray[np.int32], NDArray[np.uint8]]
-"""(order, turn, now, stack, todo)."""
+Sets = tuple[NDArray[np.uint8], NDArray[np.int64]]
+"""(sets, words)."""
+Turns = tuple[
+    NDArray[np.int64],
+    NDArray[np.int64],
+    NDArray[np.float64],
+    int,
+    NDArray[np.int32],
+    NDArray[np.uint8],
+    NDArray[np.int64],
+]
+"""(order, place, turn, now, stack, sets, words)."""
 
 LABELLED = "Tuple((u1[::1], u1[::1], f8[::1], i8))"
 PIECES = "Tuple((f8[:, ::1], i4[:, ::1]))"
-TURNS = "Tuple((i8[::1], f8[::1], i4, i4[::1], u1[::1]))"
+TURNS = "Tuple((i8[::1], i8[::1], f8[::1], i4, i4[::1], u1[:, ::1], i8[:, ::1]))"
 TILES = "Tuple((u1[::1], i4[::1], f8[::1], u1[::1], f8[:, ::1], f8[:, ::1], i8))"
 _SCRATCH = "i2[::1], f8[::1], f8[::1], f8[::1], i4[::1], i4[::1], f4[::1], u1[::1], u1[::1], i8[::1]"
-BENCH = f"Tuple(({_SCRATCH}, f8[::1], i4[::1], i4[::1], i4[::1]))"
+BENCH = f"Tuple(({_SCRATCH}, f8[::1], i4[::1], i4[::1], i4[::1], f8[::1]))"
 
 
 def make_bench(tiles: int, most: int) -> Bench:
@@ -139,8 +164,15 @@ def make_bench(tiles: int, most: int) -> Bench:
             np.full(tiles, -1, np.int32),
             np.append(np.full(places, -1), 0).astype(np.int32),
             np.full(size, -1, np.int32),
+            np.zeros(16),
         ),
     )
+
+
+def make_sets(tiles: int) -> Sets:
+    """(sets, words) of so many tiles, all empty."""
+    words = np.zeros((6, -(-tiles // 8)), np.int64)
+    return words.view(np.uint8), words
 
 
 def make_pieces(tiles: int) -> Pieces:
@@ -203,3 +235,26 @@ def where_to(across, t, cell, code):
     down, right = moved(code)
     row, col = (cell >> BITS) + down, (cell & INSIDE) + right
     return t + (row >> BITS) * across + (col >> BITS), ((row & INSIDE) << BITS) + (col & INSIDE)
+
+
+@helper
+def following(which, n, sets, words):
+    """The first place from `n` on that is in a set, or one beyond all."""
+    while n < sets.shape[1]:
+        if n & 7 == 0 and words[which, n >> 3] == 0:
+            n += 8
+        elif sets[which, n]:
+            return n
+        else:
+            n += 1
+    return n
+
+
+@helper
+def put_about(which, t, across, place, sets):
+    """Put a tile and those about it into a set."""
+    row, col = t // across, t % across
+    down = place.size // across
+    for i in range(max(row - 1, 0), min(row + 2, down)):
+        for j in range(max(col - 1, 0), min(col + 2, across)):
+            sets[which, place[i * across + j]] = 1

@@ -12,6 +12,7 @@ from planner_service.kernels.pieces import (
     CELLS,
     DEARER,
     LABELLED,
+    LED,
     LOOK,
     NO_PIECE,
     REHOOK,
@@ -199,5 +200,5 @@ def relabel_tiles(grid, labels, tiles, bench, which, changed):
     for i in range(which.size):
         t = which[i]
         relabel_tile(t, grid, labels, tiles, bench)
-        want(tiles, t, REHOOK if changed[t] == DEARER else LOOK | REHOOK)
-        wanted[t] |= LOOK
+        want(tiles, t, LED if changed[t] == DEARER else LOOK | LED)
+        wanted[t] |= LOOK | REHOOK

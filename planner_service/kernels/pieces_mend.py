@@ -1,9 +1,9 @@
-"""Making a tree of `pieces` optimal again: a window is taken over, tiles are looked at and mended.
+"""Making a tree of `pieces` optimal again: tiles are looked at and mended.
 
-A cell is *offered less* where a neighbour's cost and the step to it are less than what it costs. Tiles about which
-all totals have changed by the same number hold no such cell if they held none before. All others are looked at:
-with one cell around, by vectors; and cells that are offered less take it, and spread it inside the tile, by a
-label-correcting search. What that offers to cells of other tiles is left to these.
+A cell is *offered less* where a neighbour's cost and the step to it are less than what it costs. Tiles that may
+hold such a cell, which `pieces_risen` finds, are looked at: with one cell around, by vectors; and cells that are
+offered less take it, and spread it inside the tile, by a label-correcting search. What that offers to cells of
+other tiles is left to these.
 
 The invariant: **what a cell costs is at least what its parent offers**. It holds where costs are what is driven; a
 cell that takes less takes whoever offers it as its parent, so that its children are offered no more than
@@ -17,47 +17,48 @@ import numpy as np
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.heap import heap_lower, heap_pop
 from planner_service.kernels.layout import (
-    BOX,
     GRID,
     INF,
-    NONE,
     RULE_FOUR,
     RULE_OCTILE,
     SQRT2_EXACT,
 )
 from planner_service.kernels.pieces import (
-    ALTERED,
-    BEFORE,
     BENCH,
     BITS,
+    BLIND,
     CELLS,
-    DEARER,
     FINEST,
+    HOOKS,
     LABELLED,
+    LED,
     LOOK,
-    NO_PIECE,
+    LOST,
+    NEAR,
     PIECES,
     REHOOK,
     ROOM,
     ROOT_PIECE,
+    SEEK,
     SIDE,
     TILES,
+    TODO,
     TOTAL,
     TURNS,
     WIDE,
     corner_of,
+    following,
     moved,
     name_of,
-    on_bench,
+    put_about,
     step_cost,
-    tile_of,
     where_to,
 )
 from planner_service.kernels.pieces_labels import drive_tile, keep_tile
-from planner_service.kernels.pieces_totals import evaluate_totals, find_risen
+from planner_service.kernels.pieces_risen import find_risen
+from planner_service.kernels.pieces_totals import begin, evaluate_totals
 
 _ONE = np.uint64(1)
-_WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
 
 
 @helper
@@ -180,7 +181,6 @@ def _take_less(at, t, cell, grid, labels, pieces, tiles, bench, least):
         inner[at] = 0.0
     total = pieces[0]
     total[t * ROOM + name, TOTAL] = best
-    total[t * ROOM + name, BEFORE] = best
     return True
 
 
@@ -217,7 +217,7 @@ def _spread(t, grid, labels, tiles, bench, count, least):
             if rim and (down | right) & -SIDE:
                 other = t + (down >> BITS) * across + (right >> BITS)
                 # A child's tile sees that its total changes.
-                wanted[other] |= REHOOK if child else LOOK
+                wanted[other] |= LED if child else LOOK
                 continue
             cost[u] = offer
             piece[first + (down << BITS) + right] = piece[first + (row << BITS) + col]
@@ -274,151 +274,68 @@ def _mend(t, grid, labels, pieces, tiles, bench):
 
 
 @helper
-def _is_first(t, turn, todo, across):
+def _is_first(t, across, turns):
     """Whether no tile about this one, of those to be looked at, has an earlier turn."""
+    _, place, turn, _, _, sets, _ = turns
     row, col = t // across, t % across
-    down = todo.size // across
+    down = place.size // across
     for i in range(max(row - 1, 0), min(row + 2, down)):
         for j in range(max(col - 1, 0), min(col + 2, across)):
             other = i * across + j
-            if todo[other] and turn[other] < turn[t]:
+            if turn[other] < turn[t] and sets[TODO, place[other]]:
                 return False
     return True
+
+
+@helper
+def _any_lost(t, wanted, across):
+    """Whether a piece of a tile, or of those about it, has no way."""
+    row, col = t // across, t % across
+    down = wanted.size // across
+    what = np.uint8(0)
+    for i in range(max(row - 1, 0), min(row + 2, down)):
+        for j in range(max(col - 1, 0), min(col + 2, across)):
+            what |= wanted[i * across + j]
+    return what & LOST != 0
 
 
 @kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {TURNS}, f8)")
 def mend_tiles(grid, labels, pieces, tiles, bench, turns, most):
     """Evaluate totals, look at tiles and mend them, until the tree is optimal or `most` tiles have been looked at;
-    one that was mended counts three times. Returns (tiles looked at, mended, rounds, left to be looked at).
+    one that was mended counts three times. Returns (tiles looked at, mended, rounds, whether some are left to be
+    looked at).
 
-    turns  (order, turn, now, stack, todo):
+    turns  (order, place, turn, now, stack, sets, words):
            order  int64 (n,), all tiles, those nearest the root first
            turn   float64 (n,): of tiles beside each other the one with the least is looked at first, and totals are
                   evaluated before the other is. All alike, all are looked at in each round
            now    of `evaluate_totals`, the first time
-           todo   uint8 (n,), scratch
     """
-    order, turn, now, stack, todo = turns
     wanted, falls, across = tiles[3], tiles[4], tiles[6]
+    order, place, _, now, _, sets, words = turns
     looked = mended = rounds = 0
-    evaluate_totals(grid, labels, pieces, tiles, bench[0], order, now, stack)
+    begin(tiles, turns)
+    evaluate_totals(grid, labels, pieces, tiles, bench[0], turns, now)
     while True:
         rounds += 1
-        count = np.int64(find_risen(pieces, tiles, todo))
-        if count == 0 or looked + 2 * mended > most:
-            return looked, mended, rounds, count
-        for n in range(order.size):
+        find_risen(labels, pieces, tiles, bench, turns)
+        n = following(TODO, 0, sets, words)
+        if n >= order.size or looked + 2 * mended > most:
+            return looked, mended, rounds, n < order.size
+        while n < order.size:
             t = order[n]
-            if not todo[t] or not _is_first(t, turn, todo, across):
-                continue
-            looked += 1
-            wanted[t] &= ~LOOK
-            falls[2, t] = 0.0
-            if _mend(t, grid, labels, pieces, tiles, bench):
-                # Until totals are evaluated its own are what its exits were offered, and those of others too high.
-                wanted[t] |= REHOOK
-                mended += 1
-        evaluate_totals(grid, labels, pieces, tiles, bench[0], order, np.int32(0), stack)
-
-
-@helper
-def _merge_tile(t, grid, labels, total, across, window, inner, old_root, changed):
-    """`merge_parents` in one tile, which is on the bench."""
-    stride = grid[2]
-    parent, piece, _, root = labels
-    part, part_parent, box, way = window
-    row0, col0, row1, col1 = box
-    width = col1 - col0 + 2
-    top, left = t // across * SIDE, t % across * SIDE
-    for row in range(max(row0, top), min(row1, top + SIDE)):
-        for col in range(max(col0, left), min(col1, left + SIDE)):
-            i = (row - row0 + 1) * width + col - col0 + 1
-            if not part[i] < INF:
-                continue
-            v = (row + 1) * stride + col + 1
-            cell = ((row - top) << BITS) + col - left
-            cost = total[t * ROOM + np.int64(piece[t * CELLS + cell]), TOTAL] + inner[on_bench(cell)]
-            code = NONE if v == root else part_parent[i]
-            if (part[i] < cost + way or v == old_root) and parent[v] != code:
-                parent[v] = code
-                changed[t] = ALTERED
-
-
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {_WINDOW}, i8, u1[::1])")
-def merge_parents(grid, labels, pieces, tiles, bench, window, old_root, changed):
-    """Take the parents of a window that was grown around a new root (`labels`), where its costs are less than the
-    tree's and the way from the old root to the new one.
-
-    window   (part, part_parent, box, way): its costs and parents, and the way between the roots, s
-    changed  uint8 (n,), set to ALTERED for tiles in which a parent has changed
-    Costs stay what they are until totals are evaluated. There is no cycle: with the lesser of the two costs, every
-    cell's parent has a lower one.
-    """
-    across = tiles[6]
-    row0, col0, row1, col1 = window[2]
-    for row in range(row0 >> BITS, ((row1 - 1) >> BITS) + 1):
-        for col in range(col0 >> BITS, ((col1 - 1) >> BITS) + 1):
-            t = row * across + col
-            drive_tile(t, grid, labels, tiles, bench)
-            _merge_tile(t, grid, labels, pieces[0], across, window, bench[3], old_root, changed)
-    for v in (labels[3], old_root):
-        t, _ = tile_of(v, grid[2], across)
-        changed[t] = ALTERED
-
-
-@kernel(f"({GRID}, {LABELLED}, i8, i8[::1], f4[::1], u1[::1])")
-def cut_ways(grid, labels, across, cells, before, changed):
-    """Cells that became lethal, and those whose step they forbid, lose their parent.
-
-    cells, before  padded cells whose cost changed, and their cell cost before, s
-    changed        uint8 (n,), DEARER or ALTERED for tiles of cells that step into one of these, or are one
-    """
-    cell_cost, offsets, stride, _, corners = grid
-    parent = labels[0]
-    for j in range(cells.size):
-        x = cells[j]
-        t, _ = tile_of(x, stride, across)
-        what = DEARER if cell_cost[x] > before[j] else ALTERED
-        changed[t] |= what
-        lethal = not cell_cost[x] < INF and before[j] < INF
-        if lethal:
-            parent[x] = NONE
-        for code in range(8):
-            v = x + offsets[code]
-            way = parent[v]
-            if way == NONE:
-                continue
-            into = way == (code + 4) & 7
-            squeezed = lethal and not corners and way & 1
-            squeezed = squeezed and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
-            if into or squeezed:
-                t, _ = tile_of(v, stride, across)
-                changed[t] |= what
-                if lethal:
-                    parent[v] = NONE
-
-
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i8[::1])")
-def drop_lost(grid, labels, pieces, tiles, which):
-    """Cells of these tiles that have no way lose their parent, and pieces that lead nowhere go."""
-    _, _, stride, _, _ = grid
-    parent, piece, _, root = labels
-    total = pieces[0]
-    exits, many, _, _, _, _, across = tiles
-    for n in range(which.size):
-        t = which[n]
-        origin, rows, cols = corner_of(grid, across, t)
-        for row in range(rows):
-            for col in range(cols):
-                i = t * CELLS + (row << BITS) + col
-                v = origin + row * stride + col
-                if not total[t * ROOM + np.int64(piece[i]), TOTAL] < np.inf and v != root:
-                    parent[v] = NONE
-                    piece[i] = NO_PIECE
-        count = 0
-        for j in range(many[t]):
-            name = np.int64(exits[t * ROOM + j])
-            if total[t * ROOM + name, TOTAL] < np.inf:
-                exits[t * ROOM + count] = name
-                count += 1
-        many[t] = count
+            if _is_first(t, across, turns):
+                looked += 1
+                wanted[t] &= ~(LOOK | SEEK | BLIND)
+                wanted[t] |= BLIND if _any_lost(t, wanted, across) else np.uint8(0)
+                falls[2, t] = 0.0
+                sets[NEAR, n] = 1
+                if _mend(t, grid, labels, pieces, tiles, bench):
+                    # Until totals are evaluated its own are what its exits were offered, and those of others too
+                    # high.
+                    wanted[t] |= REHOOK
+                    put_about(HOOKS, t, across, place, sets)
+                    put_about(NEAR, t, across, place, sets)
+                    mended += 1
+            n = following(TODO, n + 1, sets, words)
+        evaluate_totals(grid, labels, pieces, tiles, bench[0], turns, np.int32(0))

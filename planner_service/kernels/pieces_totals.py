@@ -11,82 +11,133 @@ from planner_service.kernels.pieces import (
     BENCH,
     BITS,
     CELLS,
-    FINEST,
+    CHANGED,
     HOOK,
+    HOOKS,
     INSIDE,
     LABELLED,
+    LED,
     LENGTH,
     LOOK,
+    NEAR,
+    NOTED,
     PIECES,
     REHOOK,
     ROOM,
     ROOT_PIECE,
+    SEEK,
     SIDE,
     STAMP,
     TILES,
+    TODO,
     TOTAL,
     TURNS,
+    WAITS,
     corner_of,
+    following,
     moved,
     name_of,
+    put_about,
     step_cost,
     tile_of,
     where_to,
 )
-from planner_service.kernels.pieces_labels import want
-
-_WAITS, _CHANGED = np.uint8(4), np.uint8(8)
-"""What is to be done to a tile, beside `LOOK` and `REHOOK`, while totals are added up."""
-_DRIFT = 4.0
-"""How many times that a tile's totals may come apart before it is looked at."""
+from planner_service.kernels.pieces_risen import find_risen, note_changes
+from planner_service.kernels.prefetch import prefetch
 
 
 @helper
-def _hook_tile(t, grid, labels, pieces, tiles, names):
-    """Write where the pieces of a tile lead, and how far that is."""
+def _forget(total, y):
+    """Changes of a piece's total are reckoned from now on."""
+    cost, before = total[y, TOTAL], total[y, BEFORE]
+    total[y, BEFORE] = cost if cost < np.inf else (-abs(before) if before < np.inf else np.inf)
+
+
+@helper
+def _forget_all(t, total, exits, many):
+    """Changes of a tile's totals are reckoned from now on."""
+    for j in range(many[t]):
+        _forget(total, t * ROOM + np.int64(exits[t * ROOM + j]))
+
+
+@helper
+def _hook(t, name, grid, labels, pieces, across, names):
+    """Write where a piece leads, and how far that is."""
     cell_cost, offsets, stride, rule, _ = grid
     parent, piece, rim, _ = labels
     total, hook = pieces
-    exits, many, _, _, _, _, across = tiles
+    y = t * ROOM + name
+    if name == ROOT_PIECE:
+        hook[y, HOOK] = -1
+        total[y, LENGTH] = 0.0
+        return
     origin, _, _ = corner_of(grid, across, t)
-    for j in range(many[t]):
-        name = np.int64(exits[t * ROOM + j])
-        y = t * ROOM + name
-        if name == ROOT_PIECE:
-            hook[y, HOOK] = -1
-            total[y, LENGTH] = 0.0
-            continue
-        cell = np.int64(names[name])
-        v = origin + (cell >> BITS) * stride + (cell & INSIDE)
-        way = np.int64(parent[v])
-        other, beside = where_to(across, t, cell, way)
-        hook[y, HOOK] = other * ROOM + np.int64(piece[other * CELLS + beside])
-        total[y, LENGTH] = rim[other * ROOM + name_of(beside)] + step_cost(rule, cell_cost[v + offsets[way]], way)
+    cell = np.int64(names[name])
+    v = origin + (cell >> BITS) * stride + (cell & INSIDE)
+    way = np.int64(parent[v])
+    other, beside = where_to(across, t, cell, way)
+    hook[y, HOOK] = other * ROOM + np.int64(piece[other * CELLS + beside])
+    total[y, LENGTH] = rim[other * ROOM + name_of(beside)] + step_cost(rule, cell_cost[v + offsets[way]], way)
 
 
 @helper
-def _add_up(t, pieces, tiles):
-    """Totals of a tile := what its exits are offered. Returns whether one has changed."""
+def _hook_all(grid, labels, pieces, tiles, names, turns):
+    """Hook the pieces of tiles of `HOOKS` whose parents have changed, and those that lead there."""
     total, hook = pieces
-    exits, many = tiles[0], tiles[1]
+    exits, many, _, wanted, _, _, across = tiles
+    order, _, _, _, _, sets, words = turns
+    n = following(HOOKS, 0, sets, words)
+    while n < order.size:
+        t = order[n]
+        anew = wanted[t] & REHOOK != 0
+        if anew:
+            sets[WAITS, n] = sets[CHANGED, n] = 1
+            _forget_all(t, total, exits, many)
+        for j in range(many[t] if wanted[t] & (REHOOK | LED) else 0):
+            name = np.int64(exits[t * ROOM + j])
+            y = t * ROOM + name
+            if anew or (hook[y, HOOK] >= 0 and wanted[hook[y, HOOK] // ROOM] & REHOOK):
+                _hook(t, name, grid, labels, pieces, across, names)
+                sets[WAITS, n] = 1
+        n = following(HOOKS, n + 1, sets, words)
+    n = following(HOOKS, 0, sets, words)
+    while n < order.size:
+        sets[HOOKS, n] = 0
+        wanted[order[n]] &= ~(REHOOK | LED)
+        n = following(HOOKS, n + 1, sets, words)
+
+
+@helper
+def _add_up(t, pieces, exits, many, first):
+    """Totals of a tile := what its exits are offered. Returns whether one has changed. `first`: none of them has
+    before in this evaluation."""
+    total, hook = pieces
     changed = False
     for j in range(many[t]):
         y = t * ROOM + np.int64(exits[t * ROOM + j])
         next = np.int64(hook[y, HOOK])
         cost = total[y, LENGTH] + (total[next, TOTAL] if next >= 0 else 0.0)
-        changed |= cost != total[y, TOTAL]
-        total[y, TOTAL] = cost
+        if cost != total[y, TOTAL]:
+            if first and not changed:
+                _forget_all(t, total, exits, many)
+            changed = True
+            total[y, TOTAL] = cost
     return changed
 
 
 @helper
-def _add_up_all(pieces, tiles, order, now, stack):
+def _add_up_all(pieces, tiles, turns):
     """The same for all tiles, each piece after the one that it leads into."""
     total, hook = pieces
-    exits, many, _, wanted, _, _, _ = tiles
+    exits, many = tiles[0], tiles[1]
+    order, _, _, now, stack, sets, _ = turns
     for n in range(order.size):
         t = order[n]
-        wanted[t] = (wanted[t] & LOOK) | _CHANGED
+        next = order[min(n + 1, order.size - 1)]
+        for j in range(many[next]):
+            prefetch(total, (next * ROOM + np.int64(exits[next * ROOM + j])) * 4)
+        sets[WAITS, n] = sets[CHANGED, n] = 0
+        sets[NOTED, n] = sets[NEAR, n] = 1
         for j in range(many[t]):
             y = t * ROOM + np.int64(exits[t * ROOM + j])
             steps = 0
@@ -98,102 +149,57 @@ def _add_up_all(pieces, tiles, order, now, stack):
             for i in range(steps - 1, -1, -1):
                 y = np.int64(stack[i])
                 cost += total[y, LENGTH]
+                _forget(total, y)
                 total[y, TOTAL] = cost
                 hook[y, STAMP] = now
+        note_changes(t, pieces, tiles)
 
 
 @helper
-def _note_changes(t, pieces, tiles):
-    """Write `falls` and `ends` of a tile whose totals have changed."""
-    total = pieces[0]
-    exits, many, _, _, falls, ends, _ = tiles
-    least, most, near, far = np.inf, -np.inf, np.inf, 0.0
-    for j in range(many[t]):
-        y = t * ROOM + np.int64(exits[t * ROOM + j])
-        cost = total[y, TOTAL]
-        change = 0.0
-        if cost < np.inf or total[y, BEFORE] < np.inf:
-            change = cost - total[y, BEFORE]
-        total[y, BEFORE] = cost
-        least = min(least, change)
-        most = max(most, change)
-        near = min(near, cost)
-        far = max(far, cost)
-    falls[0, t] = least
-    falls[1, t] = most
-    ends[0, t] = near
-    ends[1, t] = far
+def evaluate_totals(grid, labels, pieces, tiles, names, turns, now):
+    """Totals := what is driven from each exit to the root, after what has changed about tiles of `HOOKS`.
 
-
-@helper
-def evaluate_totals(grid, labels, pieces, tiles, names, order, now, stack):
-    """Totals := what is driven from each exit to the root.
-
-    order  all tiles, those nearest the root first
     now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
-    If not, tiles about one whose totals have changed are added up, sweep by sweep. That takes a tenth of the time
-    where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way it ends, as
-    no piece leads to itself.
+    If not, tiles about one whose totals have changed are added up, those nearest the root first. That takes a tenth
+    of the time where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way
+    it ends, as no piece leads to itself.
     """
-    many, wanted = tiles[1], tiles[3]
-    for t in range(many.size):
-        if wanted[t] & REHOOK:
-            _hook_tile(t, grid, labels, pieces, tiles, names)
-            wanted[t] = (wanted[t] & ~REHOOK) | _WAITS | _CHANGED
+    across = tiles[6]
+    order, place, _, _, _, sets, words = turns
+    _hook_all(grid, labels, pieces, tiles, names, turns)
     if now:
-        _add_up_all(pieces, tiles, order, now, stack)
-    again = not now
-    while again:
-        again = False
-        for n in range(order.size):
-            t = order[n]
-            if not wanted[t] & _WAITS:
-                continue
-            wanted[t] &= ~_WAITS
-            if _add_up(t, pieces, tiles):
-                wanted[t] |= _CHANGED
-                want(tiles, t, _WAITS)
-                wanted[t] &= ~_WAITS
-                again = True
+        _add_up_all(pieces, tiles, turns)
+    n = following(WAITS, 0, sets, words)
+    while n < order.size:
+        sets[WAITS, n] = 0
+        if _add_up(order[n], pieces, tiles[0], tiles[1], not sets[CHANGED, n]):
+            sets[CHANGED, n] = 1
+            put_about(WAITS, order[n], across, place, sets)
+            sets[WAITS, n] = 0
+        n = following(WAITS, n + 1, sets, words)
+        if n >= order.size:
+            n = following(WAITS, 0, sets, words)
 
 
 @helper
-def find_risen(pieces, tiles, todo):
-    """Returns how many tiles are to be looked at, and writes 1 to `todo` for these, 0 for others: where it is
-    wanted, and where totals have risen by more than others about them since this was last called."""
-    _, many, _, wanted, falls, ends, across = tiles
-    down = many.size // across
-    for t in range(many.size):
-        falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
-        if wanted[t] & _CHANGED:
-            wanted[t] &= ~_CHANGED
-            _note_changes(t, pieces, tiles)
-    count = 0
-    for row in range(down):
-        for col in range(across):
-            t = row * across + col
-            least = np.inf
-            for i in range(max(row - 1, 0), min(row + 2, down)):
-                for j in range(max(col - 1, 0), min(col + 2, across)):
-                    least = min(least, falls[0, i * across + j])
-            # Its own pieces have risen by no more than those about it that offer them less.
-            if falls[1, t] > least:
-                falls[2, t] += falls[1, t] - least
-            elif least == -np.inf:
-                # It has no way, or had none: that it has not risen by more than who has got one says nothing.
-                falls[2, t] = np.inf
-            near = ends[0, t] if ends[0, t] < np.inf else 0.0
-            todo[t] = 1 if wanted[t] & LOOK or falls[2, t] > _DRIFT * FINEST * near else 0
-            count += todo[t]
-    return count
+def begin(tiles, turns):
+    """Make the sets from what is wanted of tiles."""
+    wanted, falls, across = tiles[3], tiles[4], tiles[6]
+    order, place, _, _, _, sets, _ = turns
+    for n in range(order.size):
+        t = order[n]
+        if wanted[t] & REHOOK:
+            put_about(HOOKS, t, across, place, sets)
+        sets[NEAR, n] = wanted[t] & (LOOK | SEEK) != 0 or falls[2, t] > 0.0
+        sets[TODO, n] = 0
 
 
-@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, i2[::1], {TURNS})")
-def add_up(grid, labels, pieces, tiles, names, turns):
+@kernel(f"({GRID}, {LABELLED}, {PIECES}, {TILES}, {BENCH}, {TURNS})")
+def add_up(grid, labels, pieces, tiles, bench, turns):
     """Evaluate totals, and note where they have risen."""
-    order, _, now, stack, todo = turns
-    evaluate_totals(grid, labels, pieces, tiles, names, order, now, stack)
-    find_risen(pieces, tiles, todo)
+    begin(tiles, turns)
+    evaluate_totals(grid, labels, pieces, tiles, bench[0], turns, turns[3])
+    find_risen(labels, pieces, tiles, bench, turns)
 
 
 @kernel(f"({GRID}, {LABELLED}, {PIECES}, {BENCH}, i8, i8[::1], f8[::1])")

@@ -24,7 +24,8 @@ from planner_service.kernels.layout import (
     step_offsets,
 )
 from planner_service.tree.changes import NO_CHANGES, Cells, Changes, joined
-from planner_service.tree.growth import grow_tree, range_of
+from planner_service.tree.cost_range import CostRange
+from planner_service.tree.growth import grow_tree
 from planner_service.tree.pace_checks import check_pace, said_of_bad
 from planner_service.tree.padded_climbs import padded_climbs, with_scratch
 from planner_service.tree.rounding import Rounding
@@ -110,7 +111,10 @@ class CostGrid:
         self._time_cost: Floats | None = None
         """As `time_cost`, where that is an array of its own. `load` and `share` set it, `apply` writes it."""
         self._lowest_time = math.inf
-        """s; the lowest of it, where there is one."""
+        """s; the lowest of `time_cost`."""
+        self._range = self._time_range = CostRange(_NONE)
+        """Of `cell_cost` and of `_time_cost`. `load` and `share` put others in their place, `apply` changes them:
+        those of a snapshot are not its own."""
         self._offsets = step_offsets(self.stride)
         self._shared: Floats | None = None
         """What `cell_cost` began as, where that is mapped: `share` sets it, `load` resets it."""
@@ -226,7 +230,8 @@ class CostGrid:
         if time_cost.shape != (self.size,) or time_cost.dtype != np.float32:
             raise ValueError(f"cell costs of this map are float32, {self.size} cells")
         own = private_copy(time_cost)  # kernels know arrays that may be written only
-        lowest, highest, last = range_of(own)
+        found = CostRange(own)
+        lowest, highest, last = found.lowest, found.highest, found.last
         if not (lowest >= kernels.CHEAPEST_S and highest <= kernels.DEAREST_S and last <= math.inf):
             raise ValueError(
                 f"cell costs lie between {kernels.CHEAPEST_S:.2g} s and {kernels.DEAREST_S:.2g} s or are inf; these"
@@ -280,12 +285,13 @@ class CostGrid:
         return Changes(cells, older[cells], self.cell_cost[cells])
 
     def _find_range(self) -> None:
-        self.lowest_cell_cost, self.highest_cell_cost, _ = range_of(self.cell_cost)
-        self._find_lowest_time()
+        self._range = CostRange(self.cell_cost)
+        self._time_range = self._range if self._time_cost is None else CostRange(self._time_cost)
+        self._read_range()
 
-    def _find_lowest_time(self) -> None:
-        if self._time_cost is not None:
-            self._lowest_time, _, _ = range_of(self._time_cost)
+    def _read_range(self) -> None:
+        self.lowest_cell_cost, self.highest_cell_cost = self._range.lowest, self._range.highest
+        self._lowest_time = self._time_range.lowest
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative;
@@ -295,14 +301,14 @@ class CostGrid:
         for row0, col0, row1, col1 in boxes:
             if not (pace[row0:row1, col0:col1] > 0).all():
                 raise ValueError(said_of_bad(pace, Window(row0, col0, row1, col1)))
-        was = (self.lowest_cell_cost, self.highest_cell_cost)
         found: list[Changes] = []
+        timed: list[Cells] = []
         for box in boxes:
             row0, col0, row1, col1 = box
             most = (row1 - row0) * (col1 - col0)
             cells = np.empty(most, np.int64)
             before = np.empty(most, np.float32)
-            count, lowest, highest = kernels.changed_cells(
+            count = kernels.changed_cells(
                 pace,
                 self._metres,
                 self.length_weight_s,
@@ -313,24 +319,23 @@ class CostGrid:
                 before,
             )
             if count:
-                self.lowest_cell_cost = min(self.lowest_cell_cost, float(lowest))
-                self.highest_cell_cost = max(self.highest_cell_cost, float(highest))
                 found.append(Changes(cells[:count], before[:count], self.cell_cost[cells[:count]]))
                 self._written[cells[:count] // _BLOCK] = True
             if self._time_cost is not None:
                 # A change of time may be too small to be seen in a cost that holds the price of length, too.
                 room = np.empty(most, np.int64), np.empty(most, np.float32)
-                kernels.changed_cells(pace, self._metres, 0.0, box, self.stride, self._time_cost, *room)
-        if dirty:
-            self._find_lowest_time()
+                seen = kernels.changed_cells(pace, self._metres, 0.0, box, self.stride, self._time_cost, *room)
+                timed.append(room[0][:seen])
+        if self._time_cost is not None and timed:
+            self._time_range.change(self._time_cost, np.concatenate(timed))
+            self._lowest_time = self._time_range.lowest
         if not found:
             return NO_CHANGES
         # A cell in two overlapping windows changes in the first only, so there is no repetition.
         changes = joined(found)
         self.rounding = self.rounding.after(changes)
-        if ((changes.before <= was[0]) | (changes.before == np.float32(was[1]))).any():
-            # An extreme cell is another now: look for the next, or one wrong mark would stay for good.
-            self._find_range()
+        self._range.change(self.cell_cost, changes.cells)
+        self._read_range()
         return changes
 
     def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import bucket_queue, wide_buckets
-from planner_service.kernels.cell_costs import cell_cost_range
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import TOO_FINE, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.tied_parents import untie_parents
+from planner_service.tree.cost_range import CostRange
 from planner_service.tree.directed_growth import grow_directed_costs
 from shared_map.arrays import Floats
 
@@ -54,7 +54,7 @@ def grow_tree(
         grow_directed_costs(padded, climbs, bounds, root, cost, scratch_of)
         if parent is None:
             return math.inf
-        reach = range_of(cost)[1]
+        reach = CostRange(cost).highest
     else:
         reach = _grow_alike(padded, bounds, root, cost, scratch_of)
     if parent is None:
@@ -89,9 +89,3 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
     """Two float32 numbers, given as integers of the same bits."""
     lowest, highest = struct.unpack("=2f", struct.pack("=2i", *bits))
     return lowest, highest
-
-
-def range_of(cell_cost: Floats) -> tuple[float, float, float]:
-    """(lowest, highest finite, highest) of cell costs."""
-    lowest, highest, last = cell_cost_range(cell_cost.view(np.int32))
-    return *floats_of_bits((lowest, highest)), floats_of_bits((last, last))[0]

@@ -66,10 +66,17 @@ class Chase:
         if connected and self.rng.random() < 0.2:
             self.go(far)  # two moves before the tree is made exact
         elif connected:
-            self.tree.mend()
+            self.mend()
         if not connected or not self.tree.exact:
             self.gave_way += 1
             self.grow(root)
+
+    def mend(self) -> None:
+        """A tree that has given way after a move goes on where it stopped."""
+        for _ in range(99):
+            self.tree.mend()
+            if self.tree.exact:
+                return
 
     def mark(self) -> None:
         rows, cols = self.pace.shape
@@ -84,6 +91,27 @@ class Chase:
             patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
             factor = float(self.rng.choice([0.0, 0.3, 0.7, 3.0, np.inf]))
             patch[:] = patch * np.float32(factor) if factor else random_pace(self.rng, *patch.shape, 5.0, 0.3)
+            windows.append(window)
+        if not np.isfinite(self.pace.flat[self.tree.root]):
+            self.pace.flat[self.tree.root] = 1.0
+        self.tree.repair(self.ground.apply(self.pace, windows))
+        if not self.tree.exact:
+            self.gave_way += 1
+            self.grow(self.tree.root)
+
+    def strike(self) -> None:
+        """Change dots, lines and patches all over the map: dearer, cheaper, closed, opened or all of these."""
+        rows, cols = self.pace.shape
+        kind, windows = int(self.rng.integers(5)), [self.ground.grid.around(self.tree.root, 0)]
+        other = random_pace(self.rng, rows, cols, 5.0, 0.2)
+        for _ in range(int(self.rng.choice([3, 10, 30]))):
+            row, col, long = (int(self.rng.integers(most)) for most in (rows, cols, 90))
+            high, wide = ((1, 1), (1, long), (long, 1), (6, 6))[int(self.rng.integers(4))]
+            window = Window(row, col, min(row + high, rows), min(col + wide, cols))
+            patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
+            factor = (np.inf, 1.5, 0.5, 0.0, float(self.rng.choice([np.inf, 30.0, 0.1, 0.0])))[kind]
+            fresh = other[window.row0 : window.row1, window.col0 : window.col1]
+            patch[:] = patch * np.float32(factor) if factor else fresh
             windows.append(window)
         if not np.isfinite(self.pace.flat[self.tree.root]):
             self.pace.flat[self.tree.root] = 1.0
@@ -198,6 +226,49 @@ def test_single_cells_beside_the_borders_of_tiles(seed: int) -> None:
         if not chase.tree.exact:
             chase.grow(chase.tree.root)
         chase.check()
+
+
+def struck(seeds: range, most: int) -> int:
+    """As `chases`, with trees that look at few tiles at a time or at any number."""
+    gave_way = 0
+    for seed in seeds:
+        chase = Chase(seed, most)
+        chase.tree._most = (8.0, 1e9, 1e9)[seed % 3]
+        for _ in range(8):
+            chase.strike()
+            if chase.rng.random() < 0.3:
+                chase.go(1)
+            chase.check()
+        gave_way += chase.gave_way
+    return gave_way
+
+
+def test_marks_of_every_kind_and_size() -> None:
+    """Ways are lost and found, pieces rise and fall."""
+    seeds = few(40)
+    assert struck(range(20000, 20000 + seeds), 330) < 4 * seeds
+
+
+def test_what_loses_its_way_and_has_it_again_is_looked_at_along_its_edge_only() -> None:
+    """Whatever lies behind a closed way rises by one number, and so keeps its parents."""
+    rows, cols = 640, 640
+    ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig())
+    pace = random_pace(np.random.default_rng(8), rows, cols, 3.0, 0.1)
+    root = int(np.flatnonzero(np.isfinite(pace))[0])
+    ground.load(pace)
+    tree = PieceTree(ground)
+    tree.grow(root)
+    looked = mended = 0
+    for far in (cols - 1, (rows - 1) * cols, rows * cols - 1, rows * cols // 2):
+        start = ground.pad_all(np.flatnonzero(np.isfinite(pace.reshape(-1)[: far + 1]))[-1:])
+        steps = int(ground.walk(tree.parent, ground.pad(root), start, 0, ground.cell_cost).ends[0])
+        trunk = ground.walk(tree.parent, ground.pad(root), start, steps - 60, ground.cell_cost).last
+        row, col = divmod(int(ground.unpad_all(trunk)[0]), cols)
+        pace[row, col] = np.inf
+        tree.repair(ground.apply(pace, [Window(row, col, row + 1, col + 1)]))
+        assert tree.exact
+        looked, mended = looked + tree.work[0], mended + tree.work[1]
+    assert looked < 2 * mended
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 
+from planner_service.kernels.cell_costs import block_ranges
 from planner_service.target_tree import TargetTree
+from planner_service.tree import cost_range
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -31,6 +35,28 @@ def test_the_range_of_cell_costs_is_that_of_the_map_after_any_changes() -> None:
         grid.apply(pace, [GRID.window])
         finite = pace[np.isfinite(pace)] * np.float32(10)
         assert (grid.lowest_cell_cost, grid.highest_cell_cost) == (float(finite.min()), float(finite.max()))
+
+
+@pytest.mark.parametrize("length_weight", [0.0, 0.5])
+def test_a_change_of_an_extreme_cell_passes_over_its_own_blocks_only(length_weight: float) -> None:
+    grid, pace = CostGrid(GRID, PlannerConfig(length_weight=length_weight)), hills()
+    grid.load(pace)
+    looked = []
+
+    def look(bits: np.ndarray, which: np.ndarray, ranges: np.ndarray) -> None:
+        looked.append(which.size)
+        block_ranges(bits, which, ranges)
+
+    where = np.unravel_index([np.argmin(pace), np.argmax(pace), 77], pace.shape)
+    pace[where] = (0.5, 0.06, np.inf)
+    windows = [Window(row, col, row + 1, col + 1) for row, col in np.transpose(where).tolist()]
+    with mock.patch.object(cost_range, "block_ranges", look):
+        assert grid.apply(pace, windows).cells.size == 3
+    assert looked == [3] * (2 if length_weight else 1)
+    time = pace[np.isfinite(pace)] * np.float32(10)
+    cost = time + np.float32(length_weight * 10)
+    assert (grid.lowest_cell_cost, grid.highest_cell_cost) == (float(cost.min()), float(cost.max()))
+    assert grid.time_share == pytest.approx(time.min() / cost.min(), rel=1e-6)
 
 
 @pytest.mark.parametrize("strategy", ["multi_resolution", "variable_range", "auto"])
