@@ -239,9 +239,8 @@ class MemoryBus:
         queryables = [
             queryable
             for bus in self.network.buses
-            if bus.namespace == self.namespace and self.network.connected(self, bus)
             for queryable in bus.queryables.get(topic.name, ())
-            if queryable.meets(wanted)
+            if queryable.meets(wanted) and bus.namespace == self.namespace and self.network.connected(self, bus)
         ]
         asking.waiting = set(range(len(queryables)))
         if not queryables:
