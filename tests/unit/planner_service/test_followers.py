@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+import random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from planner_service import followers as module
 from planner_service.followers import Followers
@@ -56,115 +56,92 @@ def test_a_tick_pushes_a_bounded_number_and_every_follower_in_turn(monkeypatch: 
     assert sorted(pushed) == sorted(f"v{n}" for n in range(10))
 
 
-places = st.tuples(st.integers(0, 19), st.integers(0, 29))
-
-
-@st.composite
-def routes(draw: st.DrawFn) -> Route:
+def random_route(chance: random.Random) -> Route:
     """A route of any steps, which stays on the grid; it may turn back and cross itself."""
-    row, col = draw(places)
+    row, col = chance.randrange(GRID.rows), chance.randrange(GRID.cols)
     start, directions = GRID.cell(row, col), []
-    for direction in draw(st.lists(st.integers(0, 7), max_size=25)):
+    mostly = chance.randrange(8)
+    for _ in range(chance.randrange(20)):
+        direction = (mostly + chance.choice((0, 0, 0, 1, -1, 4))) % 8
         if GRID.inside(row + STEP_ROW[direction], col + STEP_COL[direction]):
             row, col = row + STEP_ROW[direction], col + STEP_COL[direction]
             directions.append(direction)
-    if not draw(st.integers(0, 4)):
+    if chance.random() < 0.2:
         return Route(status=RouteStatus.UNREACHABLE, start=start)
-    return Route(
-        status=RouteStatus.OK,
-        start=start,
-        directions=bytes(directions),
-        cost_s=1.0,
-        lower_bound_s=1.0,
-        length_m=1.0,
-    )
+    return Route(status=RouteStatus.OK, start=start, directions=bytes(directions), cost_s=1.0, lower_bound_s=1.0)
 
 
-@st.composite
-def windows(draw: st.DrawFn) -> list[Window]:
-    corners = draw(st.lists(st.tuples(places, st.integers(1, 4), st.integers(1, 4)), max_size=3))
-    return [Window(row, col, min(row + rows, 20), min(col + cols, 30)) for (row, col), rows, cols in corners]
+def random_windows(chance: random.Random) -> list[Window]:
+    corners = [(chance.randrange(GRID.rows), chance.randrange(GRID.cols)) for _ in range(chance.randrange(3))]
+    return [Window(row, col, row + chance.randint(1, 3), col + chance.randint(1, 3)) for row, col in corners]
 
 
 def crossed(route: Route, changed: list[Window]) -> bool:
-    """As `Followers` has it, cell by cell."""
+    """Whether a route passes windows or next to them, cell by cell."""
     if route.status is not RouteStatus.OK:
         return False
     on_route = [divmod(cell, GRID.cols) for cell in walk(GRID, route.start, route.directions)]
-    return any(
-        Window(w.row0 - 1, w.col0 - 1, w.row1 + 1, w.col1 + 1).contains(*place)
-        for w in changed
-        for place in on_route
-    )
+    wider = [Window(each.row0 - 1, each.col0 - 1, each.row1 + 1, each.col1 + 1) for each in changed]
+    return any(window.contains(*place) for window in wider for place in on_route)
 
 
-class FollowersMachine(RuleBasedStateMachine):
-    """Whom a change concerns, whoever comes, goes and is given another route, is what looking at every cell of
-    every route finds."""
+@pytest.mark.parametrize("seed", range(5))
+def test_whom_a_change_concerns_is_what_looking_at_every_cell_of_every_route_finds(seed: int) -> None:
+    """Whoever comes, goes and is given another route meanwhile."""
+    chance = random.Random(f"followers/{seed}")
+    followers = Followers("t", GRID, 10**9, 0)
+    has: dict[str, tuple[Route, int]] = {}
+    """Vehicle -> its route, and when it may be pushed another one."""
+    stale: set[str] = set()
+    found = 0
+    for turn in range(1500):
+        changed, now_ns = random_windows(chance), chance.randrange(4)
+        match chance.randrange(8):
+            case 0 | 1 | 2:
+                vehicle, route = chance.choice("abcdef"), random_route(chance)
+                has[vehicle] = route, chance.randrange(4)
+                followers.given(vehicle, route, 0, 0, has[vehicle][1])
+                stale.discard(vehicle)
+            case 3 if chance.random() < 0.3:
+                followers.forget_routes()
+                has = {
+                    id: (Route(status=RouteStatus.NO_TARGET, start=each.start), 0) for id, (each, _) in has.items()
+                }
+                stale = set(has)
+            case 4:
+                stay = sorted(chance.sample(sorted(has), chance.randint(0, len(has))))
+                for named in (sorted(has), stay):
+                    cells = pack_column([has[id][0].start for id in named], "<u4")
+                    followers.hear(Chasers(target="t", author="x", stamp_ns=turn, ids=named, cells=cells), 0)
+                has = {id: has[id] for id in stay}
+                stale &= set(stay)
+            case 5:
+                followers.touch(Window(0, 0, 0, 0), changed)
+                stale |= {id for id, (route, _) in has.items() if crossed(route, changed)}
+                found += len(stale)
+            case _:
+                concerned = any(crossed(route, changed) for route, push_ns in has.values() if now_ns >= push_ns)
+                assert followers.any_due_in(changed, now_ns) == concerned
+                found += concerned
+        assert {id for id, each in followers.all_items() if each.stale} == stale
+    assert found > 100
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.followers = Followers("t", GRID, 10**9, 0)
-        self.given: dict[str, tuple[Route, int]] = {}
-        """Vehicle -> its route, and when it may be pushed another one."""
-        self.stale: set[str] = set()
-        self.heard = 0
 
-    @rule(vehicle=st.sampled_from("abcde"), route=routes(), push_ns=st.integers(0, 3))
-    def give(self, vehicle: str, route: Route, push_ns: int) -> None:
-        self.followers.given(vehicle, route, 0, 0, push_ns)
-        self.given[vehicle] = route, push_ns
-        self.stale.discard(vehicle)
-
-    @rule(vehicles=st.sets(st.sampled_from("abcde")))
-    def name(self, vehicles: set[str]) -> None:
-        """Their agent says who they are: all others leave."""
-        self.heard += 1
-        ids = sorted(vehicles & self.given.keys())
-        cells = pack_column([self.given[id][0].start for id in ids], "<u4")
-        both = sorted(self.given)
-        all_cells = pack_column([self.given[id][0].start for id in both], "<u4")
-        for named, at in ((both, all_cells), (ids, cells)):
-            self.followers.hear(Chasers(target="t", author="x", stamp_ns=self.heard, ids=named, cells=at), 0)
-        self.given = {id: self.given[id] for id in ids}
-        self.stale &= set(ids)
-
-    @rule()
-    def forget(self) -> None:
-        self.followers.forget_routes()
-        self.given = {
-            id: (Route(status=RouteStatus.NO_TARGET, start=route.start), 0) for id, (route, _) in self.given.items()
-        }
-        self.stale = set(self.given)
-
-    @rule(changed=windows(), now_ns=st.integers(0, 3))
-    def ask(self, changed: list[Window], now_ns: int) -> None:
-        concerned = any(crossed(route, changed) for route, push_ns in self.given.values() if now_ns >= push_ns)
-        assert self.followers.any_due_in(changed, now_ns) == concerned
-
-    @rule(changed=windows())
-    def touch(self, changed: list[Window]) -> None:
-        self.followers.touch(Window(0, 0, 0, 0), changed)
-        self.stale |= {id for id, (route, _) in self.given.items() if crossed(route, changed)}
-        assert {id for id, each in self.followers.all_items() if each.stale} == self.stale
-
-    @rule(vehicle=st.sampled_from("abcde"), steps=st.integers(0, 25), route=routes())
-    def read(self, vehicle: str, steps: int, route: Route) -> None:
-        """Another route from a cell of the old one, or from elsewhere."""
-        if vehicle not in self.given:
-            return
-        (follower,) = [each for id, each in self.followers.all_items() if id == vehicle]
-        old = follower.route
-        if old is None or old.status is not RouteStatus.OK:
-            return
+@pytest.mark.parametrize("seed", range(5))
+def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None:
+    chance = random.Random(f"news/{seed}")
+    for _ in range(200):
+        followers, old, other = Followers("t", GRID, 10**9, 0), random_route(chance), random_route(chance)
+        followers.given("v", old, 0, 0, 0)
+        (follower,) = followers.all()
+        if old.status is not RouteStatus.OK:
+            continue
         cells = walk(GRID, old.start, old.directions)
-        first = cells.index(cells[min(steps, len(cells) - 1)])
-        rest = old.directions[first:]
-        same = RouteOutline(RouteStatus.OK, cells[first], rest, 0.0)
-        assert not self.followers.is_news(follower, same)
-        if route.start not in cells:
-            assert self.followers.is_news(follower, RouteOutline(RouteStatus.OK, route.start, rest, 0.0))
-
-
-TestFollowers = FollowersMachine.TestCase
-TestFollowers.settings = settings(deadline=None, max_examples=60, stateful_step_count=25)
+        cell = chance.choice(cells)
+        rest = old.directions[cells.index(cell) :]
+        assert not followers.is_news(follower, RouteOutline(RouteStatus.OK, cell, rest, 0.0))
+        turned = bytes((code + 1) % 8 for code in rest)
+        assert not rest or followers.is_news(follower, RouteOutline(RouteStatus.OK, cell, turned, 0.0))
+        assert other.start in cells or followers.is_news(
+            follower, RouteOutline(RouteStatus.OK, other.start, rest, 0.0)
+        )
