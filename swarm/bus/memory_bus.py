@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 from swarm.bus.bus import (
@@ -40,6 +39,7 @@ from swarm.wire.topics import Topic
 
 TOKEN_NS = 1_000_000
 """Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""
+_AT_ONCE = (0,)
 
 
 Trace = Callable[[int, str, str, str, bytes], None]
@@ -104,14 +104,13 @@ class MemoryNetwork:
             for watcher in bus.watchers:
                 watcher.compare()
 
-    def arrivals_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
-        """When each copy of a message sent now arrives; a node hears itself at once."""
-        now_ns = self.scheduler.clock.now_ns()
+    def delays_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
+        """After how long each copy of a message sent now arrives; a node hears itself at once."""
         if source is to:
-            return (now_ns,)
+            return _AT_ONCE
         if self._down and (source.node in self._down or to.node in self._down):
             return ()
-        return [now_ns + delay for delay in self.links.delays_ns(source.node, to.node, what, now_ns)]
+        return self.links.delays_ns(source.node, to.node, what, self.scheduler.clock.now_ns())
 
 
 class MemoryBus:
@@ -154,10 +153,10 @@ class MemoryBus:
         for subscription in network.subscribers(self.namespace, topic.name, named):
             if subscription.bus is self and not topic.echoed:
                 continue
-            for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
-                arrivals.setdefault(when_ns, []).append(subscription)
-        for when_ns, reached in arrivals.items():
-            network.scheduler.at(when_ns, _Arrivals(self, reached, sample))
+            for delay_ns in network.delays_ns(self, subscription.bus, topic.name):
+                arrivals.setdefault(delay_ns, []).append(subscription)
+        for delay_ns, reached in arrivals.items():
+            network.scheduler.after(delay_ns, _Arrivals(self, reached, sample))
 
     def subscribe(
         self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
@@ -251,10 +250,10 @@ class MemoryBus:
         code = code_of(self.authenticator, topic, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
             assert queryable.post is not None
-            for when_ns in self.network.arrivals_ns(self, queryable.bus, topic.name):
-                answerer = MemoryAnswerer(asking, queryable, index, when_ns)
+            for delay_ns in self.network.delays_ns(self, queryable.bus, topic.name):
+                answerer = MemoryAnswerer(asking, queryable, index, asking.began_ns + delay_ns)
                 event = Asked(topic, wanted, parsed, answerer)
-                scheduler.at(when_ns, _Delivery(self, queryable.bus, payload, code, queryable.post, event))
+                scheduler.after(delay_ns, _Delivery(self, queryable.bus, payload, code, queryable.post, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
 
     def declare_alive(self, peer: Peer) -> None:
@@ -367,12 +366,14 @@ class _Sample:
 
     def parse(self) -> None:
         payload, kind = self.payload, self.topic.message
-        with suppress(ProtocolError):
+        try:
             if self.in_json and may_be_json(payload):
                 payload = packed_json(payload, kind, self.fields)
             self.parses = Heard(self.topic, self.fields, decode(payload, kind))
             self.topic.check_key(self.fields, self.parses.message)
-            self.fits = self.parses
+        except ProtocolError:
+            return
+        self.fits = self.parses
 
 
 @dataclass(eq=False, slots=True)

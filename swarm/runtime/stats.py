@@ -178,7 +178,7 @@ class Counters:
         """Add a value to the histogram of one target or vehicle; bounded as `count_by`."""
         histograms = self.histograms_by.setdefault(name, {})
         if id in histograms or len(histograms) < MOST_IDS:
-            histograms.setdefault(id, Histogram()).add(value)
+            _named(id, histograms).add(value)
         else:
             self.count("ids_uncounted")
 
@@ -198,8 +198,16 @@ class Counters:
 
     def observe(self, name: str, value: float) -> None:
         """Add a value to a histogram."""
-        self.histograms.setdefault(name, Histogram()).add(value)
+        _named(name, self.histograms).add(value)
 
     def observe_all(self, name: str, values: NDArray[np.float64]) -> None:
         if values.size:
-            self.histograms.setdefault(name, Histogram()).add_all(values)
+            _named(name, self.histograms).add_all(values)
+
+
+def _named(name: str, histograms: dict[str, Histogram]) -> Histogram:
+    """The histogram of a name, which is there from now on."""
+    found = histograms.get(name)
+    if found is None:  # `setdefault` would make one each time
+        found = histograms[name] = Histogram()
+    return found
