@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from itertools import chain
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.grid import GridSpec, Window, bounds_of, walk
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteOutline, RouteStatus
@@ -23,8 +22,10 @@ class Follower:
 
     cell       on its path, by its agent's last report or its own request: where a new route for it begins
     route      what it was given last; None if nothing was, by this incarnation of the planner
-    cells      of that route
-    bounds     first row and column of that route and the cells next to it, and the first behind them
+    bounds     a first row and column before which that route and the cells next to it do not lie, and first ones
+               behind them
+    walked     the cells of that route; None until somebody asks for them
+    row        in the table of all bounds
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
     """
@@ -33,10 +34,19 @@ class Follower:
     max_cells: int
     heard_ns: int
     route: Route | None = None
-    cells: list[int] = field(default_factory=list)
     bounds: tuple[int, int, int, int] = _NOWHERE_BOUNDS
+    walked: list[int] | None = None
+    row: int = -1
     stale: bool = False
     push_ns: int = 0
+
+    def cells(self, grid: GridSpec) -> list[int]:
+        """Those of its route, empty without one."""
+        if self.walked is None:
+            route = self.route
+            found = route is not None and route.status is RouteStatus.OK
+            self.walked = walk(grid, route.start, route.directions) if route is not None and found else []
+        return self.walked
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +78,11 @@ class Followers:
         self._lease_ns = lease_ns
         self._max_cells = max_cells
         self._by_id: dict[str, Follower] = {}
+        self._rows: tuple[list[Follower], NDArray[np.int64]] | None = None
+        """All followers and their bounds, int64 (n, 4): a route changes every few seconds, and whose route a change
+        concerns is asked in every tick. None once somebody has come or gone."""
+        self._step = [row * grid.cols + col for row, col in zip(STEP_ROW, STEP_COL, strict=True)]
+        """What a step in each direction adds to a cell."""
         self._told: dict[str, _Told] = {}
         """Agent's name as an author -> its newest message, for the lease."""
 
@@ -96,14 +111,14 @@ class Followers:
         told = _Told(frozenset(chasers.ids), chasers.stamp_ns, now_ns)
         if before is not None:
             for id in before.ids - told.ids:
-                self._by_id.pop(id, None)
+                self._drop(id)
         elif len(self._told) >= CAPACITY:
             del self._told[next(iter(self._told))]
         self._told[chasers.author] = told
         for id, cell in zip(chasers.ids, column(chasers.cells, "<u4").tolist(), strict=True):
             follower = self._by_id.get(id)
             if cell >= self._grid.cells:
-                self._by_id.pop(id, None)
+                self._drop(id)
             elif follower is None:
                 self._register(id, Follower(cell, self._max_cells, now_ns))
             else:
@@ -121,35 +136,47 @@ class Followers:
 
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
         follower.route, follower.stale, follower.push_ns = route, False, push_ns
-        if route.status is not RouteStatus.OK:
-            follower.cells, follower.bounds = [], _NOWHERE_BOUNDS
-            return
-        cells = follower.cells = walk(self._grid, route.start, route.directions)
-        row0, col0, row1, col1 = bounds_of(cells, self._grid.cols)
-        follower.bounds = (row0 - 1, col0 - 1, row1 + 2, col1 + 2)
+        self._lies(follower, self._bounds(route) if route.status is RouteStatus.OK else _NOWHERE_BOUNDS)
+
+    def _lies(self, follower: Follower, bounds: tuple[int, int, int, int]) -> None:
+        """Note where another route of a follower lies."""
+        follower.bounds, follower.walked = bounds, None
+        if self._rows is not None:
+            self._rows[1][follower.row] = bounds
+
+    def _bounds(self, route: Route) -> tuple[int, int, int, int]:
+        """Bounds of a route, as if all its steps to the north came first, or all to the south: to walk it takes ten
+        times as long, and routes which turn back are few."""
+        row, col = divmod(route.start, self._grid.cols)
+        n, ne, e, se, s, sw, w, nw = map(route.directions.count, range(8))
+        return row - (nw + n + ne) - 1, col - (sw + w + nw) - 1, row + se + s + sw + 2, col + ne + e + se + 2
 
     def forget_routes(self) -> None:
         """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
         for follower in self._by_id.values():
             follower.route, follower.stale, follower.push_ns = None, True, 0
-            follower.cells, follower.bounds = [], _NOWHERE_BOUNDS
+            self._lies(follower, _NOWHERE_BOUNDS)
 
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
             del self._by_id[next(iter(self._by_id))]
         self._by_id[vehicle] = follower
+        self._rows = None
         return follower
 
+    def _drop(self, vehicle: str) -> None:
+        if self._by_id.pop(vehicle, None) is not None:
+            self._rows = None
+
     def drop_silent(self, now_ns: int) -> None:
-        for heard in (self._by_id, self._told):
-            late = [id for id, each in heard.items() if now_ns - each.heard_ns > self._lease_ns]
-            for id in late:
-                del heard[id]
+        for id in [id for id, each in self._by_id.items() if now_ns - each.heard_ns > self._lease_ns]:
+            self._drop(id)
+        for author in [author for author, each in self._told.items() if now_ns - each.heard_ns > self._lease_ns]:
+            del self._told[author]
 
     def any_due_in(self, changed: Sequence[Window], now_ns: int) -> bool:
         """Whether the route of a follower that may be pushed another now passes one of these windows."""
-        due = [each for each in self._by_id.values() if now_ns >= each.push_ns]
-        return any(self._crosses(due[n], changed[m]) for n, m in _near(due, changed))
+        return any(now_ns >= each.push_ns and self._crosses(each, window) for each, window in self._near(changed))
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
         """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
@@ -159,8 +186,8 @@ class Followers:
         inside = (rows >= window.row0) & (rows < window.row1) & (cols >= window.col0) & (cols < window.col1)
         for n in np.flatnonzero(inside).tolist():
             fresh[n].stale = True
-        for n, m in _near(fresh, changed):
-            fresh[n].stale = fresh[n].stale or self._crosses(fresh[n], changed[m])
+        for follower, near in self._near(changed):
+            follower.stale = follower.stale or self._crosses(follower, near)
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
         """Followers with a stale route that may be pushed another one; of too many, those that waited longest."""
@@ -176,28 +203,43 @@ class Followers:
             return True
         if route.status is not RouteStatus.OK:
             return False
-        if route.start not in follower.cells:
+        driven = self._steps_to(old, route.start)
+        if driven is None:
             return True
-        rest = old.directions[follower.cells.index(route.start) :]
+        rest = old.directions[driven:]
         # An extension of the same route is not pushed until half of the old one is driven.
         if old.remaining_s > 0 and route.remaining_s > 0 and 2 * len(rest) >= len(route.directions):
             return not route.directions.startswith(rest)
         return rest != route.directions
 
+    def _steps_to(self, route: Route, cell: int) -> int | None:
+        """After how many of its steps a route first comes to a cell; None if it does not."""
+        at = route.start
+        for steps, direction in enumerate(route.directions):
+            if at == cell:
+                return steps
+            at += self._step[direction]
+        return len(route.directions) if at == cell else None
+
     def _crosses(self, follower: Follower, window: Window) -> bool:
         """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside
         it."""
-        rows, cols = np.divmod(np.array(follower.cells, np.int64), self._grid.cols)
+        rows, cols = np.divmod(np.array(follower.cells(self._grid), np.int64), self._grid.cols)
         inside = (rows >= window.row0 - 1) & (rows <= window.row1)
         return bool((inside & (cols >= window.col0 - 1) & (cols <= window.col1)).any())
 
-
-def _near(followers: Sequence[Follower], windows: Sequence[Window]) -> list[tuple[int, int]]:
-    """Of which followers the bounds of the route meet which windows."""
-    if not windows:
-        return []
-    corners = chain.from_iterable(follower.bounds for follower in followers)
-    row0, col0, row1, col1 = np.fromiter(corners, np.int64, 4 * len(followers)).reshape(-1, 4, 1).swapaxes(0, 1)
-    each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in windows], np.int64).T
-    near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
-    return [(n, m) for n, m in np.argwhere(near).tolist()]
+    def _near(self, windows: Sequence[Window]) -> Iterator[tuple[Follower, Window]]:
+        """Of which followers the bounds of the route meet which windows."""
+        if not windows or not self._by_id:
+            return
+        if self._rows is None:
+            followers = list(self._by_id.values())
+            for row, follower in enumerate(followers):
+                follower.row = row
+            self._rows = followers, np.array([each.bounds for each in followers], np.int64)
+        followers, bounds = self._rows
+        row0, col0, row1, col1 = bounds.T[:, :, None]
+        each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in windows], np.int64).T
+        near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
+        for n, m in zip(*map(np.ndarray.tolist, near.nonzero()), strict=True):
+            yield followers[n], windows[m]

@@ -41,7 +41,7 @@ class GapStatistics:
         self.last: tuple[float, float, float] | None = None
         self._counters = counters
         self._climb = climb
-        self._cols = grid.cols
+        self._grid = grid
         self._length_weight = config.length_weight
         self._straight_m = grid.resolution_m
         self._diagonal_m = grid.resolution_m * (math.sqrt(2) if config.edge == "octile" else 1.0)
@@ -97,10 +97,11 @@ class GapStatistics:
 
     def _rest(self, follower: Follower, pace: NDArray[np.float32]) -> tuple[float, int] | None:
         """(cost, last cell) of the rest of a follower's route; None if it has left the route or has none."""
-        if follower.cell not in follower.cells:
+        route = follower.cells(self._grid)
+        if follower.cell not in route:
             return None
-        cells = np.array(follower.cells[follower.cells.index(follower.cell) :], np.int64)
-        rows, cols = np.divmod(cells, self._cols)
+        cells = np.array(route[route.index(follower.cell) :], np.int64)
+        rows, cols = np.divmod(cells, self._grid.cols)
         diagonal = (np.diff(rows) != 0) & (np.diff(cols) != 0)
         metres = np.where(diagonal, self._diagonal_m, self._straight_m)
         paces = pace[rows[1:], cols[1:]].astype(np.float64)

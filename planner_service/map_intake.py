@@ -48,10 +48,15 @@ class MapIntake:
         windows = self._cost_map.dirty
         if not windows:
             return False
-        if np.isin(routes.statuses, (UNREACHABLE, LETHAL_START)).any():
+        statuses = routes.statuses.tobytes()
+        if UNREACHABLE in statuses or LETHAL_START in statuses:
             return True
         rows, cols = routes.places(self._cost_map.grid)
+        if not rows.size:
+            return False
+        bounds = Window(int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1)
         return any(
             bool(np.any((rows >= w.row0 - 1) & (rows <= w.row1) & (cols >= w.col0 - 1) & (cols <= w.col1)))
             for w in windows
+            if w.touches(bounds)
         )

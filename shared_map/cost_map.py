@@ -283,10 +283,14 @@ def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Win
         if window.empty:
             continue
         while True:
-            touching = next((n for n, other in enumerate(apart) if window.touches(other)), None)
-            if touching is None:
+            row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
+            touching = [  # `touches`, without a call for each
+                n for n, other in enumerate(apart)
+                if row0 <= other.row1 and other.row0 <= row1 and col0 <= other.col1 and other.col0 <= col1
+            ]  # fmt: skip
+            if not touching:
                 break
-            window = window.union(apart.pop(touching))
+            window = window.union(apart.pop(touching[0]))
         apart.append(window)
     if len(apart) > MAX_WINDOWS:
         whole = apart[0]

@@ -7,7 +7,7 @@ for nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 
 from swarm.clock import NS_PER_S
@@ -125,9 +125,10 @@ class BodyReferee:
         if not 0 <= now_ns - self._swept_ns < NS_PER_S:
             self._sweep(now_ns)
 
-    def covers(self, cell: int) -> bool:
-        """Whether a body was on a cell lately."""
-        return cell in self._covers
+    @property
+    def covered(self) -> Container[int]:
+        """The cells on which a body was lately; goes on being them."""
+        return self._covers
 
     def check(self, stay: Stay) -> Iterator[BodyHit]:
         """What a vehicle's stay on a cell proves."""

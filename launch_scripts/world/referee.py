@@ -6,6 +6,7 @@ A report of a vehicle holds from its stamp until the vehicle's next report. Wher
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -52,10 +53,13 @@ Broken = Collision | LethalEntry | BodyHit
 
 @dataclass(slots=True)
 class _Vehicle:
+    """row  in the column of all cells"""
+
     stay: Stay
     author: str
     seq: int
     stamp_ns: int
+    row: int
 
 
 class Referee:
@@ -73,15 +77,20 @@ class Referee:
         self._truths = {name: truth.reshape(-1) for name, truth in truths.items()}
         self._cells = grid.cells
         self._vehicles: dict[str, _Vehicle] = {}
+        self._at: NDArray[np.int64] = np.empty(64, np.int64)
+        """Last known cell of each vehicle, in the order in which they were first heard of; behind them room."""
         self._stays: dict[int, list[Stay]] = {}
+        self._left: list[tuple[int, int, Stay]] = []
+        """Heap of (when it ended, number, stay) of those which their vehicles have left."""
         self._encounters: dict[tuple[str, str], int] = {}
+        self._entered = 0
         self._swept_ns = 0
         self._bodies = BodyReferee(grid)
 
     @property
     def cells(self) -> NDArray[np.int64]:
         """Last known cell of every vehicle."""
-        own = np.fromiter((vehicle.stay.cell for vehicle in self._vehicles.values()), dtype=np.int64)
+        own = self._at[: len(self._vehicles)].copy()
         return own if self._air is None else np.concatenate((own, self._air.cells))
 
     def hear_body(self, body: Body, now_ns: int) -> None:
@@ -93,39 +102,53 @@ class Referee:
         if self._air is not None and fleet.vehicle_class in self._aloft:
             return self._air.hear(fleet)
         broken: list[Broken] = []
+        author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
+        vehicles, stays, covered = self._vehicles, self._stays, self._bodies.covered
+        # In one loop: each vehicle reports in every tick, and all that most of them have to say is that they are
+        # still where they were.
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
-            if cell < self._cells:
-                self._report(id, cell, fleet, broken)
-        if fleet.stamp_ns - self._swept_ns > NS_PER_S:
-            self._sweep(fleet.stamp_ns)
+            if cell >= self._cells:
+                continue
+            known = vehicles.get(id)
+            if known is None:
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0), fleet, None, broken)
+                continue
+            before_ns = known.stamp_ns
+            if stamp_ns <= before_ns:
+                continue
+            gapless = author == known.author and seq <= known.seq + 1
+            known.author, known.seq, known.stamp_ns = author, seq, stamp_ns
+            stay = known.stay
+            stands = cell == stay.cell
+            if stands or gapless:
+                stay.end_ns = stamp_ns
+                if stay.cell in covered or len(stays[stay.cell]) > 1:
+                    broken.extend(self._meetings(stay))
+            if not stands:
+                since_ns = stamp_ns if gapless else before_ns
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns), fleet, known, broken)
+        if stamp_ns - self._swept_ns > NS_PER_S:
+            self._sweep(stamp_ns)
         return broken
 
-    def _report(self, id: str, cell: int, fleet: Fleet, broken: list[Broken]) -> None:
-        stamp_ns = fleet.stamp_ns
-        since_ns = 0
-        known = self._vehicles.get(id)
-        if known is not None:
-            if stamp_ns <= known.stamp_ns:
-                return
-            gapless = fleet.author == known.author and fleet.seq <= known.seq + 1
-            since_ns = stamp_ns if gapless else known.stamp_ns
-            known.author, known.seq, known.stamp_ns = fleet.author, fleet.seq, stamp_ns
-            stay = known.stay
-            if cell == stay.cell or gapless:
-                stay.end_ns = stamp_ns
-                if self._bodies.covers(stay.cell) or len(self._stays.get(stay.cell, ())) > 1:
-                    broken.extend(self._meetings(stay))
-            if cell == stay.cell:
-                return
-        entered = Stay(id, cell, stamp_ns, stamp_ns, since_ns)
-        self._stays.setdefault(cell, []).append(entered)
+    def _enter(self, entered: Stay, fleet: Fleet, known: _Vehicle | None, broken: list[Broken]) -> None:
+        """A vehicle comes onto a cell."""
+        self._stays.setdefault(entered.cell, []).append(entered)
         if known is None:
-            self._vehicles[id] = _Vehicle(entered, fleet.author, fleet.seq, stamp_ns)
+            row = len(self._vehicles)
+            if row == len(self._at):
+                self._at = np.concatenate((self._at, self._at))
+            known = self._vehicles[entered.vehicle] = _Vehicle(
+                entered, fleet.author, fleet.seq, fleet.stamp_ns, row
+            )
         else:
+            self._entered += 1
+            heapq.heappush(self._left, (known.stay.end_ns, self._entered, known.stay))
             known.stay = entered
+        self._at[known.row] = entered.cell
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
-        if not truth.item(cell) < math.inf:
-            broken.append(LethalEntry(id, cell, stamp_ns))
+        if not truth.item(entered.cell) < math.inf:
+            broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns))
 
     def _meetings(self, stay: Stay) -> Iterator[Collision | BodyHit]:
         yield from self._bodies.check(stay)
@@ -143,13 +166,9 @@ class Referee:
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
         self._swept_ns = now_ns
-        for cell in list(self._stays):
-            kept = [
-                stay
-                for stay in self._stays[cell]
-                if now_ns - stay.end_ns <= _REMEMBER_NS or self._vehicles[stay.vehicle].stay is stay
-            ]
-            if kept:
-                self._stays[cell] = kept
-            else:
-                del self._stays[cell]
+        while self._left and now_ns - self._left[0][0] > _REMEMBER_NS:
+            stay = heapq.heappop(self._left)[2]
+            here = self._stays[stay.cell]
+            here.remove(stay)
+            if not here:
+                del self._stays[stay.cell]

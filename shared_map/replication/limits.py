@@ -204,9 +204,11 @@ class _Bucket:
     since_ns: int
 
     def fill(self, marks_per_s: float, now_ns: int) -> None:
-        elapsed_s = max(now_ns - self.since_ns, 0) / NS_PER_S
+        if now_ns <= self.since_ns:
+            return  # as most often: a tick's sets are admitted and charged at one time
+        elapsed_s = (now_ns - self.since_ns) / NS_PER_S
         self.left = min(marks_per_s * _BURST_S, self.left + marks_per_s * elapsed_s)
-        self.since_ns = max(now_ns, self.since_ns)
+        self.since_ns = now_ns
 
 
 @dataclass(slots=True)

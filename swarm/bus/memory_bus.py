@@ -24,15 +24,7 @@ from swarm.bus.bus import (
     new_counts,
     newest_of,
 )
-from swarm.bus.memory_declarations import (
-    Declaration,
-    Subscriptions,
-    as_batches,
-    checking_key,
-    declare,
-    narrowed,
-    sampled,
-)
+from swarm.bus.memory_declarations import Declaration, Subscriptions, narrowed, sampled
 from swarm.bus.memory_links import LinkModel
 from swarm.bus.memory_query import Asking, MemoryAnswerer
 from swarm.bus.scheduler import Scheduler
@@ -47,6 +39,7 @@ from swarm.wire.topics import Topic
 
 TOKEN_NS = 1_000_000
 """Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""
+_AT_ONCE = (0,)
 
 
 Trace = Callable[[int, str, str, str, bytes], None]
@@ -111,14 +104,13 @@ class MemoryNetwork:
             for watcher in bus.watchers:
                 watcher.compare()
 
-    def arrivals_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
-        """When each copy of a message sent now arrives; a node hears itself at once."""
-        now_ns = self.scheduler.clock.now_ns()
+    def delays_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
+        """After how long each copy of a message sent now arrives; a node hears itself at once."""
         if source is to:
-            return (now_ns,)
+            return _AT_ONCE
         if self._down and (source.node in self._down or to.node in self._down):
             return ()
-        return [now_ns + delay for delay in self.links.delays_ns(source.node, to.node, what, now_ns)]
+        return self.links.delays_ns(source.node, to.node, what, self.scheduler.clock.now_ns())
 
 
 class MemoryBus:
@@ -153,58 +145,59 @@ class MemoryBus:
         if self.closed:
             return
         self.sent(payload)
-        named = topic.one(fields)
-        key = topic.below(named)
+        named, key = topic.value(fields)
         code = code_of(self.authenticator, topic, key, payload)
         sample = _Sample(topic, named, key, payload, code, in_json)
         network = self.network
+        arrivals: dict[int, list[Declaration]] = {}
         for subscription in network.subscribers(self.namespace, topic.name, named):
             if subscription.bus is self and not topic.echoed:
                 continue
-            for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
-                network.scheduler.at(when_ns, _Arrival(self, subscription, sample))
+            for delay_ns in network.delays_ns(self, subscription.bus, topic.name):
+                arrivals.setdefault(delay_ns, []).append(subscription)
+        for delay_ns, reached in arrivals.items():
+            network.scheduler.after(delay_ns, _Arrivals(self, reached, sample))
 
     def subscribe(
         self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
     ) -> None:
         check_subscription(topic, together, every_s)
-        post = as_batches(post) if together else checking_key(post, self.counts)
         if every_s:
             post = sampled(self, post, int(every_s * NS_PER_S))
-        subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
-        subscriptions.add(declare(self, topic, fields, post))
+        self._declare(topic, Declaration(self, narrowed(topic, fields), post, together))
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
-        subscriptions.add(declare(self, topic, fields, None))
+        self._declare(topic, Declaration(self, narrowed(topic, fields), None))
+
+    def _declare(self, topic: Topic, subscription: Declaration) -> None:
+        self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions()).add(subscription)
 
     def collected(self, topic: Topic) -> list[Heard]:
-        def hear(sample: _Sample) -> Heard | None:
-            heard: list[Event] = []
-            self.hear(sample, checking_key(heard.append, self.counts))
-            return heard[0] if heard and isinstance(heard[0], Heard) else None
-
         kept = self._kept.pop(topic.name, ())
-        return newest_of(topic, ((sample.key, sample) for sample in kept), hear)
+        return newest_of(topic, [(sample.key, sample) for sample in kept], self._heard)
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        together: list[Event] = []
-        for sample in self._kept.pop(topic.name, ()):
-            self.hear(sample, as_batches(together.append))
-        return [sample for event in together if isinstance(event, HeardMany) for sample in event.samples]
+        kept = self._kept.pop(topic.name, ())
+        return [(sample.key, heard.message) for sample in kept if (heard := self._heard(sample, together=True))]
 
-    def keep(self, sample: _Sample) -> None:
-        """Keep a sample for `collected`."""
-        topic = sample.topic
-        self._kept.setdefault(topic.name, deque(maxlen=topic.buffer)).append(sample)
+    def arrived(self, sample: _Sample, subscription: Declaration) -> None:
+        """Post the event of a sample that has come, or keep it for `collected`."""
+        self.received(sample.payload)
+        topic, post = sample.topic, subscription.post
+        if post is None:
+            self._kept.setdefault(topic.name, deque(maxlen=topic.buffer)).append(sample)
+        elif (heard := self._heard(sample, subscription.together)) is not None:
+            post(HeardMany(topic, [(sample.key, heard.message)]) if subscription.together else heard)
 
-    def hear(self, sample: _Sample, post: Post) -> None:
-        """Post the event of a sample. A payload that does not parse is counted and dropped."""
-        heard = sample.heard(self)
+    def _heard(self, sample: _Sample, together: bool = False) -> Heard | None:
+        """The event of a sample. One that is rejected is counted and dropped.
+
+        together  the reader compares key and message
+        """
+        heard = sample.heard(self, together)
         if heard is None:
             self.counts["payloads_dropped"] += 1
-        else:
-            post(heard)
+        return heard
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         narrow = narrowed(topic, fields)
@@ -215,7 +208,7 @@ class MemoryBus:
     def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
-        self.queryables.setdefault(topic.name, []).append(declare(self, topic, fields, post))
+        self.queryables.setdefault(topic.name, []).append(Declaration(self, narrowed(topic, fields), post))
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         narrow = narrowed(topic, fields)
@@ -245,9 +238,8 @@ class MemoryBus:
         queryables = [
             queryable
             for bus in self.network.buses
-            if bus.namespace == self.namespace and self.network.connected(self, bus)
             for queryable in bus.queryables.get(topic.name, ())
-            if queryable.meets(wanted)
+            if queryable.meets(wanted) and bus.namespace == self.namespace and self.network.connected(self, bus)
         ]
         asking.waiting = set(range(len(queryables)))
         if not queryables:
@@ -258,10 +250,10 @@ class MemoryBus:
         code = code_of(self.authenticator, topic, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
             assert queryable.post is not None
-            for when_ns in self.network.arrivals_ns(self, queryable.bus, topic.name):
-                answerer = MemoryAnswerer(asking, queryable, index, when_ns)
+            for delay_ns in self.network.delays_ns(self, queryable.bus, topic.name):
+                answerer = MemoryAnswerer(asking, queryable, index, asking.began_ns + delay_ns)
                 event = Asked(topic, wanted, parsed, answerer)
-                scheduler.at(when_ns, _Delivery(self, queryable.bus, payload, code, queryable.post, event))
+                scheduler.after(delay_ns, _Delivery(self, queryable.bus, payload, code, queryable.post, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
 
     def declare_alive(self, peer: Peer) -> None:
@@ -335,61 +327,68 @@ class _Watcher:
         self.visible = now
 
 
+@dataclass(eq=False, slots=True)
 class _Sample:
-    """One put, parsed and checked once: when the first subscription is reached."""
+    """One put, parsed and checked once: when the first subscription is reached. All share the result.
 
-    __slots__ = ("_checked_by", "_heard", "_parsed", "code", "fields", "in_json", "key", "payload", "topic")
+    checked_by  who has found its code right; None before, and for a bus that checks none
+    parsed      whether `parse` was called
+    parses      its event; None if the payload is no message of the topic
+    fits        the same; None if the message says that it is of another sender than the key, too
+    """
 
-    def __init__(
-        self, topic: Topic, fields: dict[str, str], key: str, payload: bytes, code: bytes | None, in_json: bool
-    ) -> None:
-        self.topic = topic
-        self.fields = fields
-        self.key = key
-        self.payload = payload
-        self.code = code
-        self.in_json = in_json
-        self._checked_by: Authenticator | None = None
-        self._heard: Heard | None = None
-        self._parsed = False
+    topic: Topic
+    fields: Mapping[str, str]
+    key: str
+    payload: bytes
+    code: bytes | None
+    in_json: bool
+    checked_by: Authenticator | None = None
+    parsed: bool = False
+    parses: Heard | None = None
+    fits: Heard | None = None
 
-    def heard(self, bus: MemoryBus) -> Heard | None:
-        """The event, as a bus takes it; None if the payload does not parse, or the bus does not trust it."""
-        if self._checked_by is not bus.authenticator:
+    def heard(self, bus: MemoryBus, together: bool) -> Heard | None:
+        """The event, as a bus takes it; None if it is rejected.
+
+        together  the reader compares the message with its key
+        """
+        if self.checked_by is not bus.authenticator:
             try:
                 check_code(bus.authenticator, self.code, self.topic, self.key, self.payload)
             except ProtocolError:
                 return None
-            self._checked_by = bus.authenticator
-        if not self._parsed:
-            self._parsed = True
-            payload, kind = self.payload, self.topic.message
-            try:
-                if self.in_json and may_be_json(payload):
-                    payload = packed_json(payload, kind, self.fields)
-                self._heard = Heard(self.topic, self.fields, decode(payload, kind))
-            except ProtocolError:
-                self._heard = None
-        return self._heard
+            self.checked_by = bus.authenticator
+        if not self.parsed:
+            self.parsed = True
+            self.parse()
+        return self.parses if together else self.fits
+
+    def parse(self) -> None:
+        payload, kind = self.payload, self.topic.message
+        try:
+            if self.in_json and may_be_json(payload):
+                payload = packed_json(payload, kind, self.fields)
+            self.parses = Heard(self.topic, self.fields, decode(payload, kind))
+            self.topic.check_key(self.fields, self.parses.message)
+        except ProtocolError:
+            return
+        self.fits = self.parses
 
 
 @dataclass(eq=False, slots=True)
-class _Arrival:
-    """The arrival of a sample at a subscription."""
+class _Arrivals:
+    """The arrival of a sample at subscriptions that it reaches at one time, in the order of `subscribers`."""
 
     source: MemoryBus
-    subscription: Declaration
+    subscriptions: list[Declaration]
     sample: _Sample
 
     def __call__(self) -> None:
-        bus = self.subscription.bus
-        if not bus.traced(self.source, self.sample.topic.name, self.sample.payload):
-            return
-        bus.received(self.sample.payload)
-        if self.subscription.post is None:
-            bus.keep(self.sample)
-        else:
-            bus.hear(self.sample, self.subscription.post)
+        sample, what = self.sample, self.sample.topic.name
+        for subscription in self.subscriptions:
+            if subscription.bus.traced(self.source, what, sample.payload):
+                subscription.bus.arrived(sample, subscription)
 
 
 @dataclass(eq=False, slots=True)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-from swarm.bus.bus import Event, Heard, HeardMany, Post
-from swarm.errors import ProtocolError
+from swarm.bus.bus import Event, Heard, Post
 from swarm.wire.topics import Topic
 
 if TYPE_CHECKING:
@@ -17,12 +16,17 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False, slots=True)
 class Declaration:
-    """One subscription or queryable of one bus. `narrow` holds the fields of its key that are no wildcard; a
-    subscription without `post` keeps its samples until they are collected."""
+    """One subscription or queryable of one bus.
+
+    narrow    the fields of its key that are no wildcard
+    post      a subscription without one keeps its samples until they are collected
+    together  it posts a `HeardMany` of each sample: in a simulation nothing waits, so each comes alone
+    """
 
     bus: MemoryBus
     narrow: dict[str, str]
     post: Post | None
+    together: bool = False
 
     def meets(self, fields: Mapping[str, str]) -> bool:
         """Whether this and another key of the topic, either with wildcards, can name the same value."""
@@ -30,10 +34,6 @@ class Declaration:
             if fields[name] not in (chunk, "*"):
                 return False
         return True
-
-
-def declare(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post | None) -> Declaration:
-    return Declaration(bus, narrowed(topic, fields), post)
 
 
 def narrowed(topic: Topic, fields: Mapping[str, str | int]) -> dict[str, str]:
@@ -50,16 +50,20 @@ class Subscriptions:
 
     def __init__(self) -> None:
         self._count = 0
+        self._found: dict[tuple[str, ...], list[Declaration]] = {}
+        """Values of all fields of a key -> `find` of it, until a subscription comes or goes."""
         self._by_names: dict[tuple[str, ...], dict[tuple[str, ...], list[tuple[int, Declaration]]]] = {}
         """Names of the fields that are no wildcard -> their values -> (number of the declaration, subscription)."""
 
     def add(self, declaration: Declaration) -> None:
+        self._found.clear()
         names, values = tuple(declaration.narrow), tuple(declaration.narrow.values())
         self._by_names.setdefault(names, {}).setdefault(values, []).append((self._count, declaration))
         self._count += 1
 
     def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
         """Forget the subscriptions of a bus: all, or those with exactly these fields."""
+        self._found.clear()
         for names, by_values in self._by_names.items():
             if narrow is not None and names != tuple(narrow):
                 continue
@@ -70,28 +74,20 @@ class Subscriptions:
 
     def find(self, fields: Mapping[str, str]) -> list[Declaration]:
         """Those that a value with these fields reaches: first the ones with wildcards, each kind in the order of
-        its declaration. A replayed run depends on this order."""
+        its declaration. A replayed run depends on this order. The list is kept: nobody may change it."""
+        key = tuple(fields.values())
+        found = self._found.get(key)
+        if found is None:
+            found = self._found[key] = self._look_up(fields)
+        return found
+
+    def _look_up(self, fields: Mapping[str, str]) -> list[Declaration]:
         wide: list[tuple[int, Declaration]] = []
         exact: list[tuple[int, Declaration]] = []
         for names, by_values in self._by_names.items():
             found = by_values.get(tuple([fields[name] for name in names]), ())
             (exact if len(names) == len(fields) else wide).extend(found)
         return [declaration for _, declaration in sorted(wide, key=itemgetter(0)) + exact]
-
-
-def checking_key(post: Post, counts: dict[str, int]) -> Post:
-    """Drops and counts messages whose sender differs from their key."""
-
-    def checked(event: Event) -> None:
-        if isinstance(event, Heard):
-            try:
-                event.topic.check_key(event.fields, event.message)
-            except ProtocolError:
-                counts["payloads_dropped"] += 1
-                return
-        post(event)
-
-    return checked
 
 
 def sampled(bus: MemoryBus, post: Post, every_ns: int) -> Post:
@@ -112,14 +108,3 @@ def sampled(bus: MemoryBus, post: Post, every_ns: int) -> Post:
             newest[event.topic.below(event.fields)] = event
 
     return arrive
-
-
-def as_batches(post: Post) -> Post:
-    """Makes a `HeardMany` of each sample: in a simulation nothing waits, so each comes alone."""
-
-    def batched(event: Event) -> None:
-        if isinstance(event, Heard):
-            event = HeardMany(event.topic, [(event.topic.below(event.fields), event.message)])
-        post(event)
-
-    return batched

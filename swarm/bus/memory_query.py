@@ -143,6 +143,7 @@ class MemoryAnswerer:
             if to.traced(source, what, payload):
                 arrive()
 
-        for arrival_ns in source.network.arrivals_ns(source, to, what):
-            self.last_arrival_ns = max(self.last_arrival_ns, arrival_ns)
+        now_ns = source.network.scheduler.clock.now_ns()
+        for delay_ns in source.network.delays_ns(source, to, what):
+            self.last_arrival_ns = max(self.last_arrival_ns, now_ns + delay_ns)
             source.network.scheduler.at(self.last_arrival_ns, deliver)

@@ -201,8 +201,8 @@ def check_id(name: str, value: object) -> None:
 
 
 _KNOWN_IDS: set[str] = set()
-"""Ids found valid: the same few hundred come thousands of times a second."""
-_MAX_KNOWN_IDS = 4096
+"""Ids found valid: the same few hundred come thousands of times a second, in a large swarm some ten thousand."""
+_MAX_KNOWN_IDS = 1 << 16
 
 # --- what msgspec cannot check ------------------------------------------------------------------------------------
 

@@ -77,6 +77,9 @@ class Topic:
     fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
     _said_twice: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    _values: dict[tuple[tuple[str, str | int], ...], tuple[Mapping[str, str], str]] = field(
+        init=False, repr=False, compare=False, default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
@@ -111,9 +114,23 @@ class Topic:
         """The key expression for these fields; those not given become `*`. Raises as `every`."""
         return f"{namespace}/{self.key.format(**self.every(fields))}"
 
+    def value(self, fields: Mapping[str, str | int]) -> tuple[Mapping[str, str], str]:
+        """The fields of one value as `one` has them, and its key below the namespace. Raises as `one`.
+
+        A process puts under the same few keys again and again, so both are remembered.
+        """
+        given = tuple(fields.items())
+        value = self._values.get(given)
+        if value is None:
+            named = self.one(fields)
+            if len(self._values) >= _MOST_VALUES:
+                self._values.clear()
+            value = self._values[given] = named, self.below(named)
+        return value
+
     def keyed(self, namespace: str, **fields: str | int) -> str:
         """The key of one value. Raises as `one`."""
-        return f"{namespace}/{self.key.format(**self.one(fields))}"
+        return f"{namespace}/{self.value(fields)[1]}"
 
     def below(self, fields: Mapping[str, str]) -> str:
         """The key below the namespace, of fields that are chunks already."""
@@ -136,6 +153,8 @@ class Topic:
 
 
 _CHUNK = re.compile(r"[^/*$?#\s]+|\*")
+_MOST_VALUES = 1 << 14
+"""Keys of a topic that are remembered."""
 
 
 def _chunk(value: str | int) -> str:

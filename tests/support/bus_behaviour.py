@@ -186,9 +186,10 @@ def test_a_slow_reader_gets_the_newest_of_each_key_at_its_own_pace(world: World)
         for target in ("t0", "t1"):
             a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
     world.put_bytes(a, TRUE_POSE, b"garbage", target="t2")
+    a.publish(TRUE_POSE, pose("t1", seq=99), target="t0")  # what is rejected hides nothing
     world.until(lambda: len(box) == 2)
     assert {(event.fields["target"], event.message.seq) for event in box} == {("t0", 20), ("t1", 20)}
-    world.until(lambda: b.counts["payloads_dropped"] == 1)
+    world.until(lambda: b.counts["payloads_dropped"] == 2)
     a.publish(TRUE_POSE, pose("t0", seq=21), target="t0")
     world.until(lambda: len(box) == 3)
     assert box[2].message.seq == 21

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 
 import pytest
 from hypothesis import given
@@ -10,8 +11,10 @@ from hypothesis import strategies as st
 
 from planner_service import followers as module
 from planner_service.followers import Followers
-from swarm.grid import GridSpec, Window
-from swarm.wire.routes import Route, RouteStatus
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.vehicles import Chasers
+from swarm.wire.routes import Route, RouteOutline, RouteStatus
 
 GRID = GridSpec(20, 30, 10.0)
 
@@ -51,3 +54,94 @@ def test_a_tick_pushes_a_bounded_number_and_every_follower_in_turn(monkeypatch: 
             pushed.append(id)
             followers.sent(follower, Route(status=RouteStatus.UNREACHABLE, start=follower.cell), now_ns + 1000)
     assert sorted(pushed) == sorted(f"v{n}" for n in range(10))
+
+
+def random_route(chance: random.Random) -> Route:
+    """A route of any steps, which stays on the grid; it may turn back and cross itself."""
+    row, col = chance.randrange(GRID.rows), chance.randrange(GRID.cols)
+    start, directions = GRID.cell(row, col), []
+    mostly = chance.randrange(8)
+    for _ in range(chance.randrange(20)):
+        direction = (mostly + chance.choice((0, 0, 0, 1, -1, 4))) % 8
+        if GRID.inside(row + STEP_ROW[direction], col + STEP_COL[direction]):
+            row, col = row + STEP_ROW[direction], col + STEP_COL[direction]
+            directions.append(direction)
+    if chance.random() < 0.2:
+        return Route(status=RouteStatus.UNREACHABLE, start=start)
+    return Route(status=RouteStatus.OK, start=start, directions=bytes(directions), cost_s=1.0, lower_bound_s=1.0)
+
+
+def random_windows(chance: random.Random) -> list[Window]:
+    corners = [(chance.randrange(GRID.rows), chance.randrange(GRID.cols)) for _ in range(chance.randrange(3))]
+    return [Window(row, col, row + chance.randint(1, 3), col + chance.randint(1, 3)) for row, col in corners]
+
+
+def crossed(route: Route, changed: list[Window]) -> bool:
+    """Whether a route passes windows or next to them, cell by cell."""
+    if route.status is not RouteStatus.OK:
+        return False
+    on_route = [divmod(cell, GRID.cols) for cell in walk(GRID, route.start, route.directions)]
+    wider = [Window(each.row0 - 1, each.col0 - 1, each.row1 + 1, each.col1 + 1) for each in changed]
+    return any(window.contains(*place) for window in wider for place in on_route)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_whom_a_change_concerns_is_what_looking_at_every_cell_of_every_route_finds(seed: int) -> None:
+    """Whoever comes, goes and is given another route meanwhile."""
+    chance = random.Random(f"followers/{seed}")
+    followers = Followers("t", GRID, 10**9, 0)
+    has: dict[str, tuple[Route, int]] = {}
+    """Vehicle -> its route, and when it may be pushed another one."""
+    stale: set[str] = set()
+    found = 0
+    for turn in range(1500):
+        changed, now_ns = random_windows(chance), chance.randrange(4)
+        match chance.randrange(8):
+            case 0 | 1 | 2:
+                vehicle, route = chance.choice("abcdef"), random_route(chance)
+                has[vehicle] = route, chance.randrange(4)
+                followers.given(vehicle, route, 0, 0, has[vehicle][1])
+                stale.discard(vehicle)
+            case 3 if chance.random() < 0.3:
+                followers.forget_routes()
+                has = {
+                    id: (Route(status=RouteStatus.NO_TARGET, start=each.start), 0) for id, (each, _) in has.items()
+                }
+                stale = set(has)
+            case 4:
+                stay = sorted(chance.sample(sorted(has), chance.randint(0, len(has))))
+                for named in (sorted(has), stay):
+                    cells = pack_column([has[id][0].start for id in named], "<u4")
+                    followers.hear(Chasers(target="t", author="x", stamp_ns=turn, ids=named, cells=cells), 0)
+                has = {id: has[id] for id in stay}
+                stale &= set(stay)
+            case 5:
+                followers.touch(Window(0, 0, 0, 0), changed)
+                stale |= {id for id, (route, _) in has.items() if crossed(route, changed)}
+                found += len(stale)
+            case _:
+                concerned = any(crossed(route, changed) for route, push_ns in has.values() if now_ns >= push_ns)
+                assert followers.any_due_in(changed, now_ns) == concerned
+                found += concerned
+        assert {id for id, each in followers.all_items() if each.stale} == stale
+    assert found > 100
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None:
+    chance = random.Random(f"news/{seed}")
+    for _ in range(200):
+        followers, old, other = Followers("t", GRID, 10**9, 0), random_route(chance), random_route(chance)
+        followers.given("v", old, 0, 0, 0)
+        (follower,) = followers.all()
+        if old.status is not RouteStatus.OK:
+            continue
+        cells = walk(GRID, old.start, old.directions)
+        cell = chance.choice(cells)
+        rest = old.directions[cells.index(cell) :]
+        assert not followers.is_news(follower, RouteOutline(RouteStatus.OK, cell, rest, 0.0))
+        turned = bytes((code + 1) % 8 for code in rest)
+        assert not rest or followers.is_news(follower, RouteOutline(RouteStatus.OK, cell, turned, 0.0))
+        assert other.start in cells or followers.is_news(
+            follower, RouteOutline(RouteStatus.OK, other.start, rest, 0.0)
+        )

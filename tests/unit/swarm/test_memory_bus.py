@@ -11,11 +11,13 @@ from support.query_behaviour import *  # noqa: F403
 from support.swarm_model import START_NS, SwarmModel
 from support.trusted_behaviour import *  # noqa: F403
 
+from swarm.bus import memory_bus
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
 from swarm.bus.memory_links import PerfectLinks
 from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
 from swarm.liveness import Peer
+from swarm.wire.codec import decode
 from swarm.wire.messages.base import Nothing, schema_of
 from swarm.wire.topics import NOTE, POSE, RUN
 
@@ -134,6 +136,53 @@ def test_every_delivery_is_traced():
     ((now_ns, source, destination, what, payload),) = world.deliveries
     assert (now_ns, source, destination, what) == (START_NS + 200_000, "a", "b", "pose")
     assert schema_of("pose").encode() in payload
+
+
+def test_a_put_is_decoded_once_however_many_hear_it(monkeypatch):
+    decoded = []
+    monkeypatch.setattr(memory_bus, "decode", lambda payload, kind: decoded.append(kind) or decode(payload, kind))
+    world, boxes = SwarmModel(), [Box() for _ in range(4)]
+    a, *others = (world.bus(name) for name in "abcde")
+    for bus, box in zip(others, boxes, strict=True):
+        bus.subscribe(POSE, box)
+    a.publish(POSE, pose(), target="t0")
+    a.publish(POSE, pose("t1"), target="t0")
+    world.put_bytes(a, POSE, b"garbage", target="t0")
+    world.settle()
+    assert len(decoded) == 3
+    assert [[event.message for event in box] for box in boxes] == [[pose()]] * 4
+    assert [bus.counts["payloads_dropped"] for bus in others] == [2] * 4
+
+
+def test_those_whom_a_put_reaches_at_one_time_hear_it_in_the_order_of_their_subscriptions():
+    world, heard = SwarmModel(), []
+    late, a, b, c = (world.bus(name) for name in ("late", "a", "b", "c"))
+    for bus in (c, late, a, b):
+        bus.subscribe(POSE, lambda event, node=bus.node: heard.append((node, event.message.seq)))
+    delays = {"late": (9,), "b": (1, 9)}
+    links = Links()
+    links.delays_ns = lambda source, to, what, now_ns: [int(ms * 1e6) for ms in delays.get(to, (1,))]
+    world.network.links = links
+    a.publish(POSE, pose(), target="t0")
+    happened = world.network.scheduler.run_until(world.now_ns + 10_000_000)
+    assert heard == [("a", 1), ("c", 1), ("b", 1), ("late", 1), ("b", 1)]
+    assert happened == 3
+
+
+def test_who_subscribes_or_leaves_between_two_puts_of_a_key_hears_one_of_them():
+    world, early, late = SwarmModel(), Box(), Box()
+    a, b, c, d = (world.bus(name) for name in "abcd")
+    b.subscribe(POSE, early, target="t0")
+    d.subscribe(POSE, early)
+    a.publish(POSE, pose(), target="t0")
+    world.settle()
+    c.subscribe(POSE, late)
+    b.unsubscribe(POSE, target="t0")
+    d.close()
+    a.publish(POSE, pose(seq=2), target="t0")
+    world.settle()
+    assert [event.message.seq for event in early] == [1, 1]
+    assert [event.message.seq for event in late] == [2]
 
 
 def test_what_is_due_first_happens_first_and_of_two_the_one_scheduled_first():

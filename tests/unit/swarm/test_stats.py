@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -78,3 +79,13 @@ def test_counters_count_gauge_and_observe():
     assert counters.counts == {"marks": 5, "lost": 0}
     assert counters.gauges == {"inbox": 2.0}
     assert counters.histograms["tick_ms"].count == 1
+
+
+@given(st.lists(st.floats() | st.sampled_from([0.0, -1.0, 1.0, 1.02, 1e-300]), max_size=16))
+def test_few_values_are_counted_as_many_are_and_in_the_same_order(values: list[float]) -> None:
+    few, many = Histogram(), Histogram()
+    few.add_all(np.array(values, np.float64))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("swarm.runtime.stats._FEW", -1)
+        many.add_all(np.array(values, np.float64))
+    assert list(few.buckets.items()) == list(many.buckets.items())

@@ -46,6 +46,24 @@ def test_names_are_unique_and_every_topic_is_published_or_served():
     assert all(topic.published or topic.request for topic in TOPICS)
 
 
+@given(st.data(), topics)
+def test_a_key_that_is_remembered_is_the_one_that_would_be_made(data, topic):
+    fields = {name: data.draw(chunks | st.integers(0, 9)) for name in topic.fields}
+    named = {name: str(value) for name, value in fields.items()}
+    backwards = dict(reversed(fields.items()))
+    for given_fields in (fields, fields, backwards, named):
+        assert topic.value(given_fields) == (named, topic.key.format(**named))
+    with pytest.raises(TypeError, match="has no field colour"):
+        topic.value(fields | {"colour": "red"})
+
+
+def test_no_sender_of_ever_other_keys_makes_more_of_them_remembered_than_there_is_room_for(monkeypatch):
+    monkeypatch.setattr("swarm.wire.topics._MOST_VALUES", 3)
+    for n in range(9):
+        assert POSE.keyed("swarm", target=f"new{n}") == f"swarm/target/new{n}/pose"
+        assert len(POSE._values) <= 3
+
+
 @pytest.mark.parametrize("wrong", ["", "a/b", "a*", "$*", "**", "a b", "a?b", "a#", "\n"])
 def test_what_is_not_one_chunk_is_refused(wrong):
     with pytest.raises(ValueError, match="part of a key"):
