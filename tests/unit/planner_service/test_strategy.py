@@ -235,9 +235,6 @@ def test_a_large_tree_in_pieces_is_not_turned_into_one_with_all_costs_between_tw
     assert tree.update(pace, grid.cell(100, 102), [], 0).kind == "window"
 
 
-from planner_service.strategy import OnMove
-
-
 def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_all_costs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -129,7 +129,7 @@ def test_no_number_is_that_of_a_plot_of_another_size(rows: int, cols: int, layer
 def test_a_grid_whose_larger_plots_have_no_numbers_is_refused() -> None:
     grid = GridSpec(1, 1 << 28, 1.0)
     assert Plots(grid, (), layer=1).all.stop == MOST_PLOTS
-    with pytest.raises(ConfigError, match="map.plot_regions is 3: a grid of 1 x 268435456 cells is too narrow"):
+    with pytest.raises(ConfigError, match=r"map\.plot_regions is 3: a grid of 1 x 268435456 cells is too narrow"):
         Plots(grid, (), 3 * REGION_CELLS)
 
 
