@@ -75,7 +75,7 @@ def test_a_round_of_planning_sends_no_two_to_one_cell_and_lets_the_oldest_throug
         near = [other for _, other in GRID.neighbours(cell)]
         chance.shuffle(near)
         movers.append(Mover(f"v{n}", cell, near, chance.randint(0, len(near)), age=count - n))
-    round = Round(movers, closed=set(), inside=lambda cell: True)
+    round = Round(movers, closed=lambda cell: False, inside=lambda cell: True)
     for mover in movers:
         round.plan(mover)
     assert len(set(round.to.values())) == count
