@@ -121,7 +121,7 @@ class Steering:
         age_ms     for how long it has been on its way
         held       the cells that vehicles hold
         in_reach   whether a target is within capture range of a cell
-        lot        decides between cells that are as good as each other
+        lot        decides between cells that are as good as each other, for one that stands
         """
         here, still = path[0], len(path) == 1
         age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
@@ -180,7 +180,8 @@ class Steering:
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""
-        ahead = vehicle.route.after(path[-1], self._reserve - len(path) + 1)
+        left = self._reserve - len(path) + 1
+        ahead = vehicle.route.after(path[-1], left) if left > 0 else []
         for index, (tail, head) in enumerate(pairwise((path[-1], *ahead))):
             if not self.passable(tail, head):
                 return ahead[:index]

@@ -101,7 +101,7 @@ class _Host:
 
     spoke_ns: int
     standing: Standing | None = None
-    stands: Mapping[str, Stand] = field(default_factory=dict)
+    stands: dict[str, Stand] = field(default_factory=dict)
     asking: Sequence[Stand] = ()
     heard_ns: int = 0
     told: object = None
@@ -370,7 +370,7 @@ class Warden:
             cell: holder for holder in self._grants.items() for cell in holder[1].cells
         }
         held.update((cell, None) for cells in self._shut.values() for cell in cells)
-        stands = ChainMap(*[host.stands for host in hosts])
+        stands: Mapping[str, Stand] = ChainMap(*[host.stands for host in hosts])
         movers: dict[str, Mover] = {}
         for stand in asking:
             cells = self._cells_of(stand.vehicle)
