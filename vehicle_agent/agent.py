@@ -293,16 +293,19 @@ class Agent:
             del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
-        paths = self.holdings.paths
+        paths, cols, reach = self.holdings.paths, self._map.grid.cols, self._reach_cells
+        rows = {target: pose.cell // cols for target, pose in self._poses.items()}
         for vehicle in self.vehicles.values():
-            if vehicle.tracked == (vehicle.target in lost):
+            target, motion = vehicle.target, vehicle.motion
+            if vehicle.tracked == (target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
-            self._check_reach(vehicle)
+            if vehicle.in_reach or (target in rows and -reach <= motion.cell // cols - rows[target] <= reach):
+                self._check_reach(vehicle)
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
             path = paths[vehicle.id]
-            if len(path) > 1 and vehicle.motion.at_rest:
+            if len(path) > 1 and motion.at_rest:
                 # What was granted late may be closed by now, and would be held for good.
                 self._driver.end_path(vehicle)
                 path = paths[vehicle.id]
@@ -313,7 +316,10 @@ class Agent:
                 self._wishes.stay(vehicle.id)
                 continue
             driven.append(vehicle)
-            self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
+            if len(path) > 1:
+                self._steering.goes_on(vehicle.id)
+            else:
+                self.blocked_ticks += self._steering.blocked(vehicle, now_ns)
         self._wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1

@@ -165,11 +165,16 @@ class Steering:
         """Whether a body is on a cell or comes to it: who stands there makes way before all others."""
         return self._bodies.any and (cell in self._shut or self._bodies.danger(cell) > 0.0)
 
-    def blocked(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> bool:
-        """Whether it stands though its route goes on. Asks for another route after a while."""
-        if len(path) > 1 or vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
-            if self._stood_ns:
-                self._stood_ns.pop(vehicle.id, None)
+    def goes_on(self, vehicle: str) -> None:
+        """It holds a cell ahead."""
+        if self._stood_ns:
+            self._stood_ns.pop(vehicle, None)
+
+    def blocked(self, vehicle: Vehicle, now_ns: int) -> bool:
+        """Whether one that holds no cell but its own stands though its route goes on. Asks for another route after
+        a while."""
+        if vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
+            self.goes_on(vehicle.id)
             return False
         cell, since_ns = self._stood_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
         if cell != vehicle.cell or now_ns - since_ns > _BLOCKED_NS:
