@@ -120,7 +120,7 @@ class Agent:
             measures=scenario.map.learning,
         )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
-        self._routes = RouteBounds(grid.cols)
+        self._routes = RouteBounds(grid.cols, 1)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
@@ -258,8 +258,9 @@ class Agent:
         vehicles = list(self.vehicles.values())
         cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
         rows, east = np.divmod(np.array([vehicle.motion.cell for vehicle in vehicles], np.int64), cols)
-        in_sight = meet(np.stack((rows, east, rows, east), 1), changed, sight)
-        on_route = meet(self._routes.bounds([vehicle.route for vehicle in vehicles]), changed, 1)
+        places = np.stack((rows - sight, east - sight, rows + sight, east + sight), 1)
+        routes = self._routes.bounds([vehicle.route for vehicle in vehicles])
+        on_route, in_sight = meet(np.concatenate((routes, places)), changed).reshape(2, -1)
         for index in np.flatnonzero(on_route | in_sight).tolist():
             vehicle = vehicles[index]
             ahead = vehicle.route.ahead()
@@ -479,8 +480,8 @@ class Agent:
             return []
         if vehicle.route.cut(self._steering.passable_steps):
             vehicle.cut_route(now_ns)
-        on_route = set(cells)
-        if path[-1] not in on_route:  # it was granted cells along another route
+        if path[-1] not in cells:  # it was granted cells along another route
+            on_route = set(cells)
             self._driver.stop_soon(vehicle, max(index + 1 for index, cell in enumerate(path) if cell in on_route))
         return [begun]
 

@@ -141,8 +141,9 @@ class Wishes:
         if not (changed and vehicles):
             return
         cells = np.fromiter((vehicle.cell for vehicle in vehicles), np.int64, len(vehicles))
-        places = np.stack(np.divmod(cells, self._cols), axis=1)
-        for index in np.flatnonzero(meet(np.hstack((places, places)), changed, self._near_cells)).tolist():
+        near, (row, col) = self._near_cells, np.divmod(cells, self._cols)
+        places = np.stack((row - near, col - near, row + near, col + near), 1)
+        for index in np.flatnonzero(meet(places, changed)).tolist():
             self._made_of.pop(vehicles[index].id, None)
 
     def _around(self, cell: int) -> frozenset[int]:
