@@ -296,6 +296,7 @@ class Agent:
         driven: list[Vehicle] = []
         paths, cols, reach = self.holdings.paths, self._map.grid.cols, self._reach_cells
         rows = {target: pose.cell // cols for target, pose in self._poses.items()}
+        waiting = self._steering.waiting_ns
         for vehicle in self.vehicles.values():
             target, motion = vehicle.target, vehicle.motion
             if vehicle.tracked == (target in lost):
@@ -317,10 +318,10 @@ class Agent:
                 self._wishes.stay(vehicle.id)
                 continue
             driven.append(vehicle)
-            if len(path) > 1:
-                self._steering.goes_on(vehicle.id)
-            else:
+            if len(path) == 1:
                 self.blocked_ticks += self._steering.blocked(vehicle, now_ns)
+            elif waiting:
+                waiting.pop(vehicle.id, None)
         self._wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
