@@ -295,13 +295,13 @@ class Agent:
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
         paths, cols, reach = self.holdings.paths, self._map.grid.cols, self._reach_cells
-        rows = {target: pose.cell // cols for target, pose in self._poses.items()}
+        rows: dict[str | None, int] = {target: pose.cell // cols for target, pose in self._poses.items()}
         waiting = self._steering.waiting_ns
         for vehicle in self.vehicles.values():
-            target, motion = vehicle.target, vehicle.motion
-            if vehicle.tracked == (target in lost):
+            motion, row = vehicle.motion, rows.get(vehicle.target)
+            if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
-            if vehicle.in_reach or (target in rows and -reach <= motion.cell // cols - rows[target] <= reach):
+            if vehicle.in_reach or (row is not None and -reach <= motion.cell // cols - row <= reach):
                 self._check_reach(vehicle)
             stopped = self.stopped(vehicle.id)
             if stopped:

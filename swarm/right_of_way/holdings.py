@@ -262,7 +262,7 @@ class Holdings:
 
     def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
         """Take in the cells that are granted to each vehicle."""
-        before, grants, paths = view.seen, granted.grants, self._paths
+        before, grants, paths, plot_of = view.seen, granted.grants, self._paths, self._plot_of.__getitem__
         view.seen = grants
         changed = [id for id, cells in grants.items() if before.get(id) != cells or id not in paths]
         self._seen_anew.update(changed, [id for id in before if id not in grants])
@@ -270,7 +270,7 @@ class Holdings:
         for vehicle in changed:
             cells, seen = grants[vehicle], before.get(vehicle, _NO_CELLS)
             ours = self._vehicles is None or vehicle in self._vehicles
-            if not ours or any(self._plot_of[cell] != granted.plot for cell in cells):
+            if not ours or {*map(plot_of, cells)} != {granted.plot}:
                 view.seen = {id: each for id, each in view.seen.items() if id != vehicle}
             elif vehicle in paths:
                 self._extend(vehicle, cells, seen)
@@ -295,8 +295,10 @@ class Holdings:
     def _extend(self, vehicle: str, cells: Sequence[int], seen: Sequence[int]) -> None:
         """Take the cells that are granted anew. One that does not follow the path is left, and so given back."""
         path = self._paths[vehicle]
-        after = max((index for index, cell in enumerate(cells) if cell in path), default=-1)
-        for cell in cells[after + 1 :]:
+        first = len(cells)
+        while first and cells[first - 1] not in path:
+            first -= 1
+        for cell in cells[first:]:
             if cell in seen or not self._plots.adjacent(path[-1], cell):
                 return
             path = self._paths[vehicle] = [*path, cell]

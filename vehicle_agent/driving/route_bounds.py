@@ -11,8 +11,8 @@ from vehicle_agent.driving.route_follower import Follower
 
 
 class RouteBounds:
-    """The bounds of routes on a grid of so many columns, and of the `margin` cells around. A route changes every few
-    seconds, and bounds are needed whenever the map has changed."""
+    """The bounds of routes on a grid of so many columns, and of `margin` cells around each. A route changes every
+    few seconds, and bounds are needed whenever the map has changed."""
 
     def __init__(self, cols: int, margin: int) -> None:
         self._cols = cols

@@ -71,17 +71,23 @@ class Follower:
 
     def moved(self, cell: int) -> None:
         """The vehicle has entered a cell: the next one of its route, or one further on, or none."""
-        if cell in self._cells[self._at : self._at + _SKIPPED_CELLS]:
-            self._at = self._cells.index(cell, self._at)
+        index = self._find(cell)
+        if index is not None:
+            self._at = index
             self.left = len(self._cells) - self._at - 1
             self.version += 1
 
     def after(self, cell: int, count: int) -> list[int]:
         """The next `count` cells behind a cell of the route; none if the cell is not on it."""
-        if cell not in self._cells[self._at : self._at + _SKIPPED_CELLS]:
-            return []
-        first = self._cells.index(cell, self._at) + 1
-        return self._cells[first : first + max(count, 0)]
+        index = self._find(cell)
+        return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)]
+
+    def _find(self, cell: int) -> int | None:
+        """Where on the route a cell is to which the vehicle may come next; None if it is not one of those."""
+        try:
+            return self._cells.index(cell, self._at, self._at + _SKIPPED_CELLS)
+        except ValueError:
+            return None
 
     def point(self, cell: int, cols: int) -> tuple[float, float] | None:
         """Where a pulled route leads through one of its next cells, as row and col: the middle of its segment's
@@ -89,9 +95,9 @@ class Follower:
 
         A cell that the segment does not cross, whatever a planner says, is driven through its middle.
         """
-        if not self._turns or cell not in self._cells[self._at : self._at + _SKIPPED_CELLS]:
+        index = self._find(cell) if self._turns else None
+        if index is None:
             return None
-        index = self._cells.index(cell, self._at)
         leg = bisect_left(self._turns, index)
         if leg == len(self._turns) or self._turns[leg] == index:
             return None

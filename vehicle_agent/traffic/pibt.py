@@ -44,7 +44,9 @@ class Round:
     pushed  vehicle -> the age of the one that it could not make way for within the plot
     """
 
-    def __init__(self, movers: Sequence[Mover], closed: Callable[[int], bool], inside: Callable[[int], bool]) -> None:
+    def __init__(
+        self, movers: Sequence[Mover], closed: Callable[[int], bool], inside: Callable[[int], bool]
+    ) -> None:
         self.to: dict[str, int] = {}
         self.taken: dict[int, str] = {}
         self.pushed: dict[str, int] = {}

@@ -7,7 +7,7 @@ alone on its cells (see decision 25 for the proof).
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain
@@ -17,7 +17,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.lives import BEAT_NS, is_far_ahead
 from swarm.right_of_way.plots import Plots
-from swarm.wire.messages.traffic import Grant, Granted, Shut, Stamp, Stand, Standing, Table
+from swarm.wire.messages.traffic import Granted, Shut, Stamp, Stand, Standing, Table
+from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
@@ -57,34 +58,9 @@ def _lot(vehicle: str, step: int) -> int:
     return crc32(f"{vehicle}/{step}".encode())
 
 
-_Holder = tuple[str, Grant] | None
-"""Who holds a cell, by which grant; None is nobody who could leave it."""
-
-
-def _by_host(grants: Mapping[str, Grant]) -> dict[str, dict[str, list[int]]]:
-    """Host -> vehicle -> the cells that it is granted."""
-    by_host: dict[str, dict[str, list[int]]] = {}
-    for vehicle, grant in grants.items():
-        by_host.setdefault(agent_of(vehicle), {})[vehicle] = grant.cells
-    return by_host
-
-
 def _rests(stand: Stand, cells: Sequence[int]) -> bool:
     """Whether a vehicle stands, with nothing granted to it but where it does."""
     return stand.cell == stand.end and (not cells or cells == [stand.cell])
-
-
-def _stays(cell: int, holder: _Holder, stands: Mapping[str, Stand]) -> bool:
-    """Whether a cell that is held stays occupied, whatever is planned. Whoever wants one that a vehicle under way
-    will leave may wait for it; one that stands can be pushed.
-
-    stands  of the hosts that have spoken lately
-    """
-    stand = None if holder is None else stands.get(holder[0])
-    if holder is None or stand is None:
-        return True
-    cells = holder[1].cells
-    return cell == cells[-1] and stand.end in cells and not _rests(stand, cells)
 
 
 @dataclass(slots=True)
@@ -141,14 +117,13 @@ class Warden:
         self._me = me
         self._fleets = fleets
         self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
-        self._grants: dict[str, Grant] = dict(table.grants)
-        """Vehicle -> what it is granted. Each is made once and stands in every table until it changes."""
-        self._of_host = _by_host(self._grants)
-        """Host -> vehicle -> the cells that it is granted; follows `_grants`."""
+        self._grants = Grants(table.grants)
         self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
         self._hosts: dict[str, _Host] = {}
         self._beside = _Beside(plots.grid.cols)
         self._pushed: dict[str, int] = {}
+        self._before: dict[str, Sequence[int]] = {}
+        """Vehicle -> what it was granted before the plan that is being made has granted it more."""
         self._granted = True  # since the last table: something that a host waits for
         self._changed = False  # or anything else
         self._told: Table | None = None
@@ -185,7 +160,7 @@ class Warden:
         if not standing.vehicles and (known.standing is None or known.standing.vehicles):
             self._changed = True  # it leaves the plot as soon as a table counts this
         stands = self._stands_of(standing)
-        for vehicle, cells in list(self._of_host.get(host, _NO_GRANTS).items()):
+        for vehicle, cells in list(self._grants.by_host.get(host, _NO_GRANTS).items()):
             stand = stands.get(vehicle)
             if stand is None or stand.holds != cells:
                 self._free(vehicle, _NO_CELLS if stand is None else stand.holds, standing.knows)
@@ -210,15 +185,15 @@ class Warden:
         """A guest that stands on a cell which was shut for an earlier life of it gets it before all others."""
         if not opened:
             return
-        opened.difference_update(cell for grant in self._grants.values() for cell in grant.cells)
+        opened.difference_update(cell for grant in self._grants.of.values() for cell in grant.cells)
         for (host, _), cells in self._shut.items():
             if host != standing.agent:
                 opened.difference_update(cells)
         for stand in standing.vehicles:
-            before = self._cells_of(stand.vehicle)
+            before = self._grants.cells_of(stand.vehicle)
             ours = self._is_of(stand.vehicle, standing.agent)
             if ours and _is_entering(stand) and stand.cell in opened and len(before) < _MOST_CELLS:
-                self._set(stand.vehicle, [*before, stand.cell], self._next_stamp)
+                self._grants.set(stand.vehicle, [*before, stand.cell], self._next_stamp)
                 self._granted = True
 
     def _is_welcome(self, host: str) -> bool:
@@ -239,15 +214,10 @@ class Warden:
             return {each.vehicle: each for each in standing.vehicles if agent_of(each.vehicle) == standing.agent}
         return {each.vehicle: each for each in standing.vehicles if each.vehicle in fleet}
 
-    def _cells_of(self, vehicle: str) -> Sequence[int]:
-        """The cells that a vehicle is granted."""
-        grant = self._grants.get(vehicle)
-        return _NO_CELLS if grant is None else grant.cells
-
     def _granted_to(self, host: str) -> list[str]:
         """The vehicles of a host that are granted cells."""
-        vehicles = self._fleets[host] if host in self._fleets else self._of_host.get(host, ())
-        return [vehicle for vehicle in vehicles if vehicle in self._grants]
+        vehicles = self._fleets[host] if host in self._fleets else self._grants.by_host.get(host, ())
+        return [vehicle for vehicle in vehicles if vehicle in self._grants.of]
 
     def _ended(self, host: str, ended: int, life: int) -> None:
         """A life's own word that it drives no more."""
@@ -267,15 +237,15 @@ class Warden:
         if (host, before) in self._shut:
             del self._shut[host, before]
         elif before and mine:
-            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants[vehicle].cells]
+            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants.cells_of(vehicle)]
         for vehicle in mine:
-            self._set(vehicle, self._grants[vehicle].cells, self._next_stamp)
+            self._grants.set(vehicle, self._grants.of[vehicle].cells, self._next_stamp)
         self._hosts[host].standing = self._hosts[host].told = None
         self._granted = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
         """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
-        cells, stamp = self._grants[vehicle].cells, self._grants[vehicle].stamp
+        cells, stamp = self._grants.of[vehicle].cells, self._grants.of[vehicle].stamp
         if knows >= stamp:
             kept = [cell for cell in cells if cell in holds]
         elif holds and holds[0] in cells:
@@ -284,15 +254,7 @@ class Warden:
             return
         if len(kept) < len(cells):
             self._changed = True
-            self._set(vehicle, kept, stamp)
-
-    def _set(self, vehicle: str, cells: list[int], stamp: Stamp) -> None:
-        """Let a vehicle be granted these cells, or none."""
-        of_host = self._of_host.setdefault(agent_of(vehicle), {})
-        if cells:
-            self._grants[vehicle], of_host[vehicle] = Grant(cells, stamp), cells
-        else:
-            del self._grants[vehicle], of_host[vehicle]
+            self._grants.set(vehicle, kept, stamp)
 
     # --- what is granted ------------------------------------------------------------------------------------
 
@@ -316,7 +278,7 @@ class Warden:
             epoch=self.epoch,
             seq=self.seq,
             hosts=dict(self._lives),
-            grants=dict(self._grants),
+            grants=dict(self._grants.of),
             shut=[Shut(host, life, list(cells)) for (host, life), cells in self._shut.items()],
             pushed=dict(self._pushed),
         )
@@ -326,18 +288,18 @@ class Warden:
         if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
             return
         self._said_of, self._said_ns = table, now_ns
-        of_host = _by_host(table.grants)
+        current = table is self._told and not (self._granted or self._changed)
+        grants_of = self._grants if current else Grants(table.grants)
         shut = {cell for shut in table.shut for cell in shut.cells}
-        cells_of = {name: set(chain.from_iterable(grants.values())) for name, grants in of_host.items()}
-        held = shut.union(*cells_of.values())
+        held = shut.union(*grants_of.cells.values())
         for name, host in self._hosts.items():
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             life, heard = table.hosts.get(name, (0, 0))
-            grants = of_host.get(name, {})
+            grants = dict(grants_of.by_host.get(name, _NO_GRANTS))
             # Also around those under way: what they want once they come to rest depends on who is there.
             stands = () if host.standing is None else host.standing.vehicles
-            others = held.difference(cells_of.get(name, ())) | shut
+            others = held.difference(grants_of.cells.get(name, ())) | shut
             near = [around for stand in stands if not others.isdisjoint(around := self._beside[stand.end])]
             occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
@@ -366,23 +328,22 @@ class Warden:
         ]
         # Whoever has been on its way for longest first.
         asking = sorted(chain.from_iterable([host.asking for host in hosts]), key=_turn)
-        held: dict[int, _Holder] = {
-            cell: holder for holder in self._grants.items() for cell in holder[1].cells
-        }
-        held.update((cell, None) for cells in self._shut.values() for cell in cells)
-        stands: Mapping[str, Stand] = ChainMap(*[host.stands for host in hosts])
+        shut = {cell for cells in self._shut.values() for cell in cells}
+        held = ChainMap(self._grants.holders, dict.fromkeys(shut, ""))
+        self._before.clear()
         movers: dict[str, Mover] = {}
         for stand in asking:
-            cells = self._cells_of(stand.vehicle)
+            cells = self._grants.cells_of(stand.vehicle)
             if not cells and _is_entering(stand):
                 continue  # nobody makes way for it
             if _rests(stand, cells):
                 movers[stand.vehicle] = Mover(
                     stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
                 )
+        stands: Mapping[str, Stand] = ChainMap(*[host.stands for host in hosts])
         round = Round(
             list(movers.values()),
-            lambda cell: cell in held and _stays(cell, held[cell], stands),
+            lambda cell: cell in shut or self._stays(cell, stands),
             lambda cell: self._plots.of(cell) == self._plot,
         )
         for stand in asking:
@@ -400,27 +361,40 @@ class Warden:
             self._pushed = round.pushed
             self._granted = True
 
+    def _stays(self, cell: int, stands: Mapping[str, Stand]) -> bool:
+        """Whether a cell stays occupied, whatever is planned. Whoever wants one that a vehicle under way will leave
+        may wait for it; one that stands can be pushed.
+
+        stands  vehicle -> what is said of it, by the hosts that have spoken lately
+        """
+        vehicle = self._grants.holders.get(cell)
+        if vehicle is None:
+            return False
+        stand = stands.get(vehicle)
+        if stand is None:
+            return True
+        cells = self._before.get(vehicle) or self._grants.cells_of(vehicle)
+        return cell == cells[-1] and stand.end in cells and not _rests(stand, cells)
+
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""
-        cells = self._cells_of(stand.vehicle)
+        cells = self._grants.cells_of(stand.vehicle)
         if not cells or cells[-1] == stand.end or stand.end not in cells:
             return stand.ahead if not cells or stand.end in cells else []
         last = cells[-1]
         return stand.ahead[stand.ahead.index(last) + 1 :] if last in stand.ahead else []
 
-    def _grant(
-        self, stand: Stand, ahead: Sequence[int], held: dict[int, _Holder], taken: dict[int, str]
-    ) -> None:
+    def _grant(self, stand: Stand, ahead: Sequence[int], held: Container[int], taken: dict[int, str]) -> None:
         """Append free cells, up to the first that is not."""
         for cell in ahead:
             mine = taken.setdefault(cell, stand.vehicle) == stand.vehicle
             if not mine or cell in held or self._plots.of(cell) != self._plot:
                 return
-            cells = self._cells_of(stand.vehicle)
+            cells = self._grants.cells_of(stand.vehicle)
             if len(cells) >= _MOST_CELLS or not self._guest_may_hold_more(stand.vehicle):
                 return
-            held[cell] = None
-            self._set(stand.vehicle, [*cells, cell], self._next_stamp)
+            self._before.setdefault(stand.vehicle, cells)
+            self._grants.set(stand.vehicle, [*cells, cell], self._next_stamp)
             self._granted = True
 
     def _guest_may_hold_more(self, vehicle: str) -> bool:
@@ -428,8 +402,8 @@ class Warden:
         host = agent_of(vehicle)
         if host in self._fleets:
             return True
-        if sum(map(len, self._of_host.get(host, _NO_GRANTS).values())) >= MOST_CELLS_OF_GUEST:
+        held, fleets = self._grants.by_host, self._fleets
+        if sum(map(len, held.get(host, _NO_GRANTS).values())) >= MOST_CELLS_OF_GUEST:
             return False
-        guests = self._of_host.keys() - self._fleets.keys()
-        together = sum(len(cells) for guest in guests for cells in self._of_host[guest].values())
+        together = sum(sum(map(len, cells.values())) for guest, cells in held.items() if guest not in fleets)
         return together < MOST_CELLS_OF_GUESTS

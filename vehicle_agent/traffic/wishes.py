@@ -109,9 +109,9 @@ class Wishes:
             pushed_ms = pushed.get(id, 0)
             made_of = path, vehicle.route.version, target, near, place, pushed_ms
             kept = known.get(id)
-            if kept is not None and kept[0] == made_of and kept[1] <= now_ns < kept[2]:
-                if not still or changed.isdisjoint(beside[id]):
-                    continue
+            same = kept is not None and kept[0] == made_of and kept[1] <= now_ns < kept[2]
+            if same and (not still or changed.isdisjoint(beside[id])):
+                continue
             idle = (near or target is None) and path[0] not in ways_out
             turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
             phase_ns = phases_ns.get(id)
