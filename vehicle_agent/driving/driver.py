@@ -67,9 +67,11 @@ class Driver:
 
         stopped  whether a vehicle has to stand
         """
-        driving = [(vehicles[id], left_s) for id, left_s in self._left_s.items() if id in vehicles]
-        left = ((vehicle.id, self._drive(vehicle, left_s, stopped)) for vehicle, left_s in driving)
-        self._left_s = {id: left_s for id, left_s in left if left_s > 0.0}
+        driving, self._left_s = self._left_s, {}
+        for id, left_s in driving.items():
+            vehicle = vehicles.get(id)
+            if vehicle is not None and (left_s := self._drive(vehicle, left_s, stopped)) > 0.0:
+                self._left_s[id] = left_s
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
         """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""

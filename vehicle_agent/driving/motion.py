@@ -58,7 +58,7 @@ class Motion:
         self.at_rest = True
 
     def _settle(self) -> None:
-        """Find the cell anew. As `at_rest`, it is asked for far more often than it changes."""
+        """Find the cell anew. As whether it rests, it is asked for far more often than it changes."""
         self.cell = self.tail if self.done_m < self.border_m else self.head
 
     @property

@@ -100,6 +100,23 @@ class Vehicle:
     searching     whether its last route led to a place where its target may be, which nobody sees
     """
 
+    __slots__ = (
+        "_ask_due_ns",
+        "_need",
+        "_retry_ns",
+        "asked",
+        "gone_since_ns",
+        "id",
+        "in_reach",
+        "motion",
+        "planner_gone",
+        "route",
+        "searching",
+        "state",
+        "target",
+        "tracked",
+    )
+
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
         self.id = id
         self.state = VehicleState.IDLE
