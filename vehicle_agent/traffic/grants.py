@@ -48,7 +48,9 @@ class Grants:
                 if self.holders.get(cell) == vehicle:
                     del self.holders[cell]
                 if cell in self._doubled:
-                    self.holders.update((cell, id) for id, grant in self.of.items() if cell in grant.cells)
+                    for other, grant in [*self.of.items()]:
+                        if cell in grant.cells:
+                            self._add(other, grant)
 
     def _add(self, vehicle: str, grant: Grant) -> None:
         host = agent_of(vehicle)

@@ -87,6 +87,7 @@ def test_bounds_of_many_routes_are_those_of_each_whatever_has_changed(changes: l
             assert routes[which].begin(cells, cells)
         else:
             routes[which].drop()
+        assert all(route.left == len(route.ahead()) for route in routes)
         alone = [route.bounds(GRID.cols) for route in routes]
         around = [(north - 2, west - 2, south + 2, east + 2) for north, west, south, east in alone]
         expected = [
