@@ -15,7 +15,7 @@ from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import nodes_of
-from launch_scripts.simulation.worlds import crowd, seeded
+from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
@@ -36,10 +36,11 @@ SECONDS = 6.0
 
 
 def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
-    """Three agents that make marks all the time, or four in a crowd; among bodies, or around targets that stay
-    where they were caught."""
+    """Agents that make marks all the time, three on one plot or more on many, or four in a crowd; among bodies, or
+    around targets that stay where they were caught."""
     kind, _, others = name.partition(" ")
-    scenario, terrain = (seeded(seed), None) if kind == "small" else crowd(kind, seed, 40, 10, side=16)
+    of_kind = {"small": SMALL, "wide": WIDE}.get(kind)
+    scenario, terrain = (seeded(seed, of_kind), None) if of_kind else crowd(kind, seed, 40, 10, side=16)
     if others == "parked":
         targets = tuple(msgspec.structs.replace(target, caught="stay") for target in scenario.targets)
         return msgspec.structs.replace(scenario, targets=targets), terrain
@@ -54,7 +55,14 @@ def simulation_of(name: str, seed: int, trace: io.StringIO | None = None) -> Sim
 
 WORLDS = pytest.mark.parametrize(
     ("name", "seed"),
-    [("small", 0), ("small parked", 6), ("small among rovers", 1), ("doors among rovers", 1), ("maze parked", 6)],
+    [
+        ("small", 0),
+        ("small parked", 6),
+        ("small among rovers", 1),
+        ("wide", 2),
+        ("doors among rovers", 1),
+        ("maze parked", 6),
+    ],
 )
 
 
