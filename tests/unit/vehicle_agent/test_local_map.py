@@ -10,15 +10,18 @@ from swarm.grid import Window
 from vehicle_agent.local_map import meet
 
 numbers = st.integers(-4, 20)
+sizes = st.just((-1, -1)) | st.tuples(st.integers(0, 9), st.integers(0, 9))
+"""From the smallest row and column of a box to the greatest, which are smaller where it holds nothing."""
 
 
 @given(
-    st.lists(st.tuples(numbers, numbers, numbers, numbers), max_size=6),
+    st.lists(st.tuples(numbers, numbers, sizes), max_size=6),
     st.lists(st.tuples(numbers, numbers, st.integers(1, 6), st.integers(1, 6)), max_size=6),
 )
 def test_a_box_meets_windows_with_which_it_shares_a_cell(
-    boxes: list[tuple[int, int, int, int]], windows: list[tuple[int, int, int, int]]
+    given_boxes: list[tuple[int, int, tuple[int, int]]], windows: list[tuple[int, int, int, int]]
 ) -> None:
+    boxes = [(row, col, row + south, col + east) for row, col, (south, east) in given_boxes]
     changed = [Window(row, col, row + rows, col + cols) for row, col, rows, cols in windows]
 
     def shares(box: tuple[int, int, int, int], window: Window) -> bool:
