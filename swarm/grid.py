@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate
 
 from swarm.errors import OutsideGridError
 
@@ -229,6 +231,12 @@ class GridSpec:
 _CODES = bytes(range(8))
 
 
+@lru_cache(maxsize=16)
+def _offsets(cols: int) -> tuple[int, ...]:
+    """What a step in each direction adds to a cell of a grid of so many columns."""
+    return tuple(south * cols + east for south, east in zip(STEP_ROW, STEP_COL, strict=True))
+
+
 def bounds_of(cells: Sequence[int], cols: int) -> tuple[int, int, int, int]:
     """The smallest (row, col) and the greatest of some cells, one at least, of a grid of so many columns."""
     within = [cell % cols for cell in cells]
@@ -243,7 +251,9 @@ def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
     row, col = grid.row_col(start)
     if directions.translate(None, _CODES):
         raise ValueError(f"direction code {max(directions)} is not in 0..7")
-    rows, cols = grid.rows, grid.cols
+    rows, cols, steps = grid.rows, grid.cols, len(directions)
+    if steps <= row < rows - steps and steps <= col < cols - steps:  # so short that it cannot leave the grid
+        return list(accumulate(map(_offsets(cols).__getitem__, directions), initial=start))
     cells = [start]
     for direction in directions:
         row += STEP_ROW[direction]

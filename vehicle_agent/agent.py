@@ -120,7 +120,7 @@ class Agent:
             measures=scenario.map.learning,
         )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
-        self._routes = RouteBounds(grid.cols)
+        self._routes = RouteBounds(grid.cols, 1)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
@@ -258,8 +258,9 @@ class Agent:
         vehicles = list(self.vehicles.values())
         cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
         rows, east = np.divmod(np.array([vehicle.motion.cell for vehicle in vehicles], np.int64), cols)
-        in_sight = meet(np.stack((rows, east, rows, east), 1), changed, sight)
-        on_route = meet(self._routes.bounds([vehicle.route for vehicle in vehicles]), changed, 1)
+        places = np.stack((rows - sight, east - sight, rows + sight, east + sight), 1)
+        routes = self._routes.bounds([vehicle.route for vehicle in vehicles])
+        on_route, in_sight = meet(np.concatenate((routes, places)), changed).reshape(2, -1)
         for index in np.flatnonzero(on_route | in_sight).tolist():
             vehicle = vehicles[index]
             ahead = vehicle.route.ahead()
@@ -293,16 +294,20 @@ class Agent:
             del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
-        paths = self.holdings.paths
+        paths, cols, reach = self.holdings.paths, self._map.grid.cols, self._reach_cells
+        rows: dict[str | None, int] = {target: pose.cell // cols for target, pose in self._poses.items()}
+        waiting = self._steering.waiting_ns
         for vehicle in self.vehicles.values():
+            motion, row = vehicle.motion, rows.get(vehicle.target)
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
-            self._check_reach(vehicle)
+            if vehicle.in_reach or (row is not None and -reach <= motion.cell // cols - row <= reach):
+                self._check_reach(vehicle)
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
             path = paths[vehicle.id]
-            if len(path) > 1 and vehicle.motion.at_rest:
+            if len(path) > 1 and motion.at_rest:
                 # What was granted late may be closed by now, and would be held for good.
                 self._driver.end_path(vehicle)
                 path = paths[vehicle.id]
@@ -313,7 +318,10 @@ class Agent:
                 self._wishes.stay(vehicle.id)
                 continue
             driven.append(vehicle)
-            self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
+            if len(path) == 1:
+                self.blocked_ticks += self._steering.blocked(vehicle, now_ns)
+            elif waiting:
+                waiting.pop(vehicle.id, None)
         self._wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
@@ -473,8 +481,8 @@ class Agent:
             return []
         if vehicle.route.cut(self._steering.passable_steps):
             vehicle.cut_route(now_ns)
-        on_route = set(cells)
-        if path[-1] not in on_route:  # it was granted cells along another route
+        if path[-1] not in cells:  # it was granted cells along another route
+            on_route = set(cells)
             self._driver.stop_soon(vehicle, max(index + 1 for index, cell in enumerate(path) if cell in on_route))
         return [begun]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 
@@ -40,11 +41,9 @@ class FleetReport:
     def _report(self, region: int, places: Places, inside: Sequence[int], now_ns: int) -> Fleet:
         vehicles = [places.vehicles[index] for index in inside]
         at = np.array(inside, np.intp)
-        targets: dict[str, int] = {}
-        for vehicle in vehicles:
-            if vehicle.target is not None and len(targets) < _MOST_TARGETS:
-                targets.setdefault(vehicle.target, len(targets))
-        chased = [NO_TARGET if v.target is None else targets.get(v.target, NO_TARGET) for v in vehicles]
+        named = [vehicle.target for vehicle in vehicles]
+        first = [*islice(dict.fromkeys(target for target in named if target is not None), _MOST_TARGETS)]
+        targets: dict[str | None, int] = {target: number for number, target in enumerate(first)}
         return Fleet(
             author=self._author,
             group=self._group,
@@ -52,12 +51,12 @@ class FleetReport:
             seq=self._seq,
             stamp_ns=now_ns,
             ids=[vehicle.id for vehicle in vehicles],
-            target_ids=list(targets),
+            target_ids=list(first),
             cells=places.cells[at].astype("<u4").tobytes(),
             east_m=places.east_m[at].astype("<f4").tobytes(),
             south_m=places.south_m[at].astype("<f4").tobytes(),
             heading_rad=places.heading_rad[at].astype("<f4").tobytes(),
             states=bytes([vehicle.state for vehicle in vehicles]),
-            targets=bytes(chased),
+            targets=bytes([targets.get(target, NO_TARGET) for target in named]),
             vehicle_class=self._vehicle_class,
         )

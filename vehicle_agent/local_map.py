@@ -40,15 +40,21 @@ class LocalMap:
         return cells[found | np.isinf(self.own_prior.reshape(-1)[cells])]
 
 
-def meet(boxes: NDArray[np.int64], windows: Sequence[Window], margin: int) -> NDArray[np.bool_]:
-    """Which boxes lie within `margin` cells of any window.
+def meet(boxes: NDArray[np.int64], windows: Sequence[Window]) -> NDArray[np.bool_]:
+    """Which boxes any window meets.
 
-    boxes  int64 (n, 4): the smallest row and column of each, and the greatest
+    boxes  int64 (n, 4): the smallest row and column of each, and the greatest; one whose greatest are smaller meets
+           none
     """
-    row0, col0, row1, col1 = boxes.T
     met = np.zeros(len(boxes), np.bool_)
+    if not len(boxes):
+        return met
+    row0, col0, row1, col1 = np.ascontiguousarray(boxes.T)
+    north, west, south, east = int(row0.min()), int(col0.min()), int(row1.max()), int(col1.max())
     for window in windows:
-        rows = (row0 < window.row1 + margin) & (row1 >= window.row0 - margin)
-        met |= rows & (col0 < window.col1 + margin) & (col1 >= window.col0 - margin)
+        if window.row1 <= north or window.col1 <= west or window.row0 > south or window.col0 > east:
+            continue  # far from all of them, as half of the windows are that concern an agent
+        rows = (row0 < window.row1) & (row1 >= window.row0)
+        met |= rows & (col0 < window.col1) & (col1 >= window.col0)
     met &= row0 <= row1
     return met

@@ -320,7 +320,8 @@ class AgentService:
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(columns, now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
-        chasing = ((id, vehicle.target, agent.holdings.path(id)) for id, vehicle in agent.vehicles.items())
+        paths = agent.holdings.paths
+        chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
         for chasers in self._chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, takewhile
 
+import msgspec
+
 from swarm.right_of_way.lives import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
@@ -14,12 +16,12 @@ _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
 _FURTHEST_SEQ = 1 << 32
 _BEFORE_ALL: Stamp = (0, 0)
+_MOST_CELLS = 1 << 12
 Place = Callable[[str, Sequence[int]], int | None]
 """On which of the cells that it was granted a vehicle of a new life stands; None if it does not stand there."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wish:
+class Wish(msgspec.Struct, frozen=True):
     """Where a vehicle would go.
 
     ahead   its next cells after all that it holds
@@ -34,6 +36,7 @@ class Wish:
 
 _NO_WISH = Wish()
 _NO_CELLS: Sequence[int] = []
+_NO_STANDS: Mapping[str, _Told] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,7 @@ class _View:
     others   cells beside our vehicles that are granted to vehicles of other hosts, or to nobody
     quiet    the first standing from which on we want nothing here; None while we do
     told     what was last told of our vehicles, and when
+    same     whether it is known that the same would be told again
     """
 
     warden: str = ""
@@ -68,15 +72,32 @@ class _View:
     quiet: int | None = None
     told: object = None
     told_ns: int = 0
+    same: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Said:
-    """What is told of one vehicle while nothing about it changes: by plot a stand, and what of it is news."""
+_Told = tuple[Stand, object]
+"""A stand, and what of it is news."""
+
+
+class _Said(msgspec.Struct, frozen=True):
+    """What is told of one vehicle while nothing about it changes: by plot a stand."""
 
     wish: Wish
-    path: Sequence[int]
-    stands: list[tuple[int, Stand, object]]
+    path: list[int]
+    stands: dict[int, _Told]
+
+
+class _PlotOf(dict[int, int]):
+    """Cell -> its plot, of cells that were asked for lately: each is asked for often while a vehicle passes it."""
+
+    def __init__(self, plots: Plots) -> None:
+        self._plots = plots
+
+    def __missing__(self, cell: int) -> int:
+        if len(self) >= _MOST_CELLS:
+            self.clear()
+        plot = self[cell] = self._plots.of(cell)
+        return plot
 
 
 class Holdings:
@@ -93,6 +114,7 @@ class Holdings:
 
     def __init__(self, plots: Plots, agent: str, vehicles: Collection[str] | None) -> None:
         self._plots = plots
+        self._plot_of = _PlotOf(plots)
         self._agent = agent
         self.refused: list[str] = []
         self._vehicles = None if vehicles is None else frozenset(vehicles)
@@ -113,6 +135,10 @@ class Holdings:
         self._pushed: dict[str, int] | None = None
         """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
         self._said: dict[str, _Said] = {}
+        self._seen_anew: set[str] = set()
+        """Vehicles to which another table grants other cells: what is asked for them may be another thing now."""
+        self._stands: dict[int, dict[str, _Told]] = {}
+        """Plot -> vehicle -> what is told of it, in the order of `_paths`; follows `_said`."""
         self._views: dict[int, _View] = {}
         self._seq = 0
 
@@ -177,7 +203,10 @@ class Holdings:
         """It stands nowhere any more: give back all that it holds."""
         self._enters.pop(vehicle, None)
         self._paths.pop(vehicle, None)
-        self._said.pop(vehicle, None)
+        said = self._said.pop(vehicle, None)
+        for plot in () if said is None else said.stands:
+            del self._stands[plot][vehicle]
+            self._views[plot].same = False
         self._away.add(vehicle)
 
     @property
@@ -219,10 +248,13 @@ class Holdings:
             return []
         view.warden, view.heard_ns = granted.agent, now_ns
         self.newest = max(self.newest, granted.life)
-        self.replaced = self.replaced or granted.life > self.life
+        if granted.life > self.life and not self.replaced:
+            self.replaced = True
+            self._say_all_again()
         if granted.stamp == view.knows or granted.life != self.life:
             return []  # what it grants was granted to another life
         view.knows, view.heard = granted.stamp, granted.heard
+        view.same = False
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
         self._pushed = None
@@ -230,24 +262,20 @@ class Holdings:
 
     def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
         """Take in the cells that are granted to each vehicle."""
-        before, view.seen = view.seen, {}
-        for vehicle in before.keys() - granted.grants.keys():
-            self._said.pop(vehicle, None)
+        before, grants, paths, plot_of = view.seen, granted.grants, self._paths, self._plot_of.__getitem__
+        view.seen = grants
+        changed = [id for id, cells in grants.items() if before.get(id) != cells or id not in paths]
+        self._seen_anew.update(changed, [id for id in before if id not in grants])
         placed = []
-        for vehicle, cells in granted.grants.items():
-            seen = before.get(vehicle, _NO_CELLS)
-            if cells == seen and vehicle in self._paths:
-                view.seen[vehicle] = cells
-                continue
-            self._said.pop(vehicle, None)
+        for vehicle in changed:
+            cells, seen = grants[vehicle], before.get(vehicle, _NO_CELLS)
             ours = self._vehicles is None or vehicle in self._vehicles
-            if not ours or any(self._plots.of(cell) != granted.plot for cell in cells):
-                continue
-            view.seen[vehicle] = cells
-            if vehicle in self._paths:
+            if not ours or {*map(plot_of, cells)} != {granted.plot}:
+                view.seen = {id: each for id, each in view.seen.items() if id != vehicle}
+            elif vehicle in paths:
                 self._extend(vehicle, cells, seen)
             elif (cell := self._first_cell(vehicle, cells, seen, place)) is not None:
-                self._paths[vehicle] = [cell]
+                paths[vehicle] = [cell]
                 placed.append(vehicle)
         return placed
 
@@ -267,8 +295,10 @@ class Holdings:
     def _extend(self, vehicle: str, cells: Sequence[int], seen: Sequence[int]) -> None:
         """Take the cells that are granted anew. One that does not follow the path is left, and so given back."""
         path = self._paths[vehicle]
-        after = max((index for index, cell in enumerate(cells) if cell in path), default=-1)
-        for cell in cells[after + 1 :]:
+        first = len(cells)
+        while first and cells[first - 1] not in path:
+            first -= 1
+        for cell in cells[first:]:
             if cell in seen or not self._plots.adjacent(path[-1], cell):
                 return
             path = self._paths[vehicle] = [*path, cell]
@@ -279,24 +309,51 @@ class Holdings:
         """What to tell of each plot that concerns us, where it is new or the last word is a beat old. What is left
         out is given back."""
         self._seq += 1
-        by_plot: dict[int, list[tuple[int, Stand, object]]] = {plot: [] for plot in self.plots}
-        for vehicle, path in self._paths.items():
-            wish = wishes.get(vehicle, _NO_WISH)
-            said = self._said.get(vehicle)
-            if said is None or said.wish is not wish or said.path is not path:
-                said = self._said[vehicle] = self._say(vehicle, path, wish)
-            for each in said.stands:
-                by_plot.setdefault(each[0], []).append(each)
+        self._say_changed(wishes)
+        by_plot = {plot: self._stands.get(plot, _NO_STANDS) for plot in self.plots}
+        by_plot.update((plot, stands) for plot, stands in self._stands.items() if stands)
         for vehicle, cell in self._enters.items():
             if not any(cell in view.seen.get(vehicle, ()) for view in self._views.values()):
-                stand = Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
-                by_plot.setdefault(self._plots.of(cell), []).append((self._plots.of(cell), stand, stand))
+                plot, stand = self._plots.of(cell), Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
+                by_plot[plot] = {**by_plot.get(plot, _NO_STANDS), vehicle: (stand, stand)}
+                self._views[plot].same = False
         self._forget_left(by_plot)
         return [
-            Tell(self._listeners(plot, now_ns), self._standing(plot, [stand for _, stand, _ in said]))
-            for plot, said in by_plot.items()
-            if self._is_news(plot, said, now_ns)
+            Tell(self._listeners(plot, now_ns), self._standing(plot, [stand for stand, _ in stands.values()]))
+            for plot, stands in by_plot.items()
+            if self._is_news(plot, stands, now_ns)
         ]
+
+    def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
+        """Make anew what is told of those vehicles of which path, wish, or what tables grant has changed."""
+        anew, known, moved = self._seen_anew, self._said, False
+        for vehicle, path in self._paths.items():
+            before, wish = known.get(vehicle), wishes.get(vehicle, _NO_WISH)
+            if (
+                before is not None
+                and before.wish is wish
+                and before.path is path
+                and not (anew and vehicle in anew)
+            ):
+                continue
+            said = known[vehicle] = self._say(vehicle, path, wish)
+            moved = moved or before is None or before.stands.keys() != said.stands.keys()
+            for plot, told in said.stands.items():
+                self._views.setdefault(plot, _View()).same = False
+                if not moved:
+                    self._stands[plot][vehicle] = told
+        anew.clear()
+        if moved:
+            self._say_all_again()
+            self._stands = {}
+            for vehicle in self._paths:
+                for plot, told in known[vehicle].stands.items():
+                    self._stands.setdefault(plot, {})[vehicle] = told
+
+    def _say_all_again(self) -> None:
+        """What is told may be another thing in any plot."""
+        for view in self._views.values():
+            view.same = False
 
     def _standing(self, plot: int, stands: list[Stand]) -> Standing:
         return Standing(
@@ -316,51 +373,61 @@ class Holdings:
             return (view.warden,)
         return self._plots.members(plot)
 
-    def _is_news(self, plot: int, said: Sequence[tuple[int, Stand, object]], now_ns: int) -> bool:
+    def _is_news(self, plot: int, stands: Mapping[str, _Told], now_ns: int) -> bool:
         view = self._views[plot]
-        # What a table grants and we do not hold is freed only if we say so, knowing that table.
-        in_step = view.seen == {stand.vehicle: stand.holds for _, stand, _ in said if stand.holds}
-        told = (self.replaced, view.knows[0] if in_step else view.knows, [news for _, _, news in said])
-        if told == view.told and 0 <= now_ns - view.told_ns < BEAT_NS:
+        lately = 0 <= now_ns - view.told_ns < BEAT_NS
+        if not view.same:
+            # What a table grants and we do not hold is freed only if we say so, knowing that table.
+            in_step = view.seen == {id: stand.holds for id, (stand, _) in stands.items() if stand.holds}
+            knows = view.knows[0] if in_step else view.knows
+            told = (self.replaced, knows, [news for _, news in stands.values()])
+            lately = lately and told == view.told
+            view.told, view.same = told, True
+        if lately:
             return False
-        view.told, view.told_ns = told, now_ns
+        view.told_ns = now_ns
         return True
 
-    def _say(self, vehicle: str, path: Sequence[int], wish: Wish) -> _Said:
+    def _say(self, vehicle: str, path: list[int], wish: Wish) -> _Said:
         asked = self._askable(vehicle, path, wish)
-        still = len(path) == 1
-        wants = list(asked.wants) if still else []
-        better = asked.better if still else 0
-        ahead = list(asked.ahead)
-        plots = list(map(self._plots.of, path))
-        near = dict.fromkeys((*plots, *map(self._plots.of, (*asked.ahead[:1], *wants))))
-        near.pop(-1, None)
-        stands: list[tuple[int, Stand, object]] = []
+        ahead, wants, better = [*asked.ahead], list[int](), 0
+        if len(path) == 1:
+            wants, better = [*asked.wants], asked.better
+        plot_of = self._plot_of.__getitem__
+        concerned = [*path, *ahead[:1], *wants]
+        near: Collection[int] = {*map(plot_of, concerned)}
+        if len(near) > 1:
+            near = dict.fromkeys(plot for plot in map(plot_of, concerned) if plot >= 0)
+        stands: dict[int, _Told] = {}
         for plot in near:
-            all_here = len(near) == 1
-            holds = list(path) if all_here else [cell for cell, of in zip(path, plots, strict=True) if of == plot]
+            holds = path if len(near) == 1 else [cell for cell in path if plot_of(cell) == plot]
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
-            stands.append((plot, stand, (vehicle, path[0], holds, ahead, better)))
+            stands[plot] = stand, (vehicle, path[0], holds, ahead, better)
         return _Said(wish, path, stands)
 
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
         """Without cells that were left or given back while a table still grants them: granted anew, such a cell
         could not be told from one that is about to be freed."""
+        wanted = {*wish.ahead, *wish.wants}
+        if not wanted:
+            return wish
         lapsed: set[int] = set()
-        for view in self._views.values():
-            lapsed.update(view.seen.get(vehicle, ()))
+        for plot in set(map(self._plot_of.__getitem__, wanted)):
+            view = self._views.get(plot)
+            if view is not None and vehicle in view.seen:
+                lapsed.update(wanted.intersection(view.seen[vehicle]))
         lapsed.difference_update(path)
-        if not lapsed or (lapsed.isdisjoint(wish.ahead) and lapsed.isdisjoint(wish.wants)):
+        if not lapsed:
             return wish
         ahead = list(takewhile(lambda cell: cell not in lapsed, wish.ahead))
         better = sum(cell not in lapsed for cell in wish.wants[: wish.better])
         return Wish(ahead, [cell for cell in wish.wants if cell not in lapsed], better, wish.age_ms)
 
-    def _forget_left(self, by_plot: Mapping[int, Sequence[object]]) -> None:
+    def _forget_left(self, by_plot: Mapping[int, Mapping[str, _Told]]) -> None:
         """Leave the plots where we hold and want nothing, once their tables show that they know it."""
-        for plot, said in by_plot.items():
+        for plot, stands in by_plot.items():
             view = self._views.setdefault(plot, _View())
-            if said:
+            if stands:
                 view.quiet = None
             elif view.quiet is None:
                 view.quiet = self._seq

@@ -121,12 +121,11 @@ def a_silent_guest_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
     tick = Warden.tick
 
     def leasing(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
-        for host in list(self._guests):
+        for host in self._grants.by_host.keys() - self._fleets.keys():
             heard = self._hosts.get(host)
             if heard is not None and now_ns - heard.spoke_ns > SILENT_NS:
                 for vehicle in self._granted_to(host):
-                    del self._grants[vehicle]
-                    self._count_guest(vehicle, 0)
+                    self._grants.set(vehicle, [], self._next_stamp)
         return tick(self, now_ns)
 
     patch.setattr(Warden, "tick", leasing)

@@ -17,6 +17,7 @@ from support.traffic_world import Faults, Process, TrafficWorld
 
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Grant
+from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.warden import Warden
@@ -185,7 +186,8 @@ def frees_what_nobody_reported(patch: pytest.MonkeyPatch) -> None:
     tick = Warden.tick
 
     def greedy(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
-        self._grants = {vehicle: Grant(each.cells[-1:], each.stamp) for vehicle, each in self._grants.items()}
+        last = {vehicle: Grant(each.cells[-1:], each.stamp) for vehicle, each in self._grants.of.items()}
+        self._grants = Grants(last)
         return tick(self, now_ns)
 
     patch.setattr(Warden, "tick", greedy)

@@ -67,13 +67,11 @@ class Driver:
 
         stopped  whether a vehicle has to stand
         """
-        for id in list(self._left_s):
+        driving, self._left_s = self._left_s, {}
+        for id, left_s in driving.items():
             vehicle = vehicles.get(id)
-            left_s = 0.0 if vehicle is None else self._drive(vehicle, self._left_s[id], stopped)
-            if left_s > 0.0:
+            if vehicle is not None and (left_s := self._drive(vehicle, left_s, stopped)) > 0.0:
                 self._left_s[id] = left_s
-            else:
-                del self._left_s[id]
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
         """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
@@ -95,7 +93,7 @@ class Driver:
             before = motion.cell
             had_s, head = left_s, motion.head
             length_m = motion.length_m - motion.border_m if self._pulled else motion.length_m
-            climbing = climbing_of(motion, self._climb, self._pulled)
+            climbing = 1.0 if self._climb is None else climbing_of(motion, self._climb, self._pulled)
             pace_s_per_m = self._physics.item(before if self._pulled else head) * climbing
             if self._dynamics is None:
                 left_s = motion.advance(left_s, pace_s_per_m)
@@ -152,13 +150,11 @@ class Driver:
         self._holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))
 
 
-def climbing_of(motion: Motion, climb: Climb | None, pulled: bool) -> float:
+def climbing_of(motion: Motion, climb: Climb, pulled: bool) -> float:
     """What a metre of the stretch on which a vehicle is takes, over one on the level and in still air.
 
     pulled  whether it leads along a segment, in any direction
     """
-    if climb is None:
-        return 1.0
     if not pulled:
         return climb.driven(motion.tail, motion.head)
     (row0, col0), (row1, col1), _ = motion.stretch()

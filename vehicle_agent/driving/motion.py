@@ -21,6 +21,7 @@ class Motion:
     there on.
 
     cell         the one cell that the vehicle occupies
+    at_rest      whether it stands where a step ends, so that it may set out in any direction
     done_m       metres driven of the step
     length_m     metres of the step; 0 at rest
     border_m     metres of it up to the border
@@ -32,6 +33,7 @@ class Motion:
         "_grid",
         "_to",
         "_via",
+        "at_rest",
         "border_m",
         "cell",
         "done_m",
@@ -53,9 +55,10 @@ class Motion:
         self.tail = self.head = self.cell = cell
         self._at = self._to = middle_of(self._grid, cell)
         self.done_m = self.length_m = self.border_m = 0.0
+        self.at_rest = True
 
     def _settle(self) -> None:
-        """Find the cell anew. It is asked for seven times as often as it may change."""
+        """Find the cell anew. As whether it rests, it is asked for far more often than it changes."""
         self.cell = self.tail if self.done_m < self.border_m else self.head
 
     @property
@@ -67,11 +70,6 @@ class Motion:
     def left_m(self) -> float:
         """Metres of the step that are not driven yet."""
         return self.length_m - self.done_m
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether it stands where a step ends, so that it may set out in any direction."""
-        return self.tail == self.head
 
     @property
     def entering(self) -> int | None:
@@ -91,6 +89,7 @@ class Motion:
         way = way_of(self._grid, (self.head, self._at), (cell, self._to))
         self._via, self.border_m, self.length_m = way.via, way.border_m, way.length_m
         self.head = cell
+        self.at_rest = False
         self.done_m = 0.0
         self.heading_rad = way.heading_rad
         self._settle()
@@ -114,12 +113,14 @@ class Motion:
         needed_s = (goal_m - self.done_m) * pace_s_per_m
         if needed_s > seconds:
             self.done_m += seconds / pace_s_per_m
-            self._settle()  # rounding may take it to the border
+            if self.done_m >= self.border_m:  # rounding may take it there
+                self.cell = self.head
             return 0.0
         self.done_m = goal_m
         if goal_m == self.length_m:
             self.tail, self._at = self.head, self._to
             self.done_m = self.length_m = self.border_m = 0.0
+            self.at_rest = True
         self._settle()
         return seconds - needed_s
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +25,16 @@ class Places:
 
     def __init__(self, grid: GridSpec, vehicles: Iterable[Vehicle]) -> None:
         self.vehicles = list(vehicles)
-        motions = [vehicle.motion for vehicle in self.vehicles]
-        self.cells: NDArray[np.int64] = np.array([motion.cell for motion in motions], np.int64)
-        stretches = [motion.stretch() for motion in motions]
-        points = np.array([(*begin, *end) for begin, end, _ in stretches], np.float64).reshape(-1, 4)
-        shares = np.array([share for *_, share in stretches], np.float64).reshape(-1, 1)
-        begins, ends = points[:, :2], points[:, 2:]
+        rows: list[tuple[float, ...]] = []
+        for motion in [vehicle.motion for vehicle in self.vehicles]:
+            begin, end, share = motion.stretch()
+            rows.append((*begin, *end, share, motion.heading_rad, motion.cell))
+        numbers = np.fromiter(chain.from_iterable(rows), np.float64, 7 * len(rows)).reshape(-1, 7)
+        begins, ends, shares = numbers[:, :2], numbers[:, 2:4], numbers[:, 4:5]
         self.south_m: NDArray[np.float64]
         self.east_m: NDArray[np.float64]
         self.south_m, self.east_m = (begins + shares * (ends - begins) + 0.5).T * grid.resolution_m
+        self.heading_rad: NDArray[np.float64] = numbers[:, 5]
+        self.cells: NDArray[np.int64] = numbers[:, 6].astype(np.int64)
         row, col = np.divmod(self.cells, grid.cols)
-        self.heading_rad: NDArray[np.float64] = np.array([motion.heading_rad for motion in motions], np.float64)
         self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS

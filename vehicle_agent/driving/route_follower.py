@@ -17,11 +17,12 @@ _LEAST_PART = 1e-9
 class Follower:
     """The cells of a route and how far along it the vehicle is. Without a route no cell is ahead.
 
+    left     how many cells are ahead
     changes  how often it has been another route: begun, dropped or cut
     version  how often it, or how far along it the vehicle is, has changed
     """
 
-    __slots__ = ("_at", "_bounds", "_cells", "_turn_cells", "_turns", "changes", "partial", "version")
+    __slots__ = ("_at", "_bounds", "_cells", "_turn_cells", "_turns", "changes", "left", "partial", "version")
 
     def __init__(self) -> None:
         self._cells: list[int] = []
@@ -30,7 +31,7 @@ class Follower:
         """Of a pulled route the indices of the cells in which it turns, its first and last included; and those."""
         self._turn_cells: Sequence[int] = ()
         self._bounds: tuple[int, int, int, int] | None = None
-        self.changes = self.version = 0
+        self.left = self.changes = self.version = 0
         self.partial = False
         """Whether the route ends before its target, because the planner gave a part of it."""
 
@@ -57,6 +58,7 @@ class Follower:
 
     def _set(self, cells: list[int], at: int) -> None:
         self._cells, self._at, self._bounds = cells, at, None
+        self.left = max(len(cells) - at - 1, 0)
         self.changes += 1
         self.version += 1
 
@@ -69,16 +71,23 @@ class Follower:
 
     def moved(self, cell: int) -> None:
         """The vehicle has entered a cell: the next one of its route, or one further on, or none."""
-        if cell in self._cells[self._at : self._at + _SKIPPED_CELLS]:
-            self._at = self._cells.index(cell, self._at)
+        index = self._find(cell)
+        if index is not None:
+            self._at = index
+            self.left = len(self._cells) - self._at - 1
             self.version += 1
 
     def after(self, cell: int, count: int) -> list[int]:
         """The next `count` cells behind a cell of the route; none if the cell is not on it."""
-        if cell not in self._cells[self._at : self._at + _SKIPPED_CELLS]:
-            return []
-        first = self._cells.index(cell, self._at) + 1
-        return self._cells[first : first + max(count, 0)]
+        index = self._find(cell)
+        return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)]
+
+    def _find(self, cell: int) -> int | None:
+        """Where on the route a cell is to which the vehicle may come next; None if it is not one of those."""
+        try:
+            return self._cells.index(cell, self._at, self._at + _SKIPPED_CELLS)
+        except ValueError:
+            return None
 
     def point(self, cell: int, cols: int) -> tuple[float, float] | None:
         """Where a pulled route leads through one of its next cells, as row and col: the middle of its segment's
@@ -86,9 +95,9 @@ class Follower:
 
         A cell that the segment does not cross, whatever a planner says, is driven through its middle.
         """
-        if not self._turns or cell not in self._cells[self._at : self._at + _SKIPPED_CELLS]:
+        index = self._find(cell) if self._turns else None
+        if index is None:
             return None
-        index = self._cells.index(cell, self._at)
         leg = bisect_left(self._turns, index)
         if leg == len(self._turns) or self._turns[leg] == index:
             return None
@@ -122,12 +131,6 @@ class Follower:
         """The next `count` cells, or all that are left, without the one on which the vehicle is."""
         first = self._at + 1
         return self._cells[first:] if count is None else self._cells[first : first + count]
-
-    @property
-    def left(self) -> int:
-        """How many cells are ahead."""
-        left = len(self._cells) - self._at - 1
-        return left if left > 0 else 0
 
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
         """End the route before the first step ahead that is not passable; True if there is one.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+import msgspec
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -39,8 +40,7 @@ class Reason(enum.Enum):
 # --- what passes between a vehicle and its agent -------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class GivenRoute:
+class GivenRoute(msgspec.Struct, frozen=True):
     """A route from a planner, requested or pushed.
 
     cells          the first is where the planner took the vehicle to be
@@ -61,8 +61,7 @@ class GivenRoute:
     turns: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class AskRoute:
+class AskRoute(msgspec.Struct, frozen=True):
     """A vehicle needs a route from its cell. `force` asks the planner to grow its tree for it if it must."""
 
     vehicle: str
@@ -72,8 +71,7 @@ class AskRoute:
     reason: Reason
 
 
-@dataclass(frozen=True, slots=True)
-class Follow:
+class Follow(msgspec.Struct, frozen=True):
     """A vehicle has begun a route, from the cell on which it stands.
 
     legs  of a pulled route over how many steps each of its segments goes
@@ -101,6 +99,23 @@ class Vehicle:
     asked         the target of the open route request, None if there is none
     searching     whether its last route led to a place where its target may be, which nobody sees
     """
+
+    __slots__ = (
+        "_ask_due_ns",
+        "_need",
+        "_retry_ns",
+        "asked",
+        "gone_since_ns",
+        "id",
+        "in_reach",
+        "motion",
+        "planner_gone",
+        "route",
+        "searching",
+        "state",
+        "target",
+        "tracked",
+    )
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
         self.id = id

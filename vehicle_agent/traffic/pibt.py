@@ -9,7 +9,7 @@ and none go around in a ring.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 _DEEPEST = 200
@@ -36,7 +36,7 @@ class Round:
     """One round of planning in one plot.
 
     movers  all that are at rest
-    closed  cells that stay occupied, whatever is planned
+    closed  whether a cell stays occupied, whatever is planned
     inside  whether a cell belongs to the plot
 
     to      vehicle -> the cell that it is to go to; its own if it stays
@@ -44,7 +44,9 @@ class Round:
     pushed  vehicle -> the age of the one that it could not make way for within the plot
     """
 
-    def __init__(self, movers: Sequence[Mover], closed: Collection[int], inside: Callable[[int], bool]) -> None:
+    def __init__(
+        self, movers: Sequence[Mover], closed: Callable[[int], bool], inside: Callable[[int], bool]
+    ) -> None:
         self.to: dict[str, int] = {}
         self.taken: dict[int, str] = {}
         self.pushed: dict[str, int] = {}
@@ -79,7 +81,7 @@ class Round:
                 if pushed or mover.outside:
                     continue
                 return False  # it waits for the other plot's warden
-            if cell in self.taken or cell in self._closed or cell in self._chain:
+            if cell in self.taken or cell in self._chain or self._closed(cell):
                 continue
             other = self._standing.get(cell)
             if other is not None and (self.to.get(other.id) == mover.cell or len(self._chain) >= _DEEPEST):

@@ -43,6 +43,7 @@ class Steering:
     bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
     climb        says which steps are too steep; None if none is
 
+    waiting_ns   vehicle -> the cell on which it waits, and since when; whoever lets it go on deletes it
     ways_out     cell that only an operator's zone closes -> steps from there out of it: who stands there leaves
     """
 
@@ -64,8 +65,7 @@ class Steering:
         self._bodies = bodies
         self._shut = bodies.closed
         self.ways_out: Mapping[int, int] = {}
-        self._stood_ns: dict[str, tuple[int, int]] = {}
-        """Vehicle -> the cell on which it waits, and since when."""
+        self.waiting_ns: dict[str, tuple[int, int]] = {}
 
     def closed(self, cell: int) -> bool:
         """Whether a cell is lethal, or a body closes it."""
@@ -121,7 +121,7 @@ class Steering:
         age_ms     for how long it has been on its way
         held       the cells that vehicles hold
         in_reach   whether a target is within capture range of a cell
-        lot        decides between cells that are as good as each other
+        lot        decides between cells that are as good as each other, for one that stands
         """
         here, still = path[0], len(path) == 1
         age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
@@ -165,22 +165,23 @@ class Steering:
         """Whether a body is on a cell or comes to it: who stands there makes way before all others."""
         return self._bodies.any and (cell in self._shut or self._bodies.danger(cell) > 0.0)
 
-    def blocked(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> bool:
-        """Whether it stands though its route goes on. Asks for another route after a while."""
-        if len(path) > 1 or vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
-            if self._stood_ns:
-                self._stood_ns.pop(vehicle.id, None)
+    def blocked(self, vehicle: Vehicle, now_ns: int) -> bool:
+        """Whether one that holds no cell but its own stands though its route goes on. Asks for another route after
+        a while."""
+        if vehicle.in_reach or not vehicle.motion.at_rest or not vehicle.route.left:
+            self.waiting_ns.pop(vehicle.id, None)
             return False
-        cell, since_ns = self._stood_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
+        cell, since_ns = self.waiting_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
         if cell != vehicle.cell or now_ns - since_ns > _BLOCKED_NS:
-            del self._stood_ns[vehicle.id]
+            del self.waiting_ns[vehicle.id]
             if cell == vehicle.cell:
                 vehicle.blocked_for_long(now_ns)
         return True
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""
-        ahead = vehicle.route.after(path[-1], self._reserve - len(path) + 1)
+        left = self._reserve - len(path) + 1
+        ahead = vehicle.route.after(path[-1], left) if left > 0 else []
         for index, (tail, head) in enumerate(pairwise((path[-1], *ahead))):
             if not self.passable(tail, head):
                 return ahead[:index]

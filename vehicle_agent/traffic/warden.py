@@ -6,8 +6,9 @@ alone on its cells (see decision 25 for the proof).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections import ChainMap
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain
 from zlib import crc32
@@ -16,7 +17,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.right_of_way.lives import BEAT_NS, is_far_ahead
 from swarm.right_of_way.plots import Plots
-from swarm.wire.messages.traffic import Grant, Granted, Shut, Stamp, Stand, Standing, Table
+from swarm.wire.messages.traffic import Granted, Shut, Stamp, Stand, Standing, Table
+from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
@@ -34,6 +36,7 @@ MOST_CELLS_OF_GUESTS = 1 << 14
 """Cells of one plot that all guests together hold: a quarter of one as large as a region."""
 _MOST_BESIDE = 1 << 12
 _NO_CELLS: Sequence[int] = []
+_NO_GRANTS: Mapping[str, list[int]] = {}
 _MOST_CELLS = 64
 """Of one vehicle: what a `Grant` has room for."""
 
@@ -55,33 +58,43 @@ def _lot(vehicle: str, step: int) -> int:
     return crc32(f"{vehicle}/{step}".encode())
 
 
+def _rests(stand: Stand, cells: Sequence[int]) -> bool:
+    """Whether a vehicle stands, with nothing granted to it but where it does."""
+    return stand.cell == stand.end and (not cells or cells == [stand.cell])
+
+
 @dataclass(slots=True)
 class _Host:
     """What was heard of a host.
 
     standing  the newest of its newest life, and when it came; None if none counts
+    stands    of that, vehicle -> what is said of it, of the vehicles that the host may speak for
+    asking    those of them that stand, or would go further than they are granted; whoever else is under way wants
+              nothing now
     spoke_ns  when anything came, of any of its lives: one that is replaced is told so
     told      what was granted to it last, and when
     """
 
     spoke_ns: int
     standing: Standing | None = None
+    stands: dict[str, Stand] = field(default_factory=dict)
+    asking: Sequence[Stand] = ()
     heard_ns: int = 0
     told: object = None
     told_ns: int = 0
 
 
-class _Beside(dict[int, tuple[int, ...]]):
+class _Beside(dict[int, frozenset[int]]):
     """Cell -> the cells beside it in a grid of so many columns, of cells that were asked for lately."""
 
     def __init__(self, cols: int) -> None:
         self._cols = cols
 
-    def __missing__(self, cell: int) -> tuple[int, ...]:
+    def __missing__(self, cell: int) -> frozenset[int]:
         if len(self) >= _MOST_BESIDE:
             self.clear()
         north, south = cell - self._cols, cell + self._cols
-        around = north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1
+        around = frozenset((north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1))
         self[cell] = around
         return around
 
@@ -104,17 +117,13 @@ class Warden:
         self._me = me
         self._fleets = fleets
         self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
-        self._grants: dict[str, Grant] = dict(table.grants)
-        """Vehicle -> what it is granted. Each is made once and stands in every table until it changes."""
+        self._grants = Grants(table.grants)
         self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
-        self._guests: dict[str, dict[str, int]] = {}
-        """Guest -> its vehicles that are granted cells here, and how many cells."""
-        for vehicle, grant in self._grants.items():
-            if agent_of(vehicle) not in fleets:
-                self._guests.setdefault(agent_of(vehicle), {})[vehicle] = len(grant.cells)
         self._hosts: dict[str, _Host] = {}
         self._beside = _Beside(plots.grid.cols)
         self._pushed: dict[str, int] = {}
+        self._before: dict[str, Sequence[int]] = {}
+        """Vehicle -> what it was granted before the plan that is being made has granted it more."""
         self._granted = True  # since the last table: something that a host waits for
         self._changed = False  # or anything else
         self._told: Table | None = None
@@ -150,12 +159,13 @@ class Warden:
         self._lives[host] = (standing.life, standing.seq)
         if not standing.vehicles and (known.standing is None or known.standing.vehicles):
             self._changed = True  # it leaves the plot as soon as a table counts this
-        holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
-        for vehicle in self._granted_to(host):
-            held = holds.get(vehicle, _NO_CELLS)
-            if held != self._grants[vehicle].cells:
-                self._free(vehicle, held, standing.knows)
-        known.standing, known.heard_ns = standing, now_ns
+        stands = self._stands_of(standing)
+        for vehicle, cells in list(self._grants.by_host.get(host, _NO_GRANTS).items()):
+            stand = stands.get(vehicle)
+            if stand is None or stand.holds != cells:
+                self._free(vehicle, _NO_CELLS if stand is None else stand.holds, standing.knows)
+        known.standing, known.stands, known.heard_ns = standing, stands, now_ns
+        known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
         # Only now: a life that is itself replaced and has not stopped must not open what a vehicle may stand on.
         self._enter_again(standing, self._open(standing))
         if standing.life in standing.dead:
@@ -175,16 +185,15 @@ class Warden:
         """A guest that stands on a cell which was shut for an earlier life of it gets it before all others."""
         if not opened:
             return
-        opened.difference_update(cell for grant in self._grants.values() for cell in grant.cells)
+        opened.difference_update(cell for grant in self._grants.of.values() for cell in grant.cells)
         for (host, _), cells in self._shut.items():
             if host != standing.agent:
                 opened.difference_update(cells)
         for stand in standing.vehicles:
-            before = self._cells_of(stand.vehicle)
+            before = self._grants.cells_of(stand.vehicle)
             ours = self._is_of(stand.vehicle, standing.agent)
             if ours and _is_entering(stand) and stand.cell in opened and len(before) < _MOST_CELLS:
-                self._grants[stand.vehicle] = Grant([*before, stand.cell], self._next_stamp)
-                self._count_guest(stand.vehicle, len(before) + 1)
+                self._grants.set(stand.vehicle, [*before, stand.cell], self._next_stamp)
                 self._granted = True
 
     def _is_welcome(self, host: str) -> bool:
@@ -198,15 +207,17 @@ class Warden:
         """Whether a vehicle is one that the host may speak for."""
         return vehicle in self._fleets[host] if host in self._fleets else agent_of(vehicle) == host
 
-    def _cells_of(self, vehicle: str) -> Sequence[int]:
-        """The cells that a vehicle is granted."""
-        grant = self._grants.get(vehicle)
-        return _NO_CELLS if grant is None else grant.cells
+    def _stands_of(self, standing: Standing) -> dict[str, Stand]:
+        """Vehicle -> what is said of it, of those that the host may speak for."""
+        fleet = self._fleets.get(standing.agent)
+        if fleet is None:
+            return {each.vehicle: each for each in standing.vehicles if agent_of(each.vehicle) == standing.agent}
+        return {each.vehicle: each for each in standing.vehicles if each.vehicle in fleet}
 
     def _granted_to(self, host: str) -> list[str]:
         """The vehicles of a host that are granted cells."""
-        vehicles = self._fleets[host] if host in self._fleets else self._guests.get(host, ())
-        return [vehicle for vehicle in vehicles if vehicle in self._grants]
+        vehicles = self._fleets[host] if host in self._fleets else self._grants.by_host.get(host, ())
+        return [vehicle for vehicle in vehicles if vehicle in self._grants.of]
 
     def _ended(self, host: str, ended: int, life: int) -> None:
         """A life's own word that it drives no more."""
@@ -226,15 +237,15 @@ class Warden:
         if (host, before) in self._shut:
             del self._shut[host, before]
         elif before and mine:
-            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants[vehicle].cells]
+            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants.cells_of(vehicle)]
         for vehicle in mine:
-            self._grants[vehicle] = Grant(self._grants[vehicle].cells, self._next_stamp)
+            self._grants.set(vehicle, self._grants.of[vehicle].cells, self._next_stamp)
         self._hosts[host].standing = self._hosts[host].told = None
         self._granted = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
         """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
-        cells, stamp = self._grants[vehicle].cells, self._grants[vehicle].stamp
+        cells, stamp = self._grants.of[vehicle].cells, self._grants.of[vehicle].stamp
         if knows >= stamp:
             kept = [cell for cell in cells if cell in holds]
         elif holds and holds[0] in cells:
@@ -243,21 +254,7 @@ class Warden:
             return
         if len(kept) < len(cells):
             self._changed = True
-            if kept:
-                self._grants[vehicle] = Grant(kept, stamp)
-            else:
-                del self._grants[vehicle]
-            self._count_guest(vehicle, len(kept))
-
-    def _count_guest(self, vehicle: str, cells: int) -> None:
-        """Keep account of how many cells guests hold."""
-        host = agent_of(vehicle)
-        if host in self._fleets:
-            return
-        held = self._guests.setdefault(host, {})
-        held[vehicle] = cells
-        if not cells:
-            del held[vehicle]
+            self._grants.set(vehicle, kept, stamp)
 
     # --- what is granted ------------------------------------------------------------------------------------
 
@@ -281,7 +278,7 @@ class Warden:
             epoch=self.epoch,
             seq=self.seq,
             hosts=dict(self._lives),
-            grants=dict(self._grants),
+            grants=dict(self._grants.of),
             shut=[Shut(host, life, list(cells)) for (host, life), cells in self._shut.items()],
             pushed=dict(self._pushed),
         )
@@ -291,20 +288,20 @@ class Warden:
         if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
             return
         self._said_of, self._said_ns = table, now_ns
+        current = table is self._told and not (self._granted or self._changed)
+        grants_of = self._grants if current else Grants(table.grants)
         shut = {cell for shut in table.shut for cell in shut.cells}
-        held = shut.union(*(grant.cells for grant in table.grants.values()))
-        by_host: dict[str, dict[str, list[int]]] = {name: {} for name in self._hosts}
-        for vehicle, grant in table.grants.items():
-            by_host.setdefault(agent_of(vehicle), {})[vehicle] = grant.cells
+        held = shut.union(*grants_of.cells.values())
         for name, host in self._hosts.items():
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             life, heard = table.hosts.get(name, (0, 0))
-            grants = by_host[name]
+            grants = dict(grants_of.by_host.get(name, _NO_GRANTS))
             # Also around those under way: what they want once they come to rest depends on who is there.
             stands = () if host.standing is None else host.standing.vehicles
-            near = set(chain.from_iterable(map(self._beside.__getitem__, {stand.end for stand in stands})))
-            occupied = sorted((near & held).difference(*grants.values()) | (near & shut))
+            others = held.difference(grants_of.cells.get(name, ())) | shut
+            near = [around for stand in stands if not others.isdisjoint(around := self._beside[stand.end])]
+            occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             says = (life, grants, pushed, occupied, 0 if stands else heard)
             if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
@@ -324,34 +321,38 @@ class Warden:
             )
 
     def _plan(self, now_ns: int) -> None:
-        stands = self._stands(now_ns)
-        held = {cell for cells in self._shut.values() for cell in cells}
-        held.update(chain.from_iterable([grant.cells for grant in self._grants.values()]))
-        closed = set(held)
+        hosts = [
+            host
+            for host in self._hosts.values()
+            if host.standing is not None and now_ns - host.heard_ns <= SILENT_NS
+        ]
+        # Whoever has been on its way for longest first.
+        asking = sorted(chain.from_iterable([host.asking for host in hosts]), key=_turn)
+        shut = {cell for cells in self._shut.values() for cell in cells}
+        held = ChainMap(self._grants.holders, dict.fromkeys(shut, ""))
+        self._before.clear()
         movers: dict[str, Mover] = {}
-        for stand in stands:
-            grant = self._grants.get(stand.vehicle)
-            cells = _NO_CELLS if grant is None else grant.cells
+        for stand in asking:
+            cells = self._grants.cells_of(stand.vehicle)
             if not cells and _is_entering(stand):
                 continue  # nobody makes way for it
-            if stand.cell != stand.end or (cells and cells != [stand.cell]):
-                # It is under way: whoever wants a cell that it will leave may wait for it.
-                closed.difference_update(cells[:-1] if stand.end in cells else cells)
-                continue
-            closed.difference_update(cells)
-            movers[stand.vehicle] = Mover(
-                stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
-            )
-        for cells in self._shut.values():
-            closed.update(cells)
-        round = Round(list(movers.values()), closed, lambda cell: self._plots.of(cell) == self._plot)
-        for stand in stands:
+            if _rests(stand, cells):
+                movers[stand.vehicle] = Mover(
+                    stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
+                )
+        stands: Mapping[str, Stand] = ChainMap(*[host.stands for host in hosts])
+        round = Round(
+            list(movers.values()),
+            lambda cell: cell in shut or self._stays(cell, stands),
+            lambda cell: self._plots.of(cell) == self._plot,
+        )
+        for stand in asking:
             mover = movers.get(stand.vehicle)
             if mover is not None:
                 round.plan(mover)
             elif stand.ahead:
                 self._grant(stand, self._next_ahead(stand), held, round.taken)
-        for stand in stands:
+        for stand in asking:
             to = round.to.get(stand.vehicle)
             if to is not None and to != stand.cell:
                 ahead = stand.ahead if stand.ahead[:1] == [to] else [to]
@@ -360,39 +361,40 @@ class Warden:
             self._pushed = round.pushed
             self._granted = True
 
-    def _stands(self, now_ns: int) -> list[Stand]:
-        """The vehicles of all who have spoken lately, whoever has been on its way for longest first."""
-        stands: list[Stand] = []
-        for name, host in self._hosts.items():
-            if host.standing is None or now_ns - host.heard_ns > SILENT_NS:
-                continue
-            fleet = self._fleets.get(name)
-            if fleet is not None:
-                stands += [stand for stand in host.standing.vehicles if stand.vehicle in fleet]
-            else:
-                stands += [stand for stand in host.standing.vehicles if agent_of(stand.vehicle) == name]
-        return sorted(stands, key=_turn)
+    def _stays(self, cell: int, stands: Mapping[str, Stand]) -> bool:
+        """Whether a cell stays occupied, whatever is planned. Whoever wants one that a vehicle under way will leave
+        may wait for it; one that stands can be pushed.
+
+        stands  vehicle -> what is said of it, by the hosts that have spoken lately
+        """
+        vehicle = self._grants.holders.get(cell)
+        if vehicle is None:
+            return False
+        stand = stands.get(vehicle)
+        if stand is None:
+            return True
+        cells = self._before.get(vehicle) or self._grants.cells_of(vehicle)
+        return cell == cells[-1] and stand.end in cells and not _rests(stand, cells)
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""
-        cells = self._cells_of(stand.vehicle)
+        cells = self._grants.cells_of(stand.vehicle)
         if not cells or cells[-1] == stand.end or stand.end not in cells:
             return stand.ahead if not cells or stand.end in cells else []
         last = cells[-1]
         return stand.ahead[stand.ahead.index(last) + 1 :] if last in stand.ahead else []
 
-    def _grant(self, stand: Stand, ahead: Sequence[int], held: set[int], taken: dict[int, str]) -> None:
+    def _grant(self, stand: Stand, ahead: Sequence[int], held: Container[int], taken: dict[int, str]) -> None:
         """Append free cells, up to the first that is not."""
         for cell in ahead:
             mine = taken.setdefault(cell, stand.vehicle) == stand.vehicle
             if not mine or cell in held or self._plots.of(cell) != self._plot:
                 return
-            cells = self._cells_of(stand.vehicle)
+            cells = self._grants.cells_of(stand.vehicle)
             if len(cells) >= _MOST_CELLS or not self._guest_may_hold_more(stand.vehicle):
                 return
-            held.add(cell)
-            self._grants[stand.vehicle] = Grant([*cells, cell], self._next_stamp)
-            self._count_guest(stand.vehicle, len(cells) + 1)
+            self._before.setdefault(stand.vehicle, cells)
+            self._grants.set(stand.vehicle, [*cells, cell], self._next_stamp)
             self._granted = True
 
     def _guest_may_hold_more(self, vehicle: str) -> bool:
@@ -400,7 +402,8 @@ class Warden:
         host = agent_of(vehicle)
         if host in self._fleets:
             return True
-        if sum(self._guests.get(host, {}).values()) >= MOST_CELLS_OF_GUEST:
+        held, fleets = self._grants.by_host, self._fleets
+        if sum(map(len, held.get(host, _NO_GRANTS).values())) >= MOST_CELLS_OF_GUEST:
             return False
-        together = sum(sum(held.values()) for held in self._guests.values())
+        together = sum(sum(map(len, cells.values())) for guest, cells in held.items() if guest not in fleets)
         return together < MOST_CELLS_OF_GUESTS

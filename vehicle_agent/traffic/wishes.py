@@ -60,8 +60,9 @@ class Wishes:
         self._target_cell = target_cell
         self._in_reach = in_reach
         self._seed = seed
-        self._made_of: dict[str, tuple[object, ...]] = {}
-        """Vehicle -> what its wish was made of, but for the cells near it."""
+        self._made_of: dict[str, tuple[tuple[object, ...], int, int]] = {}
+        """Vehicle -> what its wish was made of, but for the cells near it; and from when until when that is so as
+        far as time has a part in it."""
         self._beside: dict[str, frozenset[int]] = {}
         """Vehicle at rest -> the cells on which it matters whether somebody holds them."""
         self._changed: list[Window] = []
@@ -104,6 +105,13 @@ class Wishes:
             id, target, near = vehicle.id, vehicle.target, vehicle.in_reach
             path = paths[id]
             still = len(path) == 1
+            place = self._target_cell(target) if near else None
+            pushed_ms = pushed.get(id, 0)
+            made_of = path, vehicle.route.version, target, near, place, pushed_ms
+            kept = known.get(id)
+            same = kept is not None and kept[0] == made_of and kept[1] <= now_ns < kept[2]
+            if same and (not still or changed.isdisjoint(beside[id])):
+                continue
             idle = (near or target is None) and path[0] not in ways_out
             turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
             phase_ns = phases_ns.get(id)
@@ -115,16 +123,13 @@ class Wishes:
                 since_ns = since_all_ns.setdefault(id, now_ns)
             elif id in since_all_ns:
                 del since_all_ns[id]
-            place = self._target_cell(target) if near else None
-            pushed_ms = pushed.get(id, 0)
-            made_of = path, vehicle.route.version, target, near, place, pushed_ms, turn, since_ns
-            if known.get(id) == made_of and (not still or changed.isdisjoint(beside[id])):
-                continue
-            known[id] = made_of
+            began_ns = turn * turn_ns - phase_ns
+            known[id] = made_of, began_ns, began_ns + turn_ns
+            lot = 0
             if still:
                 beside[id] = self._around(path[0])
-            age_ms = 0 if since_ns is None else max(turn * turn_ns - phase_ns - since_ns, 0) // _MS
-            lot = crc32(f"{self._seed}/{id}/{turn}".encode())
+                lot = crc32(f"{self._seed}/{id}/{turn}".encode())
+            age_ms = 0 if since_ns is None else max(began_ns - since_ns, 0) // _MS
             wish = steering.wish(vehicle, path, pushed_ms, age_ms, held, self._in_reach, lot)
             if wish != self.of.get(id):
                 self.of[id] = wish
@@ -136,8 +141,9 @@ class Wishes:
         if not (changed and vehicles):
             return
         cells = np.fromiter((vehicle.cell for vehicle in vehicles), np.int64, len(vehicles))
-        places = np.stack(np.divmod(cells, self._cols), axis=1)
-        for index in np.flatnonzero(meet(np.hstack((places, places)), changed, self._near_cells)).tolist():
+        near, (row, col) = self._near_cells, np.divmod(cells, self._cols)
+        places = np.stack((row - near, col - near, row + near, col + near), 1)
+        for index in np.flatnonzero(meet(places, changed)).tolist():
             self._made_of.pop(vehicles[index].id, None)
 
     def _around(self, cell: int) -> frozenset[int]:

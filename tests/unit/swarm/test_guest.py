@@ -108,7 +108,7 @@ def test_no_guest_and_not_all_together_take_all_cells(monkeypatch: pytest.Monkey
     warden.hear(entering("rover", 0), 0)
     warden.tick(0)
     for seq in range(2, 12):  # one vehicle that never moves and always wants more
-        cells = warden._grants["rover-00"].cells
+        cells = warden._grants.of["rover-00"].cells
         ahead = list(range(cells[-1] + 1, cells[-1] + 13))
         stand = Stand("rover-00", 0, cells[-1], cells, ahead, ahead[:1], 1, 0)
         warden.hear(Standing(plot=0, agent="rover", life=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0)

@@ -35,3 +35,4 @@ def test_a_vehicle_is_in_its_tail_until_it_is_driven_to_the_border(
         elif act == "turn back":
             motion.turn_back()
         assert motion.cell == (motion.tail if motion.done_m < motion.border_m else motion.head)
+        assert motion.at_rest == (motion.tail == motion.head)

@@ -79,7 +79,7 @@ def test_directions_from_the_network_become_cells_and_back_or_nothing(cols: int,
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(0, 99), max_size=4)), max_size=20))
 def test_bounds_of_many_routes_are_those_of_each_whatever_has_changed(changes: list[tuple[int, list[int]]]) -> None:
-    routes, columns = [Follower() for _ in range(3)], RouteBounds(GRID.cols)
+    routes, columns = [Follower() for _ in range(3)], RouteBounds(GRID.cols, 2)
     for which, cells in changes:
         if which == len(routes):
             routes.append(Follower())  # a vehicle is placed, or leaves
@@ -87,7 +87,13 @@ def test_bounds_of_many_routes_are_those_of_each_whatever_has_changed(changes: l
             assert routes[which].begin(cells, cells)
         else:
             routes[which].drop()
-        assert columns.bounds(routes).tolist() == [list(route.bounds(GRID.cols)) for route in routes]
+        assert all(route.left == len(route.ahead()) for route in routes)
+        alone = [route.bounds(GRID.cols) for route in routes]
+        around = [(north - 2, west - 2, south + 2, east + 2) for north, west, south, east in alone]
+        expected = [
+            wide if route.near(1) else none for route, wide, none in zip(routes, around, alone, strict=True)
+        ]
+        assert columns.bounds(routes).tolist() == [list(each) for each in expected]
 
 
 # --- motion -------------------------------------------------------------------------------------------------

@@ -75,7 +75,7 @@ def test_a_round_of_planning_sends_no_two_to_one_cell_and_lets_the_oldest_throug
         near = [other for _, other in GRID.neighbours(cell)]
         chance.shuffle(near)
         movers.append(Mover(f"v{n}", cell, near, chance.randint(0, len(near)), age=count - n))
-    round = Round(movers, closed=set(), inside=lambda cell: True)
+    round = Round(movers, closed=lambda cell: False, inside=lambda cell: True)
     for mover in movers:
         round.plan(mover)
     assert len(set(round.to.values())) == count
@@ -189,6 +189,21 @@ def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
         assert table is not None
         first.update(vehicle for vehicle, grant in table.grants.items() if 27 in grant.cells)
     assert first == set(held.grants)
+
+
+def test_a_cell_that_one_under_way_holds_last_is_closed_though_the_same_plan_grants_it_more() -> None:
+    held = table_of(1, 1, a1=[9, 10], a2=[18])
+    warden = Warden(PLOTS, "a0", 3, held, {host: [f"{host}-00"] for host in ("a1", "a2")})
+    drives = Stand("a1-00", 9, 10, [9, 10], [11], [], 0, 9 << 12)
+    waits = Stand("a2-00", 18, 18, [18], [], [10, 26], 2, 0)
+    warden.hear(standing("a1", [9, 10], seq=2, vehicles=[drives]), 0)
+    warden.hear(standing("a2", [18], seq=2, vehicles=[waits]), 0)
+    table = warden.tick(0)
+    assert table is not None
+    assert {vehicle: grant.cells for vehicle, grant in table.grants.items()} == {
+        "a1-00": [9, 10, 11],
+        "a2-00": [18, 26],
+    }
 
 
 # --- members ------------------------------------------------------------------------------------------------
