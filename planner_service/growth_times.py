@@ -81,6 +81,10 @@ class GrowthTimes:
         self.budget_ns = cpu_budget * 1e9 / self._tick_hz
         self._choose()
 
+    def rest_ns(self, took_ns: int) -> int:
+        """How long after such work none like it may begin, so that it takes no more than the budget."""
+        return int(took_ns * 1e9 / (self.budget_ns * self._tick_hz))
+
     def note_tick(self, moved: bool) -> None:
         """Whether the target has moved since the last tick: one that stands may have a dearer tree."""
         self._ticks = min(self._ticks + 1, _TICKS)

@@ -2,7 +2,8 @@
 
 To repair a tree costs about the same however many cells have changed. With hundreds of vehicles that see something
 new in every tick, somewhere, a planner that repaired in every tick did little else. A change that no follower's
-route passes is nothing to push; so it waits, but not long.
+route passes is nothing to push; so it waits, but not long. So does any change once repairs have had their share of
+`planner.cpu_budget` (`Planner`); no route that is given passes one all the same.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.map_intake import MapIntake
+from planner_service.map_intake import LONGEST_WAIT_NS, MapIntake
 from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
@@ -116,6 +116,8 @@ class Planner:
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
         self._growing_since_ns: int | None = None
         self._dirty_since_snapshot: list[Window] = []
+        # Before this, changes of the map wait, unless somebody's route passes one: repairs keep to the budget.
+        self._rests_until_ns = 0
         # Stamp of the newest mark that is in the map and not yet in the tree.
         self._unseen_mark_ns: int | None = None
         # A full growth is to begin as soon as none is under way; loose bounds may ask for one again from then on.
@@ -300,7 +302,9 @@ class Planner:
 
     def _may_not_wait(self, now_ns: int) -> bool:
         """Whether changes of the map are to be taken in although the target stands."""
-        return not self.tree.ready or self._intake.is_due(now_ns, self._push_ns)
+        if not self.tree.ready:
+            return True
+        return now_ns >= self._rests_until_ns and self._intake.is_due(now_ns, self._push_ns)
 
     def _take_in(self, news: tuple[int, int], now_ns: int) -> None:
         dirty = self._take_dirty(now_ns)
@@ -346,6 +350,7 @@ class Planner:
             took_ns = update.cells * (MODEL_EXACT_NS_PER_CELL if update.kind == "exact" else MODEL_NS_PER_CELL)
         if update.repair_ns:
             self.counters.observe("repair_ms", update.repair_ns / 1e6)
+            self._rests_until_ns = now_ns + min(self.tree.times.rest_ns(update.repair_ns), LONGEST_WAIT_NS)
         if update.kind in ("full", "exact"):
             self._exact_ns = now_ns
             self._record_growth(took_ns - update.repair_ns, exact_move=update.kind == "exact")

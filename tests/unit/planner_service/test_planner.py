@@ -87,6 +87,29 @@ def test_map_changes_of_a_tick_are_taken_in_together(ready: World) -> None:
     ]
 
 
+def test_changes_wait_as_long_as_repairs_have_had_their_share_and_no_route_passes_them_meanwhile(
+    ready: World,
+) -> None:
+    ready.planner._push_ns = NS_PER_S // 5  # changes wait no longer, but for the budget: a tenth of a core
+    ready.tree.answers = [Update("repair", GRID.window, 9, repair_ns=80_000_000)]
+    ready.mark(1)
+    ready.tick()
+    assert len(ready.tree.named("update")) == 1
+    ready.mark(2)
+    for _ in range(7):
+        ready.tick()
+    assert len(ready.tree.named("update")) == 1
+    ready.tick()
+    assert len(ready.tree.named("update")) == 2
+    ready.tree.answers = [Update("repair", GRID.window, 9, repair_ns=80_000_000)] * 2
+    for cell, how in ((3, lambda: ready.ask(3)), (4, lambda: ready.pose(11, 20, seq=2))):
+        ready.mark(cell)
+        before = len(ready.tree.named("update"))
+        how()
+        ready.tick()
+        assert len(ready.tree.named("update")) == before + 1
+
+
 def test_a_full_growth_is_handed_to_the_worker_with_its_snapshot_and_version(world: World) -> None:
     world.pose(10, 20)
     world.mark(5)
