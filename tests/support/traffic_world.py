@@ -338,7 +338,7 @@ class TrafficWorld:
         """Ask everybody what they know of us, again and again as long as it is needed."""
 
         own = source.disk.own
-        request = KnownRequest(agent=source.agent, disk=own.disk, plot_cells=self.plots.side)
+        request = KnownRequest(agent=source.agent, disk=own.disk, plot_cells=source.rights.plots.side)
 
         def answer(to: Process) -> None:
             for action in to.ask_known(request):

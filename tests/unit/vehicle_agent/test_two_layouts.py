@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 import swarm.right_of_way.plots
-from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import MOST_PLOTS, REGION_CELLS, GridSpec
 from swarm.right_of_way.guest_service import GuestService
@@ -58,22 +57,6 @@ class Mixed(TrafficWorld):
 
     def process_of(self, agent: str, disk: Disk) -> Process:
         return Sized(self, agent, disk)
-
-    def ask_known(self, source: Any, first: bool = False) -> None:
-        request = KnownRequest(agent=source.agent, disk=source.disk.own.disk, plot_cells=source.plots.side)
-
-        def answer(to: Process) -> None:
-            for action in to.ask_known(request):
-                if isinstance(action, Known):
-                    self.carry(to, source, lambda known=action: source.hear_known(known))
-                else:
-                    to.perform([action])
-
-        if source.alive:
-            for process in self.processes if first or not source.settled else ():
-                if process.agent != source.agent:
-                    self.carry(source, process, lambda to=process: answer(to))
-            self.at(NS_PER_S, lambda: self.ask_known(source))
 
 
 @pytest.mark.parametrize(
