@@ -28,14 +28,14 @@ BURSTS = st.lists(st.integers(1, 9), min_size=12, max_size=12)
 def decoded() -> Any:
     """Node and topic -> how many payloads it has decoded."""
     counts: Counter[tuple[str, str]] = Counter()
-    before = MemoryBus.hear
+    before = MemoryBus._heard
 
-    def hear(self: MemoryBus, sample: Any, post: Any) -> None:
+    def heard(self: MemoryBus, sample: Any, together: bool = False) -> Any:
         counts[self.node, sample.topic.name] += 1
-        before(self, sample, post)
+        return before(self, sample, together)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MemoryBus, "hear", hear)
+        patch.setattr(MemoryBus, "_heard", heard)
         yield counts
 
 

@@ -47,7 +47,7 @@ def test_a_swarm_of_twenty_is_measured_and_written_into_the_page(temporary: Path
     report = json.loads(ended.stdout)
     [row] = report["rows"]
     assert row["not_measured"] == []
-    assert (row["vehicles"], row["targets"], row["agents"]) == (20, 2, 4)
+    assert (row["vehicles"], row["targets"], row["agents"]) == (20, 2, 5)
     assert 0 < row["up_s"] < 240
     assert row["routed_s"] > 0
     assert row["routed_share"] == 1.0
