@@ -14,14 +14,14 @@ from swarm.config.agents import plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import Scenario
 
-# docs/scale-figures.md and docs/scaling.md: a thousand vehicles of five agents on two cores at 5 Hz, by role. That
-# agents, vehicles and trees cost in proportion to ticks and numbers is the thumb in the rule.
-_AGENT_CORES_AT_5_HZ = 0.012
-_VEHICLE_CORES_AT_5_HZ = 0.424 / 1000
-_PLANNER_CORES = 0.026
-_OTHERS_CORES = 0.31
-_BUSY_SHARE = 2 / 3
-"""Beyond this share of the cores ticks are late: 2 % of them at 1.4 cores of 2."""
+# docs/scale-figures.md: 300 to 3,000 vehicles of five or six agents on two cores at 5 Hz. That agents, vehicles and
+# trees cost in proportion to ticks and numbers is the thumb in the rule.
+_AGENT_CORES_AT_5_HZ = 0.022
+_VEHICLE_CORES_AT_5_HZ = 0.31 / 1000
+_PLANNER_CORES = 0.011
+_OTHERS_CORES = 0.135
+_BUSY_SHARE = 3 / 4
+"""Beyond this share of the cores ticks are late: none of them at 1.4 cores of 2, 10 % at 1.9."""
 _FEW_AGENTS = 5
 _PROCESS_BYTES = 31 << 20
 _VEHICLE_BYTES = 100 << 10

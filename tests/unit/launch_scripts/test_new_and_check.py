@@ -311,7 +311,7 @@ def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int]
 
 def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
     """docs/scale-figures.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
-    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.692, 715), (1000, 512, 1.200, 882)):
+    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.450, 745), (1000, 512, 0.677, 889)):
         scenario = parse_scenario(
             f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"
             f"[vehicles]\ntick_hz = 5\nper_agent = {min(vehicles // 4, 200)}\n"
@@ -322,11 +322,11 @@ def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
 
 
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
-    scenario = parse_scenario("[[groups]]\nvehicles = 1000\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
+    scenario = parse_scenario("[[groups]]\nvehicles = 1200\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
     wanted = needs.needs_of(scenario, 512**2)
     (found,) = needs.against(scenario, wanted, needs.Machine(2, None, None), Path())
     assert found.level == "warning"
-    assert "1,000 vehicles of 40 agents and 10 targets at 5 Hz keep about 1.5 cores busy, and there" in found.text
+    assert "1,200 vehicles of 48 agents and 10 targets at 5 Hz keep about 1.7 cores busy, and there" in found.text
     assert "there are 2: ticks will be late; a larger vehicles.per_agent, fewer of them, a lower" in found.text
     assert list(needs.against(scenario, wanted, needs.Machine(4, None, None), Path())) == []
 
