@@ -3,6 +3,7 @@ compiled beside it."""
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import threading
@@ -135,7 +136,7 @@ class WarmUp:
 
 
 def _find_nothing(tell: Connection, _: None) -> None:
-    tell.send(((), ()))
+    _say(tell, ((), ()))
 
 
 def _find_missing(tell: Connection, scenario: Scenario) -> None:
@@ -143,11 +144,11 @@ def _find_missing(tell: Connection, scenario: Scenario) -> None:
     from planner_service.kernel_build import can_build, missing, name_of, needed_kernels
 
     if not can_build():
-        tell.send(((), ()))
+        _say(tell, ((), ()))
         return
     needed = needed_kernels(scenario)
     first, others = missing(needed.first), missing((*needed.classes, *needed.later))
-    tell.send((list(map(name_of, first)), list(map(name_of, others))))
+    _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
 
 
 def _build(tell: Connection, scenario: Scenario) -> None:
@@ -158,7 +159,14 @@ def _build(tell: Connection, scenario: Scenario) -> None:
     needed = needed_kernels(scenario)
     for kernels, niceness in ((needed.first, 0), ((*needed.classes, *needed.later), _BACKGROUND)):
         os.nice(niceness)
-        build(kernels, lambda kernel: tell.send(name_of(kernel)))
+        build(kernels, lambda kernel: _say(tell, name_of(kernel)))
+
+
+def _say(tell: Connection, what: object) -> None:
+    """Tell the launcher. One that has refused its scenario meanwhile hears nothing, and whoever started it must read
+    no traceback of that."""
+    with contextlib.suppress(OSError):
+        tell.send(what)
 
 
 def _end_with_launcher() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import socket
@@ -19,7 +20,7 @@ from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.run_processes import has_ended
 from launch_scripts.launcher.up import run_swarm
 from launch_scripts.launcher.up_options import UpOptions, chosen_processes
-from launch_scripts.launcher.warm_up import WarmUp
+from launch_scripts.launcher.warm_up import WarmUp, _find_missing, _find_nothing
 from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
@@ -368,7 +369,7 @@ _LAUNCHER = """
 import signal, sys, time
 from pathlib import Path
 from launch_scripts.launcher.local_swarm import LocalSwarm
-from launch_scripts.launcher.warm_up import WarmUp
+from launch_scripts.launcher.warm_up import WarmUp, _find_missing, _find_nothing
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
@@ -457,3 +458,12 @@ def test_an_added_process_that_refuses_ends_no_run(tmp_path: Path, swarms: list[
     (ending,) = endings_within(swarm)
     assert ending.refused
     assert ending.restart_in_s is not None
+
+
+def test_what_loads_kernels_for_a_launcher_that_is_gone_ends_without_a_word() -> None:
+    for what, scenario in ((_find_nothing, None), (_find_missing, Scenario())):
+        listens, tell = multiprocessing.Pipe(duplex=False)
+        listens.close()
+        what(tell, scenario)  # type: ignore[arg-type]
+        with pytest.raises(OSError, match="Broken pipe"):
+            tell.send(0)
