@@ -163,8 +163,8 @@ def _build(tell: Connection, scenario: Scenario) -> None:
 
 
 def _say(tell: Connection, what: object) -> None:
-    """Tell the launcher. One that has refused its scenario meanwhile hears nothing, and whoever started it must read
-    no traceback of that."""
+    """Tell the launcher. One that has refused its scenario meanwhile hears nothing, and whoever started it must
+    read no traceback of that."""
     with contextlib.suppress(OSError):
         tell.send(what)
 
