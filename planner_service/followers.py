@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
+from swarm.grid import GridSpec, Window, step_offsets, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteOutline, RouteStatus
@@ -81,8 +81,6 @@ class Followers:
         self._rows: tuple[list[Follower], NDArray[np.int64]] | None = None
         """All followers and their bounds, int64 (n, 4): a route changes every few seconds, and whose route a change
         concerns is asked in every tick. None once somebody has come or gone."""
-        self._step = [row * grid.cols + col for row, col in zip(STEP_ROW, STEP_COL, strict=True)]
-        """What a step in each direction adds to a cell."""
         self._told: dict[str, _Told] = {}
         """Agent's name as an author -> its newest message, for the lease."""
 
@@ -214,11 +212,11 @@ class Followers:
 
     def _steps_to(self, route: Route, cell: int) -> int | None:
         """After how many of its steps a route first comes to a cell; None if it does not."""
-        at = route.start
+        at, offsets = route.start, step_offsets(self._grid.cols)
         for steps, direction in enumerate(route.directions):
             if at == cell:
                 return steps
-            at += self._step[direction]
+            at += offsets[direction]
         return len(route.directions) if at == cell else None
 
     def _crosses(self, follower: Follower, window: Window) -> bool:

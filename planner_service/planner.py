@@ -116,7 +116,8 @@ class Planner:
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
         self._growing_since_ns: int | None = None
         self._dirty_since_snapshot: list[Window] = []
-        # Before this, changes of the map wait, unless somebody's route passes one: repairs keep to the budget.
+        # Before this, changes of the map wait, unless a route is to be given that passes one: repairs keep to the
+        # budget.
         self._rests_until_ns = 0
         # Stamp of the newest mark that is in the map and not yet in the tree.
         self._unseen_mark_ns: int | None = None

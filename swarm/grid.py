@@ -232,7 +232,7 @@ _CODES = bytes(range(8))
 
 
 @lru_cache(maxsize=16)
-def _offsets(cols: int) -> tuple[int, ...]:
+def step_offsets(cols: int) -> tuple[int, ...]:
     """What a step in each direction adds to a cell of a grid of so many columns."""
     return tuple(south * cols + east for south, east in zip(STEP_ROW, STEP_COL, strict=True))
 
@@ -253,7 +253,7 @@ def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
         raise ValueError(f"direction code {max(directions)} is not in 0..7")
     rows, cols, steps = grid.rows, grid.cols, len(directions)
     if steps <= row < rows - steps and steps <= col < cols - steps:  # so short that it cannot leave the grid
-        return list(accumulate(map(_offsets(cols).__getitem__, directions), initial=start))
+        return list(accumulate(map(step_offsets(cols).__getitem__, directions), initial=start))
     cells = [start]
     for direction in directions:
         row += STEP_ROW[direction]

@@ -16,6 +16,7 @@ from swarm.config.commented import commented
 from swarm.config.describe import expected
 from swarm.config.input_files import shown
 from swarm.config.load import BUILT_IN_TERRAINS, read_scenario
+from swarm.config.values import MOST_PER_AGENT
 from swarm.errors import ConfigError, StoreError
 
 _HEAD = """A scenario of terrain-swarm, written by `swarm new`. Every setting that is not here has its default; what
@@ -25,7 +26,7 @@ there is: docs/reference/scenario.md.
     swarm up {name}         run it; Ctrl-C ends it and leaves runs/LAST/
 """
 _NONE = ""
-_AGENTS, _LEAST_PER_AGENT, _MOST_PER_AGENT = 8, 25, 1000
+_AGENTS, _LEAST_PER_AGENT = 8, 25
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
 
 def _per_agent(vehicles: int) -> int:
     """An agent costs by itself, in every tick: few of many vehicles cost a machine less than many of few."""
-    return min(max(_LEAST_PER_AGENT, -(-vehicles // _AGENTS)), _MOST_PER_AGENT)
+    return min(max(_LEAST_PER_AGENT, -(-vehicles // _AGENTS)), MOST_PER_AGENT)
 
 
 def _from(path: Path, name: str | None) -> str:

@@ -86,6 +86,12 @@ def step_length(rule, odd):
 
 
 @helper
+def cuts_corner(v, way, x, offsets):
+    """Whether the step from padded cell `v` in direction `way` is a diagonal one that passes beside cell `x`."""
+    return way & 1 == 1 and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
+
+
+@helper
 def check_cells(cells, size):
     """Raises ValueError unless these are padded cells (int64): indices into arrays of so many. Called by kernels
     that are handed cells, because from Python it would take a microsecond."""

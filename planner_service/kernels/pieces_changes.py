@@ -11,6 +11,7 @@ from planner_service.kernels.layout import (
     GRID,
     INF,
     NONE,
+    cuts_corner,
 )
 from planner_service.kernels.pieces import (
     ALTERED,
@@ -104,9 +105,7 @@ def cut_ways(grid, labels, across, cells, before, changed):
             if way == NONE:
                 continue
             into = way == (code + 4) & 7
-            squeezed = lethal and not corners and way & 1
-            squeezed = squeezed and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
-            if into or squeezed:
+            if into or (lethal and not corners and cuts_corner(v, way, x, offsets)):
                 t, _ = tile_of(v, stride, across)
                 changed[t] |= what
                 if lethal:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
 from planner_service.kernels.compile import helper, step_kernel
-from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, diagonal_length
+from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, cuts_corner, diagonal_length
 from planner_service.kernels.parents import point_row_to_parents
 
 _NOBODY = np.int32(-1)
@@ -347,10 +347,8 @@ def _detach(grid, cost, parent, changed, before, limit, detached):
             way = parent[v]
             if way == NONE:
                 continue
-            squeezed = False
-            if lethal and not corners and way & 1:
-                squeezed = v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x
-            if squeezed or way == (k + 4) & 7:
+            closed = lethal and not corners and cuts_corner(v, way, x, offsets)
+            if closed or way == (k + 4) & 7:
                 parent[v] = NONE
                 detached[count] = v
                 count += 1

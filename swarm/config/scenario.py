@@ -15,6 +15,7 @@ from msgspec import Meta
 from swarm.config.classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.values import (
+    MOST_PER_AGENT,
     MOST_TARGETS,
     Assigner,
     CommonName,
@@ -139,7 +140,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     dynamics_options    what a plug-in for `dynamics` takes
     """
 
-    per_agent: Annotated[int, Meta(ge=1, le=1000)] = 25
+    per_agent: Annotated[int, Meta(ge=1, le=MOST_PER_AGENT)] = 25
     tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
     sense_range_m: Positive = 300.0
     capture_range_m: Positive = 150.0

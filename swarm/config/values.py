@@ -25,6 +25,8 @@ PlaceText = str
 
 RESERVED_GROUP = "operator"
 """No group is called so: zones are marks of this one, which every group hears."""
+MOST_PER_AGENT = 1000
+"""Vehicles of one agent process."""
 MOST_TARGETS = 1000
 """Of all entries together."""
 

@@ -9,13 +9,13 @@ from collections.abc import Hashable
 from swarm.bus.bus import Event, Heard, HeardMany, Question, Undecoded
 
 CAPACITY = 4096
-"""Undecoded samples, or questions, per topic: more than a process gets in a second. Beyond it the oldest goes."""
+"""Unread samples, or questions, per topic: more than a process gets in a second. Beyond it the oldest goes."""
 LATE_S = 0.5
 """Once the oldest question of a topic has waited this long, or half of its asker's timeout, the newest is taken
 first: an answer to it still finds its asker."""
 
 _UNREAD_BATCHES = 2
-"""Undecoded batches beyond which `post` blocks: one to be read while the next is decoded."""
+"""Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
 _KEPT = ""
 """Name of the queue of what is never dropped."""
 
@@ -54,7 +54,7 @@ class Inbox:
         self._closed = False
         """Set by `close`, for good."""
         self._queues: OrderedDict[str, _Queue] = OrderedDict()
-        """Undecoded events by kind and topic. The queue whose turn was longest ago comes first."""
+        """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
         self._unread = 0
         """Events in all queues."""
         self._next = 0

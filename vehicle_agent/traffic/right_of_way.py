@@ -249,9 +249,8 @@ class RightOfWay:
         if known is not None or plot not in self.plots.all:
             return known
         members = self.plots.members(plot)
-        if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
-            return None
-        if not self._has_quorum:
+        noted = {self.agent, *self.own.noted_by}
+        if self.agent not in members or not noted.issuperset(members) or not self._has_quorum:
             return None
         promised, stored = self._saved.get(plot) or (0, self._at_start(plot))
         made = self._members[plot] = Member(self.plots, self.agent, promised, stored, self._spawns, now_ns)

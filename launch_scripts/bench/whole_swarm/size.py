@@ -8,7 +8,7 @@ import msgspec
 
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.values import MOST_TARGETS
+from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
 from swarm.errors import ConfigError
 from swarm.right_of_way.plots import fitting_regions
 
@@ -16,7 +16,6 @@ CELLS_PER_VEHICLE = 262.144
 """As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
 _VEHICLES_AN_AGENT = 500
 _FEWEST_AGENTS, _MOST_AGENTS = 5, 40
-_MOST_PER_AGENT = 1000
 _MOST_VEHICLES = 100_000
 LEAST_SIDE, MOST_SIDE = 32, 16_384
 
@@ -127,12 +126,12 @@ def size_of(
         raise ConfigError(f"--agents is {agents}, expected 1 to {vehicles}: each of them hosts a vehicle at least")
     if per_agent is None:
         usual = min(max(-(-vehicles // _VEHICLES_AN_AGENT), _FEWEST_AGENTS), _MOST_AGENTS, vehicles)
-        many = agents or max(usual, -(-vehicles // _MOST_PER_AGENT))
+        many = agents or max(usual, -(-vehicles // MOST_PER_AGENT))
         per_agent = -(-vehicles // many)
-        if per_agent > _MOST_PER_AGENT:
-            raise ConfigError(f"--agents is {many}, expected {-(-vehicles // _MOST_PER_AGENT)} or more: an agent "
-                              f"hosts at most {_MOST_PER_AGENT} vehicles, and there are {vehicles}")  # fmt: skip
-    _between("--per-agent", per_agent, 1, _MOST_PER_AGENT)
+        if per_agent > MOST_PER_AGENT:
+            raise ConfigError(f"--agents is {many}, expected {-(-vehicles // MOST_PER_AGENT)} or more: an agent "
+                              f"hosts at most {MOST_PER_AGENT} vehicles, and there are {vehicles}")  # fmt: skip
+    _between("--per-agent", per_agent, 1, MOST_PER_AGENT)
     if side is None:
         side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), LEAST_SIDE)
     _between("--size", side, LEAST_SIDE, MOST_SIDE)
