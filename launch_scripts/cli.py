@@ -16,7 +16,7 @@ from launch_scripts.command_line import complete
 from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
 from launch_scripts.command_line.run_command import run_command
-from launch_scripts.commands import afterwards, before, chaos, health, mavlink, query, roles
+from launch_scripts.commands import afterwards, before, health, mavlink, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
     AsJson,
@@ -54,7 +54,6 @@ FAMILIES = [
         "A plan, certificates and configurations for several machines.",
         ADMIN,
     ),
-    Family("bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire.", ADMIN),
 ]
 """Sub-commands which have sub-commands of their own, imported when they are called."""
 
@@ -357,7 +356,6 @@ def sweep(
 
 
 app.add_typer(before.app)
-app.add_typer(chaos.app)
 app.add_typer(afterwards.app)
 app.add_typer(roles.app)
 app.add_typer(query.app)

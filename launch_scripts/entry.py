@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from launch_scripts.health.probe import fast
+from launch_scripts.web.health_probe import fast
 
 _OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
 _RUNS = ("demo", "up")

@@ -28,7 +28,7 @@ ENTRIES = {
     "keeper": "shared_map.keeper.main:run",
     "monitor": "launch_scripts.monitor.main:run",
     "planner": "planner_service.main:run",
-    "targets": "launch_scripts.world.main:run",
+    "targets": "launch_scripts.simulation.world.main:run",
     "agent": "vehicle_agent.main:run",
 }
 """`module:function` of each role's `run(setup, stop_when)`."""

@@ -18,9 +18,9 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
+from swarm.recording.recording import recorded
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
-from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.turns import Turns

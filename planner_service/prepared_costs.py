@@ -25,7 +25,7 @@ from shared_map.source_digest import source_digest
 from shared_map.terrain.kept import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
-from swarm.runtime.recording.outside import Outside
+from swarm.recording.outside import Outside
 
 log = logging.getLogger(__name__)
 

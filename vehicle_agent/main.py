@@ -9,10 +9,10 @@ from shared_map.prepared_classes import load_classes
 from shared_map.terrain.prepared import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
+from swarm.recording.recording import recorded
 from swarm.runtime.health import LIFE_BEFORE
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with, tick_phase
-from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, MemoryPromiseStore, PromiseStore

@@ -14,7 +14,7 @@ import msgspec
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
-from swarm.runtime.recording.outside import Outside
+from swarm.recording.outside import Outside
 from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way import OwnRecord
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from launch_scripts.check.findings import Finding, failure, refused
 from launch_scripts.process_table import ROLES, certificate_names
-from shared_map.terrain.importers.sources import FILE_KINDS, is_terrain
+from shared_map.importers.sources import FILE_KINDS, is_terrain
 from swarm.bus.endpoints import host_port
 from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES, is_loopback
 from swarm.config.plugin_names import plugins_of

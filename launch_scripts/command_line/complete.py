@@ -37,7 +37,7 @@ def scenarios_and_worlds(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def studies(ctx: typer.Context, incomplete: str) -> list[str]:
     """Built-in studies, and .toml files below the folder that the word begins with."""
-    from launch_scripts.sweep.study import study_names
+    from launch_scripts.simulation.study.study import study_names
 
     return [name for name in [*study_names(), *_files(incomplete, ".toml")] if name.startswith(incomplete)]
 
@@ -112,7 +112,7 @@ def _runs_folder(ctx: typer.Context) -> Path:
 def _scenario(ctx: typer.Context) -> Scenario | None:
     """The scenario that the command line names, or else that of the newest run here."""
     from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.report.results.run_folder import LAST, SCENARIO_FILE, find_run
+    from launch_scripts.observe.run_folder import LAST, SCENARIO_FILE, find_run
     from swarm.errors import SwarmError
 
     # While an option still lacks its value, the words before it are left as they are.

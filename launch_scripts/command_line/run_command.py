@@ -16,7 +16,7 @@ from launch_scripts.command_line import usage
 from swarm.errors import ConfigError, StoreError, SwarmError
 
 
-def run_command(command: Callable[[], Any]) -> int:
+def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     """Runs the command that is made here. Returns its exit code; what a user, a file or the network has wrong is
     told in a sentence."""
     # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
@@ -30,7 +30,7 @@ def run_command(command: Callable[[], Any]) -> int:
     _fill_streams()
     try:
         try:
-            code = command().main(prog_name="swarm", standalone_mode=False)
+            code = command().main(prog_name=name, standalone_mode=False)
         finally:
             sys.stdout.flush()
     except TyperException as error:

@@ -11,8 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.terminal import REPORTED
+from launch_scripts.observe.files import write_file
+from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
-from launch_scripts.report.files import write_file
 from launch_scripts.report.results.compare import (
     LeftRun,
     Row,
@@ -22,7 +23,6 @@ from launch_scripts.report.results.compare import (
     settings_that_differ,
     text_of,
 )
-from launch_scripts.report.results.run_folder import SCENARIO_FILE, find_run, read_report
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.errors import ConfigError, StoreError
 

@@ -25,7 +25,7 @@ def size(
     link: Annotated[float, typer.Option(min=1, help="Link of a machine, Mbit/s.")] = 1000.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
 ) -> None:
-    """How many machines a swarm needs, by the cost model of `swarm bench scaling`.
+    """How many machines a swarm needs, by the cost model of `./launch_scripts/bench scaling`.
 
     \b
     swarm deploy size --vehicles 1000 --targets 10
@@ -38,14 +38,13 @@ def size(
     Exit code 1 if a process has to do more than one core can.
     """
     import msgspec
-
-    from launch_scripts.bench.scaling.blocks import extrapolated, size_block
-    from launch_scripts.bench.scaling.check import model_of, usable, without_each
-    from launch_scripts.bench.scaling.needs import Machine, fewest_machines, too_much
-    from launch_scripts.bench.scaling.rows import read_rows
-    from launch_scripts.bench.show import show
-    from launch_scripts.bench.tables import table
-    from launch_scripts.bench.whole_swarm.size import LEAST_SIDE, MOST_SIDE, size_of
+    from bench.scaling.blocks import extrapolated, size_block
+    from bench.scaling.check import model_of, usable, without_each
+    from bench.scaling.needs import Machine, fewest_machines, too_much
+    from bench.scaling.rows import read_rows
+    from bench.show import show
+    from bench.tables import table
+    from bench.whole_swarm.size import LEAST_SIDE, MOST_SIDE, size_of
 
     for option, value in (("--memory", memory), ("--link", link)):
         if not math.isfinite(value):

@@ -12,7 +12,7 @@ from launch_scripts.commands.shared_options import AsJson, Tls, spread
 
 if TYPE_CHECKING:
     from launch_scripts.commands.running.status import Status
-    from launch_scripts.health.probe import Answer
+    from launch_scripts.web.health_probe import Answer
 
 app = typer.Typer()
 
@@ -44,7 +44,7 @@ def health(
 
     swarm health --connect tcp/127.0.0.1:7447 --json
     """
-    from launch_scripts.health.probe import ask
+    from launch_scripts.web.health_probe import ask
     from swarm.errors import ConfigError
 
     if url is None and live:
@@ -59,7 +59,7 @@ def health(
 
 def swarm_answer(status: Status) -> Answer:
     """Whether all processes that the run needs are there and ready."""
-    from launch_scripts.health.probe import Answer
+    from launch_scripts.web.health_probe import Answer
     from swarm.runtime.stats import READY
 
     observed = status.model.observed

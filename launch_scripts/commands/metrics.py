@@ -18,10 +18,10 @@ _TURN_S = 0.1
 def serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     """Serve until Ctrl-C, on an address of this machine. Raises BusError if the port is taken, or there is no
     router."""
-    from launch_scripts.health.verdict import Process
-    from launch_scripts.metrics.endpoint import MetricsEndpoint
-    from launch_scripts.metrics.exporter import Exporter
-    from launch_scripts.metrics.families import families
+    from launch_scripts.web.health_verdict import Process
+    from launch_scripts.web.metric_families import families
+    from launch_scripts.web.metrics_endpoint import MetricsEndpoint
+    from launch_scripts.web.metrics_exporter import Exporter
     from swarm.bus.zenoh_bus import open_bus
     from swarm.runtime.health import Health
     from swarm.runtime.supervisor import supervisor_of
@@ -49,9 +49,9 @@ def serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
 
 def dashboard() -> str:
     """A dashboard for Grafana, as JSON."""
-    return files("launch_scripts.metrics").joinpath("dashboard.json").read_text(encoding="utf-8")
+    return files("launch_scripts.web").joinpath("dashboard.json").read_text(encoding="utf-8")
 
 
 def alerts() -> str:
     """Rules of Prometheus, as YAML."""
-    return files("launch_scripts.metrics").joinpath("alerts.yml").read_text(encoding="utf-8")
+    return files("launch_scripts.web").joinpath("alerts.yml").read_text(encoding="utf-8")

@@ -49,7 +49,7 @@ def check(
 
     swarm plugins check sensor camera:Camera --options '{"misses": 0.5}'
     """
-    from launch_scripts.plugin_check import check_plugin
+    from launch_scripts.check.plugin_check import check_plugin
 
     try:
         table = json.loads(options)

@@ -11,10 +11,10 @@ from typing import Any
 import typer
 
 from launch_scripts.launcher.progress import progress
+from launch_scripts.observe.run_folder import find_run
 from launch_scripts.plain_text import plain
 from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run, unreadable
-from launch_scripts.report.results.run_folder import find_run
-from swarm.runtime.recording.replaying import Difference
+from swarm.recording.replaying import Difference
 
 _ROW = "{:<22} {:>4} {:>9} {:>9} {:>9}  {}"
 _SHOWN = 300

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from launch_scripts.report.results.run_folder import find_run
+from launch_scripts.observe.run_folder import find_run
 from swarm.config.explain import choice
 from swarm.errors import ConfigError
 

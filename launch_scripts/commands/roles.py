@@ -254,8 +254,8 @@ def run_role(
 
 def _told_health(name: str, place: Place) -> Health:
     """What the role tells of itself: to its supervisor, and to probes if they are given a port."""
-    from launch_scripts.health.pages import PageServer, health_pages
-    from launch_scripts.health.verdict import Process
+    from launch_scripts.web.health_pages import PageServer, health_pages
+    from launch_scripts.web.health_verdict import Process
     from swarm.runtime.health import Health
     from swarm.runtime.supervisor import supervisor_of
 

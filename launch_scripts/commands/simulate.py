@@ -23,7 +23,7 @@ def simulate_once(
 
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.launcher.terminal import Terminal
-    from launch_scripts.report.results.run_folder import begin_run
+    from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
     from launch_scripts.simulation.simulate import simulate as run_simulation
     from launch_scripts.simulation.worlds import WORLDS

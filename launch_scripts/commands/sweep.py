@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from launch_scripts.sweep.needs import check_installed
+from launch_scripts.simulation.study.needs import check_installed
 from swarm.config.input_files import shown
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from launch_scripts.sweep.run import Sweep
-    from launch_scripts.sweep.summary import Summary
-    from launch_scripts.sweep.trial import Result, Trial
+    from launch_scripts.simulation.study.run import Sweep
+    from launch_scripts.simulation.study.summary import Summary
+    from launch_scripts.simulation.study.trial import Result, Trial
 
 
 _SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
@@ -34,9 +34,9 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
         raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
     if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:
         raise ConfigError(f"--scheduler: found {shown(scheduler)}, expected an address such as {_EXAMPLE}")
-    from launch_scripts.sweep.cluster import cores
-    from launch_scripts.sweep.run import Sweep
-    from launch_scripts.sweep.study import study_path
+    from launch_scripts.simulation.study.cluster import cores
+    from launch_scripts.simulation.study.run import Sweep
+    from launch_scripts.simulation.study.study import study_path
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -53,7 +53,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
         raise
     summary = sweep.finish()
     if as_json:
-        from launch_scripts.sweep.summary import as_json as told
+        from launch_scripts.simulation.study.summary import as_json as told
 
         print(json.dumps(told(summary), indent=2))
     else:
@@ -110,9 +110,10 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
 
 
 def _print(summary: Summary, folder: Path) -> None:
-    from launch_scripts.bench.tables import table
-    from launch_scripts.sweep.page import between, number
-    from launch_scripts.sweep.run import PAGE, RESULTS
+    from bench.tables import table
+
+    from launch_scripts.simulation.study.page import between, number
+    from launch_scripts.simulation.study.run import PAGE, RESULTS
 
     console = Console(highlight=False, markup=False, emoji=False)
     several = len({case.scenario for case in summary.cases}) > 1

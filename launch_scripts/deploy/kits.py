@@ -20,8 +20,8 @@ from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.deploy.shown_plan import as_json
+from launch_scripts.observe.files import write_file
 from launch_scripts.process_table import OPERATOR
-from launch_scripts.report.files import write_file
 from swarm.bus.access_control import common_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.write import scenario_text

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 
-from launch_scripts.health.verdict import Process
+from launch_scripts.web.health_verdict import Process
 from swarm.runtime.health import Phase
 
 STILL_S = 60.0

@@ -8,8 +8,8 @@ from typing import Any
 
 from launch_scripts.launcher.own_part import OwnPart
 from launch_scripts.launcher.terminal import Terminal
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import RECORDED_BESIDE
-from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain

@@ -6,8 +6,8 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.state import RunState, TargetLine
+from launch_scripts.observe import facts
+from launch_scripts.observe.state import RunState, TargetLine
 
 SHOWN_ALARMS = 5
 _FEWEST_TARGETS = 3

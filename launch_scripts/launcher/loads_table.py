@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from rich.table import Table
 
 from launch_scripts.launcher.live_table import columns
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.process_load import ProcessLoad, RoleLoad
+from launch_scripts.observe import facts
+from launch_scripts.observe.process_load import ProcessLoad, RoleLoad
 
 
 def loads_table(lines: Sequence[ProcessLoad | RoleLoad], *, each: bool) -> Table:

@@ -18,12 +18,12 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.health.verdict import Process
 from launch_scripts.launcher.child import EndedAsAsked, ExitReason, Reports, run_child
 from launch_scripts.launcher.hang_watch import STILL_S, HangWatch
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.launcher.run_processes import threads_of
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
+from launch_scripts.web.health_verdict import Process
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.deadline import KILLED_BY
 from swarm.runtime.health import BOARD_BYTES, Board

@@ -8,15 +8,15 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from launch_scripts.health.verdict import Process
 from launch_scripts.launcher.up_options import UpOptions
+from launch_scripts.web.health_verdict import Process
 from swarm.errors import BusError
 from swarm.runtime.health import Health
 from swarm.runtime.supervisor import supervisor_of
 
 if TYPE_CHECKING:
-    from launch_scripts.metrics.endpoint import MetricsEndpoint
-    from launch_scripts.report.latest_state import Observed
+    from launch_scripts.observe.latest_state import Observed
+    from launch_scripts.web.metrics_endpoint import MetricsEndpoint
 
 _TURNS_HZ = 2.0
 """How often a launcher turns, at least."""
@@ -46,7 +46,7 @@ class MachineSignals:
     def _open(self) -> None:
         if self._port is None:
             return
-        from launch_scripts.metrics.endpoint import MetricsEndpoint  # takes time to import
+        from launch_scripts.web.metrics_endpoint import MetricsEndpoint  # takes time to import
 
         board, seen = self._health.board, self._seen
         self._metrics = MetricsEndpoint(self._port, lambda: [Process(_NAME, board.read()), *seen()], self._address)
@@ -70,7 +70,7 @@ class MachineSignals:
             with suppress(BusError):  # the launcher before still has the port
                 self._open()
         if self._metrics is not None:
-            from launch_scripts.metrics.families import Figures, Run, families
+            from launch_scripts.web.metric_families import Figures, Run, families
 
             run = Run(*self._run, started_ns) if up is None else None
             alive = observed.up() if up is None else up

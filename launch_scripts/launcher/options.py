@@ -10,10 +10,10 @@ from pathlib import Path
 
 import msgspec
 
+from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_name
-from launch_scripts.report.results.run_folder import LAST
-from shared_map.terrain.importers.sources import is_terrain
+from shared_map.importers.sources import is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import explain, nearest

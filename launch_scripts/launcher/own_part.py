@@ -11,12 +11,12 @@ from rich.text import Text
 
 from launch_scripts.launcher.live_table import SHOWN_ALARMS
 from launch_scripts.launcher.loads_table import loads_table
+from launch_scripts.observe.alarms import Alarm, alarms_of
+from launch_scripts.observe.facts import lines_of
+from launch_scripts.observe.plan import RunPlan
+from launch_scripts.observe.process_load import ProcessLoad, ProcessLoads, by_role
+from launch_scripts.observe.run_model import RunModel
 from launch_scripts.process_table import ROLES, ProcessSpec
-from launch_scripts.report.run_state.alarms import Alarm, alarms_of
-from launch_scripts.report.run_state.facts import lines_of
-from launch_scripts.report.run_state.model import RunModel
-from launch_scripts.report.run_state.plan import RunPlan
-from launch_scripts.report.run_state.process_load import ProcessLoad, ProcessLoads, by_role
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import job_of

@@ -15,8 +15,8 @@ from rich.text import Text
 
 from launch_scripts.launcher.busy_line import busy_line
 from launch_scripts.launcher.lasting_output import make_output_last
+from launch_scripts.observe.certified_gap import gap_text
 from launch_scripts.plain_text import plain
-from launch_scripts.report.results.certified_gap import gap_text
 
 log = logging.getLogger(__name__)
 

@@ -29,12 +29,12 @@ from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
+from launch_scripts.observe import facts
+from launch_scripts.observe.disk_watch import DiskWatch
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_folder import begin_run
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec
-from launch_scripts.report.disk_watch import DiskWatch
-from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.results.run_folder import begin_run
-from launch_scripts.report.run_state import facts
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
 from shared_map.terrain.prepared import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key

@@ -10,9 +10,9 @@ from pathlib import Path
 from launch_scripts.launcher.log_file import LogFormat, log_to
 from launch_scripts.launcher.options import as_process, common_run_id, new_run_id
 from launch_scripts.launcher.run_terrain import find_members
-from launch_scripts.monitor.serving.loopback_guard import LOOPBACK
+from launch_scripts.observe.plan import plan_of_members
 from launch_scripts.process_table import ENTRIES, LAUNCHER, RECORDED_BESIDE, ROLES, ProcessSpec, processes_of
-from launch_scripts.report.run_state.plan import plan_of_members
+from launch_scripts.web.loopback_guard import LOOPBACK
 from swarm.config.explain import choice
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError

@@ -14,7 +14,7 @@ MODULES = (
     "launch_scripts.launcher.router",
     "shared_map.keeper.main",
     "vehicle_agent.main",
-    "launch_scripts.world.main",
+    "launch_scripts.simulation.world.main",
     "launch_scripts.monitor.main",
     # What these import as they run, each for itself otherwise.
     "encodings.idna",

@@ -6,10 +6,10 @@ import time
 from collections.abc import Collection
 
 from launch_scripts.launcher.own_part import OwnPart
+from launch_scripts.observe.recorder import RECORDED, Recorder
+from launch_scripts.observe.run_model import HEARD
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.report.paced_reading import PacedReading
-from launch_scripts.report.recorder import RECORDED, Recorder
-from launch_scripts.report.run_state.model import HEARD
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError

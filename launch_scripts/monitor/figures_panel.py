@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from launch_scripts.monitor.shown_text import in_markdown
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.alarms import KINDS
-from launch_scripts.report.run_state.state import RunState
+from launch_scripts.observe import facts
+from launch_scripts.observe.alarms import KINDS
+from launch_scripts.observe.state import RunState
 from swarm.runtime.role import RoleSetup
 
 _WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside", "teleported")

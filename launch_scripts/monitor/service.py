@@ -18,13 +18,13 @@ from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
 from launch_scripts.monitor.movers.movers_view import MoversView
-from launch_scripts.monitor.serving.loopback_guard import Audience
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.observe.recorder import ROUTES_S
+from launch_scripts.observe.run_figures import RunFigures
+from launch_scripts.observe.run_model import HEARD
 from launch_scripts.report.paced_reading import PacedReading
-from launch_scripts.report.recorder import ROUTES_S
-from launch_scripts.report.run_figures import RunFigures
-from launch_scripts.report.run_state.model import HEARD
+from launch_scripts.web.loopback_guard import Audience
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync

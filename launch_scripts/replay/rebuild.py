@@ -9,7 +9,7 @@ from typing import cast
 
 import msgspec
 
-from launch_scripts.world.service import TargetsService
+from launch_scripts.simulation.world.service import TargetsService
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
 from shared_map.arrays import Floats
@@ -22,9 +22,9 @@ from swarm.bus.bus import Event
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
+from swarm.recording.records import Head
+from swarm.recording.replaying import Replaying
 from swarm.runtime.process import Service
-from swarm.runtime.recording.records import Head
-from swarm.runtime.recording.replaying import Replaying
 from swarm.runtime.role import RoleSetup
 from swarm.wire.codec import decode
 from swarm.wire.messages.processes import Stats

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from launch_scripts.observe.run_folder import SCENARIO_FILE
 from launch_scripts.replay.rebuild import REPLAYED, Ground, Grounds, rebuilt, setup_of
-from launch_scripts.report.results.run_folder import SCENARIO_FILE
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, StoreError, SwarmError
-from swarm.runtime.recording.recording import path_of, versions
-from swarm.runtime.recording.records import (
+from swarm.recording.recording import path_of, versions
+from swarm.recording.records import (
     CALLS,
     FOLDER,
     SUFFIX,
@@ -21,7 +21,7 @@ from swarm.runtime.recording.records import (
     RecordReader,
     RecordWriter,
 )
-from swarm.runtime.recording.replaying import Outcome, Progress, replay
+from swarm.recording.replaying import Outcome, Progress, replay
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.world.rovers import Rover
-from launch_scripts.world.service import TargetsService
+from launch_scripts.simulation.world.rovers import Rover
+from launch_scripts.simulation.world.service import TargetsService
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode

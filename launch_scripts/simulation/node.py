@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from launch_scripts.process_table import ProcessSpec
-from launch_scripts.world.service import TargetsService
+from launch_scripts.simulation.world.service import TargetsService
 from planner_service.prepared_costs import PREPARED_COSTS
 from planner_service.service import PlannerService
 from shared_map.keeper.service import KeeperService
@@ -17,9 +17,9 @@ from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
+from swarm.recording.boundary import Boundary
+from swarm.recording.recording import Recording
 from swarm.runtime.process import Service
-from swarm.runtime.recording.boundary import Boundary
-from swarm.runtime.recording.recording import Recording
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED
 from vehicle_agent.promise_store import PROMISE_STORE, MemoryPromiseStore

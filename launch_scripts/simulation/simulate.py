@@ -15,8 +15,8 @@ from typing import Any, TextIO
 
 import msgspec
 
+from launch_scripts.observe.recorder import RECORDED, Recorder
 from launch_scripts.process_table import ENTRIES, STOP_ORDER, ProcessSpec, planner_spec, processes_of
-from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node

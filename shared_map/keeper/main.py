@@ -10,9 +10,9 @@ from shared_map.keeper.store import KEEPER_STORE, KeeperStore
 from shared_map.terrain.prepared import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
+from swarm.recording.recording import recorded
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
-from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 

@@ -22,7 +22,7 @@ from shared_map.replication.marks import base_seq, is_tombstone
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
-from swarm.runtime.recording.outside import Outside
+from swarm.recording.outside import Outside
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order

@@ -2,7 +2,7 @@
 
 A vehicle of an air class drives on that surface as others do on the ground, by the same trees and routes: pace is
 that of level flight, and a step costs by what it climbs. One surface that follows the terrain comes within a tenth
-to a quarter of the best way through a stack of 64 levels, at a 64th of its cells (`swarm bench air`).
+to a quarter of the best way through a stack of 64 levels, at a 64th of its cells (`./launch_scripts/bench air`).
 """
 
 from __future__ import annotations

@@ -48,7 +48,8 @@ def kept_key(scenario: Scenario) -> str | None:
     if terrain.source not in BUILT_IN_TERRAINS or files:
         return None
     here = Path(__file__).parent
-    code = source_digest(here.parent, *sorted(each.parent for each in here.rglob("__init__.py")))
+    rooms = (here, here.parent / "importers")
+    code = source_digest(here.parent, *sorted(each.parent for room in rooms for each in room.rglob("__init__.py")))
     # One of them brings the elevation of "jacksboro".
     libraries = " ".join(map(version, ("scipy", "scikit-image", "matplotlib")))
     payload = msgspec.json.encode([code, libraries, scenario.seed, terrain, cost], order="sorted")

@@ -40,7 +40,7 @@ from swarm.grid import GridSpec
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
-    from shared_map.terrain.importers.sources import Source
+    from shared_map.importers.sources import Source
 
 FORMAT = 5
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
@@ -85,7 +85,7 @@ class Terrain:
 
 def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_class: str = GROUND) -> Terrain:
     """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence."""
-    from shared_map.terrain.importers.sources import load_source
+    from shared_map.importers.sources import load_source
 
     source = load_source(scenario.terrain, scenario.seed, progress)
     try:

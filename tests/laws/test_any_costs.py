@@ -9,14 +9,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from bench.planning.any_costs import paces_of_any_ratio
+from bench.planning.fields import make_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
 from support.planner_strategies import RULES, STRATEGIES
 
-from launch_scripts.bench.planning.any_costs import paces_of_any_ratio
-from launch_scripts.bench.planning.fields import make_field
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from bench.planning.certificate_checks import Findings, Life, run_checks
 from numpy.typing import NDArray
 from support.effort import few
 from support.planner_strategies import random_pace
 from support.slow_twins import lower_bound
 
-from launch_scripts.bench.planning.certificate_checks import Findings, Life, run_checks
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.pieces import MOST_SLACK
 from planner_service.target_tree import TargetTree

@@ -21,10 +21,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
+from shared_map.importers.grids.array_files import read_npy
+from shared_map.importers.photos.labels import read_labels
+from shared_map.importers.sources import load_source
 from shared_map.keeper.export import from_json
-from shared_map.terrain.importers.grids.array_files import read_npy
-from shared_map.terrain.importers.photos.labels import read_labels
-from shared_map.terrain.importers.sources import load_source
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, parse_toml, read_bytes
 from swarm.config.load import load_scenario
@@ -34,7 +34,7 @@ from swarm.grid import GridSpec
 COMMANDS = """
 import json, os, re, sys
 from launch_scripts.cli import main
-import shared_map.terrain.importers.sources
+import shared_map.importers.sources
 for line in sys.stdin:
     command, output = json.loads(line)
     child = os.fork()

@@ -21,9 +21,9 @@ from support.mavlink_world import (
     World,
 )
 
-from launch_scripts.mavlink.adapter import Wishes
-from launch_scripts.mavlink.autopilots import ARDUPILOT, PX4, kind_of
-from launch_scripts.mavlink.messages import (
+from launch_scripts.gateways.mavlink.adapter import Wishes
+from launch_scripts.gateways.mavlink.autopilots import ARDUPILOT, PX4, kind_of
+from launch_scripts.gateways.mavlink.messages import (
     ARM_DISARM,
     DO_SET_MODE,
     MISSION_START,
@@ -49,8 +49,8 @@ from launch_scripts.mavlink.messages import (
     Warned,
     Way,
 )
-from launch_scripts.mavlink.upload import MOST_TRIES, RETRY_NS
-from launch_scripts.mavlink.wheel import Wheel
+from launch_scripts.gateways.mavlink.upload import MOST_TRIES, RETRY_NS
+from launch_scripts.gateways.mavlink.wheel import Wheel
 from swarm.clock import NS_PER_S
 
 OF_THE_WHEEL = (ARM_DISARM, DO_SET_MODE, MISSION_START, NAV_TAKEOFF)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench.planning.fields import from_file
 
-from launch_scripts.bench.planning.fields import from_file
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec

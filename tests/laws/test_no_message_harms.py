@@ -9,15 +9,15 @@ from functools import cache
 import numpy as np
 import pytest
 import rerun as rr
+from chaos.lies import NAMES, ROLES, Lies
 from support.effort import few
 from support.liar import Liar, asked, published
 from support.swarm_model import SwarmModel
 from support.wire_strategies import types_of_the_wire
 
-from launch_scripts.chaos.lies import NAMES, ROLES, Lies
 from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.world.service import TargetsService
+from launch_scripts.simulation.world.service import TargetsService
 from planner_service.service import PlannerService
 from shared_map.arrays import Floats
 from shared_map.keeper.service import KeeperService

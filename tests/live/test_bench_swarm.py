@@ -1,4 +1,4 @@
-"""`swarm bench swarm`: a small swarm of real processes is measured, and nothing is left however the bench ends."""
+"""`bench swarm`: a small swarm of real processes is measured, and nothing is left however the bench ends."""
 
 from __future__ import annotations
 

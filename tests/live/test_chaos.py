@@ -1,4 +1,4 @@
-"""`swarm chaos`: a real swarm is struck, recovers, and leaves nothing behind, also where chaos itself is ended."""
+"""`bench chaos`: a real swarm is struck, recovers, and leaves nothing behind, also where chaos itself is ended."""
 
 from __future__ import annotations
 

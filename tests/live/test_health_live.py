@@ -11,8 +11,8 @@ import pytest
 from support.live_swarm import Hands, swarm
 from support.processes import eventually
 
-from launch_scripts.health.probe import ask
 from launch_scripts.ports import free_ports
+from launch_scripts.web.health_probe import ask
 from swarm.errors import BusError
 
 pytestmark = pytest.mark.network

@@ -22,7 +22,7 @@ from support.fake_run import fake_run
 from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
 
 from launch_scripts.monitor.blueprint import BACKGROUND
-from launch_scripts.monitor.serving.web import viewer_program
+from launch_scripts.web.view_page import viewer_program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from launch_scripts.bench.wire.partition import rounds, why_not
+from bench.wire.partition import rounds, why_not
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

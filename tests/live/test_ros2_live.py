@@ -13,17 +13,17 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from bench.wire.remote import Far
+from bench.wire.ros2_gateway import swarm_peer
 from support.live_swarm import SWARM, LiveSwarm
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
-from launch_scripts.bench.wire.remote import Far
-from launch_scripts.bench.wire.ros2_gateway import swarm_peer
+from launch_scripts.gateways.ros2.graph import Attachment, Qos
+from launch_scripts.gateways.ros2.node import Node, close_ros, open_ros
+from launch_scripts.gateways.ros2.topics import ROWS, TABLE, Direction
+from launch_scripts.gateways.ros2.types import Distribution, types_of
 from launch_scripts.ports import free_ports
-from launch_scripts.ros2.graph import Attachment, Qos
-from launch_scripts.ros2.node import Node, close_ros, open_ros
-from launch_scripts.ros2.topics import ROWS, TABLE, Direction
-from launch_scripts.ros2.types import Distribution, types_of
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
 

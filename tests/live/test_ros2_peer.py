@@ -10,8 +10,8 @@ import pytest
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
-from launch_scripts.ros2.node import Node, open_ros
-from launch_scripts.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.node import Node, open_ros
+from launch_scripts.gateways.ros2.types import Distribution, types_of
 
 pytestmark = pytest.mark.network
 TYPES = types_of(Distribution.JAZZY)

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from support.small_study import STUDY, dies_of_seed_one, write_study
 
-from launch_scripts.sweep import cluster
-from launch_scripts.sweep.cluster import client_of, local_client, run_trials
-from launch_scripts.sweep.plan import plan, trials_of
-from launch_scripts.sweep.run import RESULTS, Sweep
-from launch_scripts.sweep.store import ResultStore
-from launch_scripts.sweep.study import load_study
-from launch_scripts.sweep.trial import run_trial
+from launch_scripts.simulation.study import cluster
+from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
+from launch_scripts.simulation.study.plan import plan, trials_of
+from launch_scripts.simulation.study.run import RESULTS, Sweep
+from launch_scripts.simulation.study.store import ResultStore
+from launch_scripts.simulation.study.study import load_study
+from launch_scripts.simulation.study.trial import run_trial
 from swarm.errors import BusError
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(280)]

@@ -11,8 +11,8 @@ from launch_scripts.simulation.body_law import BodyLaw
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.worlds import CROWDS, SMALL, crowd, seeded
-from launch_scripts.world.service import TargetsService
 from swarm.config.scenario import RoverConfig
 from vehicle_agent.traffic.steering import Steering
 

@@ -25,10 +25,10 @@ from launch_scripts.simulation.worlds import SMALL
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
-from swarm.runtime.recording import records
-from swarm.runtime.recording.outside import Outside
-from swarm.runtime.recording.recording import Recording
-from swarm.runtime.recording.records import (
+from swarm.recording import records
+from swarm.recording.outside import Outside
+from swarm.recording.recording import Recording
+from swarm.recording.records import (
     CALLS,
     MAGIC,
     Cut,

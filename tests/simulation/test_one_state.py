@@ -17,8 +17,8 @@ from launch_scripts.launcher.live_table import live_table
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.details import _DOES
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.state import RunState
+from launch_scripts.observe import facts
+from launch_scripts.observe.state import RunState
 from launch_scripts.simulation.node import EPOCH_NS
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.terrain.terrain import terrain_of_pace

@@ -12,8 +12,8 @@ from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, nodes_of
+from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.worlds import SMALL, seeded
-from launch_scripts.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.wire.messages.orders import GiveOrder, Obey, ZoneOrder
 from swarm.wire.messages.vehicles import VehicleState

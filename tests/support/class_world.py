@@ -6,7 +6,7 @@ from collections import Counter
 from functools import cache
 
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.world.service import TargetsService
+from launch_scripts.simulation.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.agents import agent_of, plan_agents
 from swarm.config.load import parse_scenario

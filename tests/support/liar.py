@@ -6,7 +6,8 @@ import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 
-from launch_scripts.chaos.lies import Lies
+from chaos.lies import Lies
+
 from swarm.bus.bus import Asked, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryBus
 from swarm.wire.codec import encode

@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from launch_scripts.bench.wire.partition import why_not
+from bench.wire.partition import why_not
 
 __all__ = ["Machines", "machines", "why_not"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from launch_scripts.mavlink.adapter import Adapter, Wishes
-from launch_scripts.mavlink.autopilots import ARDUPILOT, PX4
-from launch_scripts.mavlink.messages import (
+from launch_scripts.gateways.mavlink.adapter import Adapter, Wishes
+from launch_scripts.gateways.mavlink.autopilots import ARDUPILOT, PX4
+from launch_scripts.gateways.mavlink.messages import (
     ARM_DISARM,
     DO_SET_MODE,
     MISSION_START,

@@ -17,8 +17,8 @@ from typing import Any
 
 import zenoh
 
+from launch_scripts.gateways.ros2.types import REQUEST, RESPONSE, RosTypes
 from launch_scripts.ports import free_ports
-from launch_scripts.ros2.types import REQUEST, RESPONSE, RosTypes
 
 _PROGRAM = Path(__file__).with_name("ros_peer_program.py")
 _LONGEST_S = 120.0

@@ -155,7 +155,7 @@ def _give_file(
 ) -> None:
     """Order a zone for each area of a file."""
     from launch_scripts.commands.run_frame import frame_of_run
-    from shared_map.terrain.importers.zones.zone_outlines import outlines_of
+    from shared_map.importers.zones.zone_outlines import outlines_of
     from swarm.bus.zenoh_bus import open_bus
     from swarm.orders import Acknowledged, Operator
     from swarm.wire.messages.orders import MOST_CORNERS, ZoneOrder

@@ -242,8 +242,8 @@ def _png(route: DescribedRoute, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from launch_scripts.report.pictures.palette import BLUE, INK, RED
-    from launch_scripts.report.pictures.plot_style import STYLE
+    from launch_scripts.observe.palette import BLUE, INK, RED
+    from launch_scripts.observe.plot_style import STYLE
 
     grid = route.grid
     x_m, y_m = route.metres()

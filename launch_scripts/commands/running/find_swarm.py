@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from launch_scripts.report.results.run_folder import LAST, REPORT_FILE, RUN_FILE, SCENARIO_FILE, find_run
+from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE, SCENARIO_FILE, find_run
 from swarm.bus.endpoints import listening
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import NetworkConfig

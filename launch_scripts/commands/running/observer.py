@@ -6,10 +6,10 @@ import time
 from collections.abc import Sequence
 
 from launch_scripts.commands.run_frame import frame_of_members
-from launch_scripts.report.run_state.model import HEARD, RunModel
-from launch_scripts.report.run_state.plan import plan_of_members
-from launch_scripts.report.run_state.process_load import ProcessLoad, ProcessLoads
-from launch_scripts.report.run_state.state import RunState
+from launch_scripts.observe.plan import plan_of_members
+from launch_scripts.observe.process_load import ProcessLoad, ProcessLoads
+from launch_scripts.observe.run_model import HEARD, RunModel
+from launch_scripts.observe.state import RunState
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.grid import GridSpec

@@ -12,12 +12,12 @@ from rich.table import Table
 
 from launch_scripts.commands.run_frame import frame_of_members
 from launch_scripts.launcher.live_table import columns, targets_table
+from launch_scripts.observe import facts
+from launch_scripts.observe.certified_gap import gaps_to
+from launch_scripts.observe.plan import plan_of_members, run_of_most
+from launch_scripts.observe.run_model import HEARD, RunModel
+from launch_scripts.observe.state import RunState
 from launch_scripts.plain_text import plain
-from launch_scripts.report.results.certified_gap import gaps_to
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.model import HEARD, RunModel
-from launch_scripts.report.run_state.plan import plan_of_members, run_of_most
-from launch_scripts.report.run_state.state import RunState
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S

@@ -21,11 +21,11 @@ from launch_scripts.launcher.lasting_output import make_output_last
 from launch_scripts.launcher.live_table import fitted
 from launch_scripts.launcher.loads_table import loads_table
 from launch_scripts.launcher.watcher import ask_run
+from launch_scripts.observe import facts
+from launch_scripts.observe.plan import run_of_most
+from launch_scripts.observe.process_load import ProcessLoad, by_role
+from launch_scripts.observe.state import RunState
 from launch_scripts.process_table import ROLES
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.plan import run_of_most
-from launch_scripts.report.run_state.process_load import ProcessLoad, by_role
-from launch_scripts.report.run_state.state import RunState
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import BusError

@@ -87,8 +87,8 @@ def classify(
 
 
 def _compare(terrain: Terrain, path: Path) -> None:
-    from shared_map.terrain.importers.photos.classify import by_rules, confusion, held_out
-    from shared_map.terrain.importers.photos.labels import read_labels
+    from shared_map.importers.photos.classify import by_rules, confusion, held_out
+    from shared_map.importers.photos.labels import read_labels
 
     labels = read_labels(path, terrain.grid)
     inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)

@@ -138,7 +138,7 @@ def _crs_name(grid: GridSpec) -> str:
         return grid.crs
     import rasterio
 
-    from shared_map.terrain.importers.rasters.georeference import crs_name
+    from shared_map.importers.rasters.georeference import crs_name
 
     return crs_name(rasterio.CRS.from_user_input(grid.crs))
 

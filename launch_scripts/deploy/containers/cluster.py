@@ -12,7 +12,7 @@ from launch_scripts.deploy.containers.kubernetes import SECRETS, kubernetes_file
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.kits import certificates_of, for_operators, keep_plan, with_parts
 from launch_scripts.deploy.plan import Plan
-from launch_scripts.report.files import replacing
+from launch_scripts.observe.files import replacing
 from swarm.errors import StoreError
 
 RECIPE = "Containerfile"

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from launch_scripts.monitor.ground import ground_colours as colours
 from launch_scripts.monitor.movers.looks import Colour, Look
-from launch_scripts.report.pictures import palette
+from launch_scripts.observe import palette
 
 BACKGROUND = (17, 22, 28)
 WIDTH_PX, HEIGHT_PX = 1840, 156

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from launch_scripts.monitor.movers.routes import RouteNow
-from launch_scripts.report.results.certified_gap import percent
-from launch_scripts.report.run_state.facts import TARGET_FACTS
-from launch_scripts.report.run_state.state import TargetLine
-from launch_scripts.report.vehicle_columns import VehicleColumns
+from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.facts import TARGET_FACTS
+from launch_scripts.observe.state import TargetLine
+from launch_scripts.observe.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.vehicles import VehicleState

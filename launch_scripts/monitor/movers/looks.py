@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes
-from launch_scripts.report.pictures import palette
+from launch_scripts.observe import palette
 from swarm.wire.messages.vehicles import VehicleState
 
 Colour = tuple[int, int, int]

@@ -18,9 +18,9 @@ from launch_scripts.monitor.movers.strips import poles
 from launch_scripts.monitor.movers.targets_view import TargetsView
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.serving.sinks import Streams
-from launch_scripts.report.run_figures import RunFigures
-from launch_scripts.report.run_state.state import RunState
-from launch_scripts.report.vehicle_columns import VehicleColumns
+from launch_scripts.observe.run_figures import RunFigures
+from launch_scripts.observe.state import RunState
+from launch_scripts.observe.vehicle_columns import VehicleColumns
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.config.scenario import Scenario

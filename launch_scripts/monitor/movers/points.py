@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.report.vehicle_columns import VehicleColumns
+from launch_scripts.observe.vehicle_columns import VehicleColumns
 from swarm.grid import GridSpec
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import Sighted

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from launch_scripts.monitor.serving.loopback_guard import LOOPBACK
-from launch_scripts.monitor.serving.web import viewer_program
+from launch_scripts.web.loopback_guard import LOOPBACK
+from launch_scripts.web.view_page import viewer_program
 
 T = TypeVar("T")
 _START_WITHIN_S = 30.0

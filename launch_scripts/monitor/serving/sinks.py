@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 import rerun as rr
 import rerun.blueprint as rrb
 
-from launch_scripts.monitor.serving.loopback_guard import LOOPBACK, Audience
-from launch_scripts.monitor.serving.stream_gate import StreamGate
-from launch_scripts.monitor.serving.web import ViewerPage
+from launch_scripts.web.loopback_guard import LOOPBACK, Audience
+from launch_scripts.web.stream_gate import StreamGate
+from launch_scripts.web.view_page import ViewerPage
 from swarm.config.scenario import MonitorConfig
 from swarm.errors import BusError, StoreError
 

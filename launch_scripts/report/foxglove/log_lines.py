@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
+from launch_scripts.gateways.ros2.messages import Severity
+from launch_scripts.observe.alarms import Alarm
 from launch_scripts.report.geo.track_file import Track
-from launch_scripts.report.run_state.alarms import Alarm
-from launch_scripts.ros2.messages import Severity
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.wire.statements import STAMP_LIMIT_NS

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.gateways.ros2 import markers
+from launch_scripts.gateways.ros2.frames import headings_along
+from launch_scripts.gateways.ros2.grids import UNKNOWN, occupancy_grid, occupancy_of
+from launch_scripts.gateways.ros2.markers import Colour, Drawing, Form, MarkerBook
+from launch_scripts.gateways.ros2.messages import RosMessages
+from launch_scripts.gateways.ros2.names import ros_name
+from launch_scripts.observe.ground_pace import GroundPace
 from launch_scripts.report.foxglove.log_lines import Line
 from launch_scripts.report.geo.geo_shapes import turns_of
 from launch_scripts.report.geo.track_file import GivenRoute, RunTracks, Track
-from launch_scripts.report.ground_pace import GroundPace
-from launch_scripts.ros2 import markers
-from launch_scripts.ros2.frames import headings_along
-from launch_scripts.ros2.grids import UNKNOWN, occupancy_grid, occupancy_of
-from launch_scripts.ros2.markers import Colour, Drawing, Form, MarkerBook
-from launch_scripts.ros2.messages import RosMessages
-from launch_scripts.ros2.names import ros_name
 from shared_map.terrain.places import middles_of
 from swarm.clock import NS_PER_S
 from swarm.wire.statements import MarkKind

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
 from launch_scripts.report.geo.csv_layers import write_csv
 from launch_scripts.report.geo.geo_layers import (
     Layer,
@@ -16,7 +17,6 @@ from launch_scripts.report.geo.geo_layers import (
     write_layers,
 )
 from launch_scripts.report.geo.track_file import TRACKS_FILE, RunTracks, read_tracks
-from launch_scripts.report.results.run_folder import REPORT_FILE, lacks, read_report
 from shared_map.terrain.places import MapFrame
 from swarm.errors import ConfigError, StoreError
 

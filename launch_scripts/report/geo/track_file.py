@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.array_archive import arrays_in, packed
-from launch_scripts.report.latest_state import MarkedCells
-from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.tracks import Tracks
+from launch_scripts.observe.array_archive import arrays_in, packed
+from launch_scripts.observe.latest_state import MarkedCells
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec

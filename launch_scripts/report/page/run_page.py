@@ -9,17 +9,17 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
 
-from launch_scripts.report.files import write_file
+from launch_scripts.observe.alarms import Alarm
+from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.facts import count, duration, fact, grouped, together
+from launch_scripts.observe.files import write_file
+from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
 from launch_scripts.report.page.map_svg import map_parts
 from launch_scripts.report.page.theme import themed_svg
 from launch_scripts.report.pictures.learned_picture import QUICKER, SLOWER
 from launch_scripts.report.pictures.plots import PLOTS, draw_plot
-from launch_scripts.report.results.certified_gap import percent
 from launch_scripts.report.results.result_tables import TABLES
-from launch_scripts.report.results.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
-from launch_scripts.report.run_state.alarms import Alarm
-from launch_scripts.report.run_state.facts import count, duration, fact, grouped, together
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import StoreError
 

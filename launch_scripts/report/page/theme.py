@@ -11,8 +11,8 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from launch_scripts.report.pictures import palette
-from launch_scripts.report.pictures.plot_style import STYLE
+from launch_scripts.observe import palette
+from launch_scripts.observe.plot_style import STYLE
 
 WIDTH_IN, HEIGHT_IN = 4.1, 1.8
 _THEMED = {

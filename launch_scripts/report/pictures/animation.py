@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, UnidentifiedImageError
 
-from launch_scripts.report.files import write_file
+from launch_scripts.observe.files import write_file
+from launch_scripts.observe.palette import BLACK, FAINT, GROUPS, INK, RED, YELLOW
+from launch_scripts.observe.run_folder import read_report
 from launch_scripts.report.geo.run_export import free_places, tracks_of_run
 from launch_scripts.report.geo.track_file import RunTracks, Track
 from launch_scripts.report.pictures.ground_picture import GROUND_FILE
@@ -24,9 +26,7 @@ from launch_scripts.report.pictures.map_picture import (
     in_km,
     mark_overlay,
 )
-from launch_scripts.report.pictures.palette import BLACK, FAINT, GROUPS, INK, RED, YELLOW
 from launch_scripts.report.pictures.scale_bar import round_length, said_length
-from launch_scripts.report.results.run_folder import read_report
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError

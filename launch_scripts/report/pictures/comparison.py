@@ -18,13 +18,13 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from launch_scripts.report.files import replacing
-from launch_scripts.report.pictures.palette import BLACK, BLUE, FAINT, GREEN, ORANGE, PINK, SKY
-from launch_scripts.report.pictures.plot_style import STYLE
+from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.facts import count, duration
+from launch_scripts.observe.files import replacing
+from launch_scripts.observe.palette import BLACK, BLUE, FAINT, GREEN, ORANGE, PINK, SKY
+from launch_scripts.observe.plot_style import STYLE
 from launch_scripts.report.pictures.plots import compact, show_percent, told
-from launch_scripts.report.results.certified_gap import percent
 from launch_scripts.report.results.compare import LeftRun, remarks
-from launch_scripts.report.run_state.facts import count, duration
 
 _COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, BLACK)
 _DASHES: tuple[Any, ...] = ("solid", (0, (5, 1.5)), (0, (1.5, 1.2)))

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.pictures.palette import BLUE, ORANGE, rgb
+from launch_scripts.observe.palette import BLUE, ORANGE, rgb
 from shared_map.arrays import Floats
 from shared_map.learning.factors import keys_of
 from shared_map.terrain.terrain import Terrain

@@ -14,9 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from launch_scripts.report.geo.track_file import RunTracks, Track
-from launch_scripts.report.pictures.ground_picture import GroundPicture
-from launch_scripts.report.pictures.palette import (
+from launch_scripts.observe.palette import (
     BLACK,
     FORBIDDEN,
     GROUPS,
@@ -26,6 +24,8 @@ from launch_scripts.report.pictures.palette import (
     RED,
     YELLOW,
 )
+from launch_scripts.report.geo.track_file import RunTracks, Track
+from launch_scripts.report.pictures.ground_picture import GroundPicture
 from launch_scripts.report.pictures.plots import halo
 from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from shared_map.terrain.places import MapFrame

@@ -15,7 +15,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from launch_scripts.report.pictures.palette import (
+from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.facts import duration
+from launch_scripts.observe.palette import (
     BLUE,
     FAINT,
     GREEN,
@@ -25,8 +27,6 @@ from launch_scripts.report.pictures.palette import (
     STATE_COLOURS,
     VIOLET,
 )
-from launch_scripts.report.results.certified_gap import percent
-from launch_scripts.report.run_state.facts import duration
 
 Report = Mapping[str, Any]
 _SHOWN_PERCENT = 0.005

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from launch_scripts.report.run_state.alarms import Alarm
-from launch_scripts.report.run_state.model import RunModel
-from launch_scripts.report.run_state.plan import RunPlan
+from launch_scripts.observe.alarms import Alarm
+from launch_scripts.observe.plan import RunPlan
+from launch_scripts.observe.run_model import RunModel
 from swarm.grid import GridSpec
 from swarm.wire.messages.processes import Alarm as Told
 from swarm.wire.messages.processes import Stats

@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bench.cli import app
+from bench.isolated import measure
+from bench.planning import library_adapters as rivals
+from bench.planning.certificate_checks import LAWS
+from bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
+from bench.planning.cold_start import tables
+from bench.planning.fields import FIELDS, Field, make_field
+from bench.planning.scale import points_of
+from bench.planning.tree_process import MODULE
+from bench.wire import partition
 from rich.console import Console
 from typer.testing import CliRunner
 
-from launch_scripts.bench.cli import app
-from launch_scripts.bench.isolated import measure
-from launch_scripts.bench.planning import library_adapters as rivals
-from launch_scripts.bench.planning.certificate_checks import LAWS
-from launch_scripts.bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
-from launch_scripts.bench.planning.cold_start import tables
-from launch_scripts.bench.planning.fields import FIELDS, Field, make_field
-from launch_scripts.bench.planning.scale import points_of
-from launch_scripts.bench.planning.tree_process import MODULE
-from launch_scripts.bench.wire import partition
 from planner_service.tree.bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
@@ -241,7 +241,7 @@ def test_targets_that_do_not_fit_into_memory_are_run_in_groups(monkeypatch: pyte
     plan = Plan(targets=5, vehicles=10, frames=4, probes=20)
     entrants = {"full": PlannerConfig(strategy="full")}
     assert chase(field, entrants, plan)["full"].batches == 1
-    monkeypatch.setattr("launch_scripts.bench.planning.chase.memory_free", lambda: 0)
+    monkeypatch.setattr("bench.planning.chase.memory_free", lambda: 0)
     tally = chase(field, entrants, plan)["full"]
     assert tally.batches == 5
     assert len(tally.frame_ms) == 4
@@ -425,7 +425,9 @@ def test_a_number_out_of_range_is_refused_by_name(words: tuple[str, ...]) -> Non
 
 @pytest.mark.parametrize("command", ["peers", "start", "paper", "scale", "gap"])
 def test_help_teaches_with_an_example(command: str) -> None:
-    assert f"swarm bench {command}" in words_of(command, "--help").replace(f"Usage: swarm bench {command}", "", 1)
+    assert f"./launch_scripts/bench {command}" in words_of(command, "--help").replace(
+        f"Usage: ./launch_scripts/bench {command}", "", 1
+    )
 
 
 def test_exact_moves_are_those_that_would_have_grown_and_are_counted() -> None:

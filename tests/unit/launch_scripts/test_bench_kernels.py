@@ -1,13 +1,12 @@
-"""`swarm bench kernels` runs small, and what it prints fits and makes sense."""
+"""`./launch_scripts/bench kernels` runs small, and what it prints fits and makes sense."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
+from bench.cli import app
 from typer.testing import CliRunner
-
-from launch_scripts.bench.cli import app
 
 
 @pytest.mark.parametrize("field", ["terrain", "maze"])

@@ -1,4 +1,4 @@
-"""`swarm bench swarm` and `swarm bench crowd`: sizes, what is read out of counters, exponents, the page."""
+"""`bench swarm` and `bench crowd`: sizes, what is read out of counters, exponents, the page."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from bench.cli import app
+from bench.whole_swarm import crowd, series
+from bench.whole_swarm.figures import LIVE, SIMULATED, Figure, exponent, exponents, topic_figures
+from bench.whole_swarm.page import write_sizes
+from bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
+from bench.whole_swarm.stats_window import StatsWindow, ticks
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from typer.testing import CliRunner
 
-from launch_scripts.bench.cli import app
-from launch_scripts.bench.whole_swarm import crowd, series
-from launch_scripts.bench.whole_swarm.figures import LIVE, SIMULATED, Figure, exponent, exponents, topic_figures
-from launch_scripts.bench.whole_swarm.page import write_sizes
-from launch_scripts.bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
-from launch_scripts.bench.whole_swarm.stats_window import StatsWindow, ticks
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.simulation.campaign import in_processes
 from swarm.config.agents import plan_agents
@@ -365,7 +365,7 @@ def test_a_small_crowd_is_driven_shown_and_written_into_the_page(tmp_path: Path)
     assert drive["arrivals"] > 0
     assert (drive["collisions"], drive["lethal_entries"]) == (0, 0)
     text = (tmp_path / "page.md").read_text()
-    assert "## Crowds\n\n`swarm bench crowd --worlds open --seeds 1:2" in text
+    assert "## Crowds\n\n`./launch_scripts/bench crowd --worlds open --seeds 1:2" in text
     assert f"| open | {shown['cells_per_step']:.2f} |" in text
     lines = Console(width=80, file=io.StringIO())
     for part in crowd.tables(found):

@@ -1,14 +1,13 @@
-"""`swarm bench wire` runs small, and what must hold holds: nothing is lost, everything has its ratio."""
+"""`./launch_scripts/bench wire` runs small, and what must hold holds: nothing is lost, everything has its ratio."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
+from bench.cli import app
+from bench.wire import codec
 from typer.testing import CliRunner
-
-from launch_scripts.bench.cli import app
-from launch_scripts.bench.wire import codec
 
 pytestmark = pytest.mark.network
 

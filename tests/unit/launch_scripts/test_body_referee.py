@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.target_reports import fleet
 
-from launch_scripts.world.referee import BodyHit, Referee
+from launch_scripts.simulation.world.referee import BodyHit, Referee
 from swarm.grid import GridSpec
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.vehicles import Fleet

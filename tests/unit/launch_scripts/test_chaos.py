@@ -1,17 +1,17 @@
-"""What `swarm chaos` is made of: blows by seed, hostile messages, recovery, and the laws of a siege."""
+"""What `bench chaos` is made of: blows by seed, hostile messages, recovery, and the laws of a siege."""
 
 from __future__ import annotations
 
 from itertools import islice
 
 import pytest
+from chaos.blows import BLOWS, CALM, blows
+from chaos.hostile import KINDS, Hostile
+from chaos.lies import Lies
+from chaos.picture import draw
+from chaos.recovery import Recovery
+from chaos.tally import Ended, Outcome, Sample, Tally
 
-from launch_scripts.chaos.blows import BLOWS, CALM, blows
-from launch_scripts.chaos.hostile import KINDS, Hostile
-from launch_scripts.chaos.lies import Lies
-from launch_scripts.chaos.picture import draw
-from launch_scripts.chaos.recovery import Recovery
-from launch_scripts.chaos.tally import Ended, Outcome, Sample, Tally
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import pack_column

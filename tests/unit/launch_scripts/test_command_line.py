@@ -18,7 +18,7 @@ from launch_scripts import cli
 from launch_scripts.check import machine
 from launch_scripts.cli import command, main
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.results.run_folder import begin_run
+from launch_scripts.observe.run_folder import begin_run
 from swarm.config.values import Walk
 
 
@@ -41,7 +41,7 @@ EVERY = list(commands())
 
 def test_every_command_is_there() -> None:
     names = {" ".join(path) for path, _ in EVERY}
-    assert {"up", "new", "check", "doctor", "map inspect", "deploy certs", "bench swarm", "zone add"} <= names
+    assert {"up", "new", "check", "doctor", "map inspect", "deploy certs", "zone add"} <= names
     assert len(names) > 60
 
 
@@ -110,7 +110,6 @@ def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
     assert set(offered("target", "add", "x", "--walk", "")) >= set(Walk.__args__[:4])
     assert offered("set", "pl") == ["planner.cpu_budget", "planner.push_s"]
     assert offered("plugins", "check", "se") == ["sensor"]
-    assert offered("chaos", "--blow", "k") == ["kill"]
     assert offered("export", "LAST", "--what", "ma") == ["marks"]
     assert offered("export", "LAST", "--format", "g") == ["geojson", "gpkg"]
     assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]

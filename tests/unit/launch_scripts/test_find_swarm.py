@@ -14,8 +14,8 @@ import pytest
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.running.find_swarm import find_swarm
 from launch_scripts.commands.shared_options import Tls
+from launch_scripts.observe.run_folder import begin_run
 from launch_scripts.ports import free_ports
-from launch_scripts.report.results.run_folder import begin_run
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import BusError, ConfigError
 

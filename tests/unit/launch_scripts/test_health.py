@@ -22,15 +22,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.processes import eventually
 
-from launch_scripts.health.pages import PageServer, health_pages
-from launch_scripts.health.probe import ask, fast
-from launch_scripts.health.verdict import HEALTHY, READY, Process, verdict
 from launch_scripts.launcher import hang_watch
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, HangWatch
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.warm_up import WarmUp
-from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS
 from launch_scripts.process_table import ProcessSpec
+from launch_scripts.web.health_pages import PageServer, health_pages
+from launch_scripts.web.health_probe import ask, fast
+from launch_scripts.web.health_verdict import HEALTHY, READY, Process, verdict
+from launch_scripts.web.loopback_guard import MOST_CONNECTIONS
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import Health, Phase, Vitals
@@ -152,7 +152,7 @@ def test_whoever_answers_something_else_is_not_taken_for_a_page_of_health(reply:
 
 
 def test_nothing_that_a_stranger_answers_is_obeyed_by_a_terminal() -> None:
-    from launch_scripts.health.probe import Answer
+    from launch_scripts.web.health_probe import Answer
 
     lines = Answer(False, {"status": "\x1b[2J", "missing": ["a\nb", {"x": "\x9b"}]}).lines()
     assert all(line.isprintable() for line in lines)

@@ -17,9 +17,9 @@ import rerun as rr
 
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.serving import loopback_guard, stream_gate
-from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS, Audience, refusal
 from launch_scripts.monitor.serving.sinks import Sinks
+from launch_scripts.web import loopback_guard, stream_gate
+from launch_scripts.web.loopback_guard import MOST_CONNECTIONS, Audience, refusal
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 

@@ -23,9 +23,9 @@ from support.mavlink_world import (
     World,
 )
 
-from launch_scripts.mavlink.adapter import Wishes
-from launch_scripts.mavlink.autopilots import ARDUPILOT, PX4
-from launch_scripts.mavlink.messages import (
+from launch_scripts.gateways.mavlink.adapter import Wishes
+from launch_scripts.gateways.mavlink.autopilots import ARDUPILOT, PX4
+from launch_scripts.gateways.mavlink.messages import (
     ABOVE_HOME,
     ABOVE_TERRAIN,
     ARM_DISARM,
@@ -52,8 +52,8 @@ from launch_scripts.mavlink.messages import (
     Way,
     Withdraw,
 )
-from launch_scripts.mavlink.upload import State, Upload
-from launch_scripts.mavlink.waypoints import MOST_POINTS, is_end_of, rest, turns
+from launch_scripts.gateways.mavlink.upload import State, Upload
+from launch_scripts.gateways.mavlink.waypoints import MOST_POINTS, is_end_of, rest, turns
 
 MISSION, GUIDED = Wishes("t0"), Wishes("t0", "guided")
 OFFBOARD, AUTO_MISSION, AUTO_HOLD = 6 << 16, 4 << 16 | 4 << 24, 4 << 16 | 3 << 24

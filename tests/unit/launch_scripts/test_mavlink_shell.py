@@ -10,9 +10,9 @@ from support.client_rig import run_info
 from support.mavlink_world import FRAME, GRID, START, TO_THE_EAST
 from support.swarm_model import SwarmModel
 
-from launch_scripts.mavlink.adapter import Wishes
-from launch_scripts.mavlink.run import Body, Shell, check_ground
-from launch_scripts.mavlink.wire import AUTOPILOT, Wire
+from launch_scripts.gateways.mavlink.adapter import Wishes
+from launch_scripts.gateways.mavlink.run import Body, Shell, check_ground
+from launch_scripts.gateways.mavlink.wire import AUTOPILOT, Wire
 from swarm.bus.bus import Heard
 from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
 from swarm.client.session import Session

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from launch_scripts.mavlink.link import Link, open_link, read_address
-from launch_scripts.mavlink.messages import (
+from launch_scripts.gateways.mavlink.link import Link, open_link, read_address
+from launch_scripts.gateways.mavlink.messages import (
     ABOVE_HOME,
     ABOVE_TERRAIN,
     ARM_DISARM,
@@ -36,8 +36,8 @@ from launch_scripts.mavlink.messages import (
     Setpoint,
     Warned,
 )
-from launch_scripts.mavlink.run import read_key
-from launch_scripts.mavlink.wire import AUTOPILOT, COMPID, SYSID, Wire
+from launch_scripts.gateways.mavlink.run import read_key
+from launch_scripts.gateways.mavlink.wire import AUTOPILOT, COMPID, SYSID, Wire
 from swarm.errors import BusError, ConfigError
 
 common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")

@@ -22,14 +22,14 @@ from rosbags.highlevel import AnyReader
 from support.fake_run import fake_run
 
 from launch_scripts.cli import main
+from launch_scripts.gateways.ros2.frames import RosMap
+from launch_scripts.gateways.ros2.grids import rows_from_north
+from launch_scripts.gateways.ros2.names import ros_name
+from launch_scripts.observe.ground_pace import GROUND_PACE_FILE
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.foxglove.timeline import frame_names, instants_of
 from launch_scripts.report.geo.track_file import TRACKS_FILE, RunTracks, read_tracks
-from launch_scripts.report.ground_pace import GROUND_PACE_FILE
-from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
-from launch_scripts.ros2.frames import RosMap
-from launch_scripts.ros2.grids import rows_from_north
-from launch_scripts.ros2.names import ros_name
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

@@ -16,10 +16,10 @@ from prometheus_client.parser import text_string_to_metric_families as plain_fam
 from support.exported_metrics import exported
 
 from launch_scripts.commands.metrics import dashboard
-from launch_scripts.metrics.endpoint import MetricsEndpoint
-from launch_scripts.metrics.exporter import Exporter
-from launch_scripts.metrics.families import HELP, Figures, Run, families, named
-from launch_scripts.report.results.counts import Counts
+from launch_scripts.observe.counts import Counts
+from launch_scripts.web.metric_families import HELP, Figures, Run, families, named
+from launch_scripts.web.metrics_endpoint import MetricsEndpoint
+from launch_scripts.web.metrics_exporter import Exporter
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.memory_links import PerfectLinks
 from swarm.bus.scheduler import Scheduler
@@ -184,7 +184,7 @@ def test_no_name_from_the_network_breaks_a_scrape(
 ) -> None:
     from prometheus_client.openmetrics.exposition import generate_latest
 
-    from launch_scripts.metrics.endpoint import OneScrape
+    from launch_scripts.web.metrics_endpoint import OneScrape
 
     heard = Counts()
     heard.count(

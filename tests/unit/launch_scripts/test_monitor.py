@@ -33,12 +33,12 @@ from support.monitor_rig import (
 )
 from support.target_reports import fleet
 
-from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.serving.loopback_guard import Audience
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from launch_scripts.web import die_with_parent
+from launch_scripts.web.loopback_guard import Audience
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S

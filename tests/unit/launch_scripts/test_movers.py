@@ -23,10 +23,10 @@ from launch_scripts.monitor.movers.points import cell_at, label_places, target_p
 from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along, filled
 from launch_scripts.monitor.movers.searches import SILENT_NS, Searches, searched_points
 from launch_scripts.monitor.movers.strips import Trails, poles, rings
-from launch_scripts.report.results.certified_gap import CertifiedGap
-from launch_scripts.report.run_state.alarms import KINDS, Alarm
-from launch_scripts.report.run_state.state import TargetLine
-from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
+from launch_scripts.observe.alarms import KINDS, Alarm
+from launch_scripts.observe.certified_gap import CertifiedGap
+from launch_scripts.observe.state import TargetLine
+from launch_scripts.observe.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

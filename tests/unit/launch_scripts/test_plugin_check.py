@@ -9,7 +9,7 @@ import pytest
 from support.plugin_modules import forgotten_afterwards
 from support.plugin_pages import write_example
 
-from launch_scripts.plugin_check import check_plugin
+from launch_scripts.check.plugin_check import check_plugin
 from swarm.config.load import load_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, plugins_of
 from swarm.errors import ConfigError

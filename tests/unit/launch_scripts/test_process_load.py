@@ -8,10 +8,10 @@ from rich.console import Console
 
 from launch_scripts.commands.running.top import fields_of, table_of
 from launch_scripts.launcher.live_table import live_table
+from launch_scripts.observe.process_load import ProcessLoads, by_role
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.state import RunState
 from launch_scripts.process_table import ROLES
-from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.run_state.process_load import ProcessLoads, by_role
-from launch_scripts.report.run_state.state import RunState
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.grid import GridSpec

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from launch_scripts.launcher.live_table import plain_line
-from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.results.certified_gap import CertifiedGap
-from launch_scripts.report.run_state import facts
-from launch_scripts.report.run_state.state import RunState
-from launch_scripts.report.samples import Sample, Samples
-from launch_scripts.report.tracks import Tracks
+from launch_scripts.observe import facts
+from launch_scripts.observe.certified_gap import CertifiedGap
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.samples import Sample, Samples
+from launch_scripts.observe.state import RunState
+from launch_scripts.observe.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig

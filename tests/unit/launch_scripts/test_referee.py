@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.target_reports import fleet
 
-from launch_scripts.world.referee import Collision, LethalEntry, Referee
+from launch_scripts.simulation.world.referee import Collision, LethalEntry, Referee
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Fleet
 

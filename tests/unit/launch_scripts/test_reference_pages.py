@@ -12,11 +12,11 @@ from typing import Annotated
 import msgspec
 import pytest
 
+from docs.generate import cli_page, scenario_page
+from docs.generate.__main__ import PAGES
+from docs.generate.docstrings import as_markdown, meanings, prose
 from launch_scripts import cli
 from launch_scripts.command_line.families import Family
-from launch_scripts.reference import cli_page, scenario_page
-from launch_scripts.reference.__main__ import PAGES
-from launch_scripts.reference.docstrings import as_markdown, meanings, prose
 from swarm.config.scenario import Scenario
 
 ROOT = Path(__file__).parents[3]
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_the_page_is_current(path):
-    assert path.read_text(encoding="utf-8") == PAGES[path](), "run `python -m launch_scripts.reference`"
+    assert path.read_text(encoding="utf-8") == PAGES[path](), "run `python -m docs.generate`"
 
 
 class Explained(msgspec.Struct):

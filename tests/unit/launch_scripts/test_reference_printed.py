@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from launch_scripts.reference.method_pictures import FOLDER, PICTURES
-from launch_scripts.reference.printed import lattice_route, printed_costs, printed_range
+from docs.generate.method_pictures import FOLDER, PICTURES
+from docs.generate.printed import lattice_route, printed_costs, printed_range
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec

@@ -43,7 +43,7 @@ def test_every_page_is_built_and_in_the_navigation(site):
 
 
 def test_a_page_of_the_python_api_stands_for_every_room(site):
-    from launch_scripts.reference.site import packages
+    from docs.generate.site import packages
 
     for package, modules in packages().items():
         page = (site / "reference" / "api" / f"{package}.html").read_text(encoding="utf-8")

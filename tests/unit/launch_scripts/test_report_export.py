@@ -22,11 +22,11 @@ from support.fake_run import fake_run
 from support.map_strategies import set_of
 
 from launch_scripts.cli import main
-from launch_scripts.report.begun_routes import BegunRoute
+from launch_scripts.observe.begun_routes import BegunRoute
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.geo.geo_layers import mark_layer, track_layers
 from launch_scripts.report.geo.geo_shapes import in_degrees
 from launch_scripts.report.geo.track_file import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
-from launch_scripts.report.recorder import Recorder
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace

@@ -17,17 +17,17 @@ from msgspec.structs import replace
 from support.effort import few
 
 from launch_scripts.commands.ros2 import settings_of
-from launch_scripts.ros2.actions import Channel, Declare, Put, Remove
-from launch_scripts.ros2.diagnostics import Health
-from launch_scripts.ros2.frames import RosMap
-from launch_scripts.ros2.gateway import Gateway
-from launch_scripts.ros2.graph import NO_HASH, Endpoint, Kind, NodeName, Qos, SeenEndpoint
-from launch_scripts.ros2.map_feed import MapFeed
-from launch_scripts.ros2.map_topics import corners, outline
-from launch_scripts.ros2.messages import RosMessages
-from launch_scripts.ros2.names import ros_name
-from launch_scripts.ros2.packed_path import PATH, packed_path
-from launch_scripts.ros2.packed_places import (
+from launch_scripts.gateways.ros2.actions import Channel, Declare, Put, Remove
+from launch_scripts.gateways.ros2.diagnostics import Health
+from launch_scripts.gateways.ros2.frames import RosMap
+from launch_scripts.gateways.ros2.gateway import Gateway
+from launch_scripts.gateways.ros2.graph import NO_HASH, Endpoint, Kind, NodeName, Qos, SeenEndpoint
+from launch_scripts.gateways.ros2.map_feed import MapFeed
+from launch_scripts.gateways.ros2.map_topics import corners, outline
+from launch_scripts.gateways.ros2.messages import RosMessages
+from launch_scripts.gateways.ros2.names import ros_name
+from launch_scripts.gateways.ros2.packed_path import PATH, packed_path
+from launch_scripts.gateways.ros2.packed_places import (
     ODOMETRY,
     POSE,
     TRANSFORMS,
@@ -35,10 +35,10 @@ from launch_scripts.ros2.packed_places import (
     PackedPose,
     PackedTransforms,
 )
-from launch_scripts.ros2.peers import PeerWatch
-from launch_scripts.ros2.settings import Settings, load_settings, parse_settings
-from launch_scripts.ros2.topics import ROWS
-from launch_scripts.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.peers import PeerWatch
+from launch_scripts.gateways.ros2.settings import Settings, load_settings, parse_settings
+from launch_scripts.gateways.ros2.topics import ROWS
+from launch_scripts.gateways.ros2.types import Distribution, types_of
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.client.own_marks import OwnMarks
 from swarm.clock import NS_PER_S

@@ -15,21 +15,21 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.effort import few
 
-from launch_scripts.ros2.frames import RosMap, quaternion_of
-from launch_scripts.ros2.incoming.areas import MOST_CELLS, closed_cells, corners_of
-from launch_scripts.ros2.incoming.goals import GoalTargets
-from launch_scripts.ros2.incoming.places import FrameReader, Place, robot_place
-from launch_scripts.ros2.incoming.settings import (
+from launch_scripts.gateways.ros2.frames import RosMap, quaternion_of
+from launch_scripts.gateways.ros2.incoming.areas import MOST_CELLS, closed_cells, corners_of
+from launch_scripts.gateways.ros2.incoming.goals import GoalTargets
+from launch_scripts.gateways.ros2.incoming.places import FrameReader, Place, robot_place
+from launch_scripts.gateways.ros2.incoming.settings import (
     GridSettings,
     IncomingSettings,
     Robots,
     ZoneSettings,
     check_incoming,
 )
-from launch_scripts.ros2.incoming.tracks import Track
-from launch_scripts.ros2.messages import RosMessages
-from launch_scripts.ros2.packed_path import packed_path
-from launch_scripts.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.incoming.tracks import Track
+from launch_scripts.gateways.ros2.messages import RosMessages
+from launch_scripts.gateways.ros2.packed_path import packed_path
+from launch_scripts.gateways.ros2.types import Distribution, types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from launch_scripts.ros2 import grids, markers
-from launch_scripts.ros2.frames import (
+from launch_scripts.gateways.ros2 import grids, markers
+from launch_scripts.gateways.ros2.frames import (
     RosMap,
     heading_of,
     heading_of_quaternion,
@@ -20,9 +20,9 @@ from launch_scripts.ros2.frames import (
     quaternion_of,
     yaw_of,
 )
-from launch_scripts.ros2.markers import Drawing, Form, MarkerBook
-from launch_scripts.ros2.messages import Level, RosMessages, Severity
-from launch_scripts.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.markers import Drawing, Form, MarkerBook
+from launch_scripts.gateways.ros2.messages import Level, RosMessages, Severity
+from launch_scripts.gateways.ros2.types import Distribution, types_of
 from swarm.grid import GridSpec, Window
 
 STAMP_NS = 1_700_000_000_123_456_789

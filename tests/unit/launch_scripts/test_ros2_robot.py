@@ -11,13 +11,13 @@ import pytest
 from support.client_rig import Program
 from support.swarm_model import SwarmModel
 
-from launch_scripts.ros2.frames import RosMap
-from launch_scripts.ros2.incoming.place_routes import PlaceRoutes
-from launch_scripts.ros2.incoming.places import Place
-from launch_scripts.ros2.incoming.robot import Robot
-from launch_scripts.ros2.incoming.settings import Robots
-from launch_scripts.ros2.messages import Level, RosMessages
-from launch_scripts.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.frames import RosMap
+from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
+from launch_scripts.gateways.ros2.incoming.places import Place
+from launch_scripts.gateways.ros2.incoming.robot import Robot
+from launch_scripts.gateways.ros2.incoming.settings import Robots
+from launch_scripts.gateways.ros2.messages import Level, RosMessages
+from launch_scripts.gateways.ros2.types import Distribution, types_of
 from swarm.clock import NS_PER_S
 
 TYPES = types_of(Distribution.JAZZY)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from launch_scripts.process_table import processes_of
-from launch_scripts.world.rovers import Rovers
-from launch_scripts.world.walks import TrueTerrain
+from launch_scripts.simulation.world.rovers import Rovers
+from launch_scripts.simulation.world.walks import TrueTerrain
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from support.fake_run import fake_run
 
 from launch_scripts.launcher.options import SCENARIOS, find_scenario
-from launch_scripts.report.recorder import Recorder
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.results import Driven
+from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
+from launch_scripts.observe.vehicle_columns import VehicleColumns
 from launch_scripts.report.results.result_tables import TABLES
-from launch_scripts.report.results.results import Driven
-from launch_scripts.report.results.run_folder import begin_run, ended, find_run, point_last, read_report
-from launch_scripts.report.vehicle_columns import VehicleColumns
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S

@@ -16,8 +16,8 @@ from PIL import Image
 from support.fake_run import fake_run
 
 from launch_scripts.cli import main
-from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.load import parse_scenario

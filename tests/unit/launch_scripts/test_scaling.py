@@ -1,4 +1,4 @@
-"""`swarm bench scaling` and `swarm deploy size`: counts, quantities, fits, what several machines need, the page."""
+"""`bench scaling` and `swarm deploy size`: counts, quantities, fits, what several machines need, the page."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from bench.cli import app as bench
+from bench.scaling import page, rows
+from bench.scaling.blocks import NAMES, Block, blocks
+from bench.scaling.check import compare, model_of, summary, usable
+from bench.scaling.cost_model import fit, relative_error
+from bench.scaling.design import KINDS, Run, runs
+from bench.scaling.model import Model, Row
+from bench.scaling.needs import Machine, crossings_of, fewest_machines, needs, too_much
+from bench.scaling.quantities import _asks_per_s, quantities_of
+from bench.scaling.rows import measure_missing, read_rows
+from bench.scaling.terms import SENT, TERMS, WORK
+from bench.scaling.traffic import MACHINES, Traffic, run
+from bench.whole_swarm.size import Size, size_of
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from launch_scripts.bench.cli import app as bench
-from launch_scripts.bench.scaling import page, rows
-from launch_scripts.bench.scaling.blocks import NAMES, Block, blocks
-from launch_scripts.bench.scaling.check import compare, model_of, summary, usable
-from launch_scripts.bench.scaling.cost_model import fit, relative_error
-from launch_scripts.bench.scaling.design import KINDS, Run, runs
-from launch_scripts.bench.scaling.model import Model, Row
-from launch_scripts.bench.scaling.needs import Machine, crossings_of, fewest_machines, needs, too_much
-from launch_scripts.bench.scaling.quantities import _asks_per_s, quantities_of
-from launch_scripts.bench.scaling.rows import measure_missing, read_rows
-from launch_scripts.bench.scaling.terms import SENT, TERMS, WORK
-from launch_scripts.bench.scaling.traffic import MACHINES, Traffic, run
-from launch_scripts.bench.whole_swarm.size import Size, size_of
 from launch_scripts.commands.deploy import app as deploy
 from swarm.errors import ConfigError, SwarmError
 from swarm.grid import REGION_CELLS
@@ -329,7 +329,9 @@ def test_the_page_holds_what_the_rows_say(measured: list[Row], model: Model) -> 
     text = PAGE.read_text(encoding="utf-8")
     found = blocks(model, compare(measured), measured)
     assert [block.name for block in found] == list(NAMES)
-    assert page.with_blocks(text, found) == text, "run swarm bench scaling --kinds none --write docs/scaling.md"
+    assert page.with_blocks(text, found) == text, (
+        "run ./launch_scripts/bench scaling --kinds none --write docs/scaling.md"
+    )
 
 
 def test_tables_are_replaced_between_their_marks_only(tmp_path: Path) -> None:

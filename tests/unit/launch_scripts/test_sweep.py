@@ -15,21 +15,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from bench.learning_runs import wrong_prior
 from hypothesis import given
 from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
-from launch_scripts.bench.learning_runs import wrong_prior
 from launch_scripts.commands.sweep import sweep_study
 from launch_scripts.simulation.simulate import simulate
+from launch_scripts.simulation.study import statistics
+from launch_scripts.simulation.study.plan import plan
+from launch_scripts.simulation.study.run import Sweep
+from launch_scripts.simulation.study.store import ResultStore
+from launch_scripts.simulation.study.study import Study, cases_of, load_study, parse_study, study_names, study_path
+from launch_scripts.simulation.study.summary import Summary
+from launch_scripts.simulation.study.trial import Result, Trial, numbers, run_trial
 from launch_scripts.simulation.trial import BrokenLaw, try_seed
-from launch_scripts.sweep import statistics
-from launch_scripts.sweep.plan import plan
-from launch_scripts.sweep.run import Sweep
-from launch_scripts.sweep.store import ResultStore
-from launch_scripts.sweep.study import Study, cases_of, load_study, parse_study, study_names, study_path
-from launch_scripts.sweep.summary import Summary
-from launch_scripts.sweep.trial import Result, Trial, numbers, run_trial
 from swarm.config.load import load_scenario
 from swarm.errors import ConfigError, StoreError
 

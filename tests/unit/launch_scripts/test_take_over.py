@@ -22,8 +22,8 @@ from launch_scripts.launcher.options import common_run_id
 from launch_scripts.launcher.run_processes import writing
 from launch_scripts.launcher.take_over import TakeOver
 from launch_scripts.launcher.up_options import UpOptions
+from launch_scripts.observe.latest_state import Observed
 from launch_scripts.process_table import ProcessSpec
-from launch_scripts.report.latest_state import Observed
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError

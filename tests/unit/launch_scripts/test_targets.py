@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 from support.target_reports import RES, flat, fleet
 
-from launch_scripts.world.service import TargetsService
-from launch_scripts.world.targets import (
+from launch_scripts.simulation.world.service import TargetsService
+from launch_scripts.simulation.world.targets import (
     LISTEN_NS,
     PATIENCE_NS,
     STAY_COOL_DOWN_NS,
@@ -22,8 +22,8 @@ from launch_scripts.world.targets import (
     Publish,
     TargetWorld,
 )
-from launch_scripts.world.telling import Telling
-from launch_scripts.world.walks import Walk
+from launch_scripts.simulation.world.telling import Telling
+from launch_scripts.simulation.world.walks import Walk
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.homes import homes_of
 from shared_map.terrain.terrain import terrain_of_pace

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain import terrain_picture
 from launch_scripts.commands.terrain.terrain import app
-from shared_map.terrain.importers.sources import load_source
+from shared_map.importers.sources import load_source
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario

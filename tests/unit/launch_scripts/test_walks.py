@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.target_reports import FLAT, RES, flat
 
-from launch_scripts.world.walks import (
+from launch_scripts.simulation.world.walks import (
     WALKS,
     Budget,
     TrueTerrain,

@@ -15,8 +15,8 @@ from support.target_reports import fleet
 from launch_scripts.launcher.own_part import OwnPart
 from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.launcher.watcher import Watcher
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
-from launch_scripts.report.recorder import Recorder
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.liveness import Peer

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from launch_scripts.reference import __main__ as reference
-from launch_scripts.reference import wire_lock
-from launch_scripts.reference.wire_lock import broken, lock
+from docs.generate import __main__ as reference
+from docs.generate import wire_lock
+from docs.generate.wire_lock import broken, lock
 
 Change = Callable[[Any], object]
 

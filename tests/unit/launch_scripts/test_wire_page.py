@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from launch_scripts.reference import wire_page as wire_doc
+from docs.generate import wire_page as wire_doc
 from swarm.wire.topics import TOPICS
 
 
 def test_the_page_is_current():
-    assert wire_doc.PATH.read_text(encoding="utf-8") == wire_doc.document(), (
-        "run `python -m launch_scripts.reference`"
-    )
+    assert wire_doc.PATH.read_text(encoding="utf-8") == wire_doc.document(), "run `python -m docs.generate`"
 
 
 def test_every_key_message_and_field_is_on_the_page():

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s, flat, optimum_s, rough
 
-from launch_scripts.world.service import TargetsService
+from launch_scripts.simulation.world.service import TargetsService
 from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.target_tree import TargetTree

@@ -13,10 +13,10 @@ from scipy import ndimage
 from skimage.draw import line
 
 from shared_map.arrays import Bytes
-from shared_map.terrain.importers.photos.classify import by_rules, confusion, held_out, learnt
-from shared_map.terrain.importers.photos.labels import Labels, read_labels
-from shared_map.terrain.importers.photos.photo_features import box_sum
-from shared_map.terrain.importers.sources import Source, load_source
+from shared_map.importers.photos.classify import by_rules, confusion, held_out, learnt
+from shared_map.importers.photos.labels import Labels, read_labels
+from shared_map.importers.photos.photo_features import box_sum
+from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import counted, looked_up
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo

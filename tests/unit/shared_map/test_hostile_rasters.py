@@ -12,9 +12,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from shared_map.terrain.importers.rasters.rasters import read_elevation
-from shared_map.terrain.importers.water.level_ground import level_ground
-from shared_map.terrain.importers.water.voids import undeclared_voids
+from shared_map.importers.rasters.rasters import read_elevation
+from shared_map.importers.water.level_ground import level_ground
+from shared_map.importers.water.voids import undeclared_voids
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
@@ -107,8 +107,8 @@ def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
 
 
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
-    from shared_map.terrain.importers.sources import _looked_at
-    from shared_map.terrain.importers.water import level_ground as module
+    from shared_map.importers.sources import _looked_at
+    from shared_map.importers.water import level_ground as module
 
     monkeypatch.setattr(module, "MOST_SAMPLED", 2000)
     heights = np.add.outer(np.arange(101) * 2.0, np.arange(83) * 1.0).astype(np.float32) + 50

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from shared_map.terrain.importers.sources import load_source
+from shared_map.importers.sources import load_source
 from shared_map.terrain.layers import (
     CLASS_FACTOR,
     TerrainClass,

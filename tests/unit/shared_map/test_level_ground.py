@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench.water import counted, run_on
+from bench.water_models import MODELS, UNKNOWABLE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from support.height_models import SIDE, hills, is_water, load, written
 
-from launch_scripts.bench.water import counted, run_on
-from launch_scripts.bench.water_models import MODELS, UNKNOWABLE
-from shared_map.terrain.importers.grids.plain_files import read_npz
-from shared_map.terrain.importers.sources import _jacksboro_path
-from shared_map.terrain.importers.water import level_ground as module
-from shared_map.terrain.importers.water.level_ground import level_ground
-from shared_map.terrain.importers.water.voids import undeclared_voids
+from shared_map.importers.grids.plain_files import read_npz
+from shared_map.importers.sources import _jacksboro_path
+from shared_map.importers.water import level_ground as module
+from shared_map.importers.water.level_ground import level_ground
+from shared_map.importers.water.voids import undeclared_voids
 from swarm.errors import TerrainError
 
 # --- level ground -------------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def test_water_of_every_kind_of_model_is_found_and_dry_ground_is_left(name: str)
         assert shares["taken"] > 0.2
         return
     assert shares["taken"] <= 0.003
-    # What is missed where water is rough are ponds; `swarm bench water` has the figures.
+    # What is missed where water is rough are ponds; `./launch_scripts/bench water` has the figures.
     rough = "laser" in name or "packed" in name or "filter" in name
     assert (shares["missed"] or 0) <= (0.1 if rough else 0.002)
 

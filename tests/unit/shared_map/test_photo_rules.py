@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.importers.ground_cover import classified
-from shared_map.terrain.importers.photos import photo_features
-from shared_map.terrain.importers.photos.classify import class_readings
-from shared_map.terrain.importers.photos.photo_features import Features
-from shared_map.terrain.importers.photos.photo_roads import line_strength
-from shared_map.terrain.importers.photos.photo_rules import CLASS_OF_READINGS, EXPOSURES, ground_readings
-from shared_map.terrain.importers.source import Source
+from shared_map.importers.ground_cover import classified
+from shared_map.importers.photos import photo_features
+from shared_map.importers.photos.classify import class_readings
+from shared_map.importers.photos.photo_features import Features
+from shared_map.importers.photos.photo_roads import line_strength
+from shared_map.importers.photos.photo_rules import CLASS_OF_READINGS, EXPOSURES, ground_readings
+from shared_map.importers.source import Source
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig

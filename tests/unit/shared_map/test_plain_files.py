@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared_map.terrain.importers.grids.plain_files import read_pgm
-from shared_map.terrain.importers.sources import Source, load_source
+from shared_map.importers.grids.plain_files import read_pgm
+from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario

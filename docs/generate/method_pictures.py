@@ -1,0 +1,403 @@
+"""The pictures of docs/method.md, computed by the planner's own trees on small grids. They are deterministic.
+
+python -m docs.generate.method_pictures [NAME ...]
+
+What the paper prints and this project does otherwise comes from `printed`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from docs.generate.printed import lattice_route, printed_costs, printed_range
+from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
+from launch_scripts.observe.plot_style import STYLE
+from planner_service.strategy import ROWS, STAGES, Strategy
+from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.strides import one_stride
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+
+FOLDER = Path(__file__).parents[2] / "docs" / "images" / "method"
+Pace = NDArray[np.float32]
+Place = tuple[int, int]
+Trail = NDArray[np.int64]
+_GROUND = LinearSegmentedColormap.from_list("ground", ["#f6f3ea", "#d9cfae", "#a68a5b"])
+_WALL = ListedColormap(["#4a4f57"])
+_LABEL: Any = {"fc": "white", "ec": "none", "pad": 1.0, "alpha": 0.8}
+_GAP = LinearSegmentedColormap.from_list("gap", ["#f2f7f4", "#fbd9a0", ORANGE, RED, "#6d1404"])
+
+
+class Chase:
+    """A target's tree on a small map, and where the target is."""
+
+    def __init__(self, pace: Pace, target: Place, row: Strategy | None = None, **config: Any) -> None:
+        self.pace = pace
+        self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
+        self.tree = TargetTree(self.grid, PlannerConfig(**config), chosen_by=row)
+        self.version = 0
+        self.widths: list[int] = []
+        self.go(target)
+
+    def go(self, target: Place) -> Any:
+        """The target is at a place; the tree follows. A full growth that falls due is done at once."""
+        self.target = target
+        cell = self.grid.cell(*target)
+        done = self.tree.update(self.pace, cell, [], self.version)
+        if done.wants_full:
+            grown = self.tree.full_job(cell)()
+            done = self.tree.adopt(grown, self.pace, cell, [], self.version, [])
+        if self.tree.wants_strides:
+            self.tree.take_strides(self.tree.stride_job().run())
+        self.widths.append(done.window.row1 - done.window.row0)
+        return done
+
+    def trail(self, start: Place) -> Trail:
+        """(n, 2) places of the route from a cell to the target."""
+        route = self.tree.routes([self.grid.cell(*start)])[0]
+        steps = np.frombuffer(route.directions, np.uint8)
+        moves = np.stack([np.array(STEP_ROW)[steps], np.array(STEP_COL)[steps]], axis=1)
+        return np.concatenate([[start], np.array(start) + np.cumsum(moves, axis=0)])
+
+    def costs(self) -> NDArray[np.float64]:
+        """(rows, cols), s: what is driven along the route of each cell; inf where there is none."""
+        return self.tree.routes(np.arange(self.grid.cells)).cost_s.reshape(self.pace.shape)
+
+
+def tree() -> Figure:
+    """A cost map, the parents of all cells, and the route of a vehicle."""
+    pace = _hills(14, 22, seed=5, strength=2.4)
+    pace[3:10, 9] = np.inf
+    chase = Chase(pace, (4, 17), strategy="full")
+    figure, (axes,) = _figure(1, (6.6, 4.3))
+    _ground(axes, pace)
+    for row in range(14):
+        for col in range(22):
+            trail = chase.trail((row, col))
+            if len(trail) > 1 and math.isfinite(pace[row, col]):
+                south, east = (trail[1] - trail[0]) * 0.32
+                axes.annotate(
+                    "",
+                    (col + east, row + south),
+                    (col - east, row - south),
+                    arrowprops={"arrowstyle": "-|>,head_width=.14,head_length=.24", "color": "#7d7357", "lw": 0.7},
+                )
+    _route(axes, chase.trail((11, 3)), GREEN)
+    _vehicle(axes, (11, 3))
+    _target(axes, (4, 17))
+    axes.set_title("Each cell's parent; brown cells cost more, the wall is lethal")
+    return figure
+
+
+def reversed_edges() -> Figure:
+    """Which of two targets is the cheapest, if the tree is grown along the edges, and against them."""
+    pace = np.ones((36, 60), np.float32)
+    row, col = np.indices(pace.shape)
+    pace[np.hypot(row - 18, col - 14) < 3.5] = 12.0
+    places, vehicle = ((18, 14), (18, 56)), (27, 18)
+    chases = [Chase(pace, place, strategy="full") for place in places]
+    driven = np.stack([chase.costs() for chase in chases])
+    as_printed = np.stack([printed_costs(pace, place) for place in places])
+    figure, panels = _figure(2, (9.2, 3.3))
+    sides = ((as_printed, "Along the edges, as printed"), (driven, "Against the edges"))
+    for axes, (costs, title) in zip(panels, sides, strict=True):
+        choice = costs.argmin(axis=0)
+        axes.imshow(choice, cmap=ListedColormap(["#d6e9f5", "#fdebd0"]), vmin=0, vmax=1)
+        axes.contourf(pace > 1, levels=[0.5, 2], colors=[INK], alpha=0.18)
+        if (choice != driven.argmin(axis=0)).any():
+            axes.contourf(choice != driven.argmin(axis=0), levels=[0.5, 1.5], colors="none", hatches=["////"])
+            axes.text(24, 34, "hatched: sent to the dearer target", fontsize=8.5, color=INK)
+        taken = int(choice[vehicle])
+        _route(axes, chases[taken].trail(vehicle), GREEN)
+        _vehicle(axes, vehicle)
+        for place, colour, name in zip(places, (BLUE, ORANGE), ("A, in a swamp", "B"), strict=True):
+            _target(axes, place, colour)
+            axes.text(place[1], place[0] - 2.6, name, ha="center", fontsize=9, color=INK, bbox=_LABEL)
+        figures = f"to {'AB'[taken]}: {costs[taken][vehicle]:.0f} s promised, {driven[taken][vehicle]:.0f} s driven"
+        axes.set_title(f"{title}\n{figures}")
+    return figure
+
+
+def range_rule() -> Figure:
+    """How wide a window each move of a target gets, by the printed condition and by blocks that are left."""
+    figure = Figure(figsize=(9.2, 3.5), layout="constrained")
+    left, *right = figure.subplots(1, 3, width_ratios=[1.05, 1.2, 1.2])
+    _blocks(left)
+    moves = range(1, 33)
+    for axes, step, title in zip(right, ((0, 1), (1, 1)), ("Along a row", "Along a diagonal"), strict=True):
+        chase = Chase(np.ones((257, 257), np.float32), (128, 128), strategy="variable_range", k_min=2)
+        for n in moves:
+            chase.go((128 + n * step[0], 128 + n * step[1]))
+        printed = [printed_range(n * step[0], n * step[1], k_min=2) for n in moves]
+        axes.bar(moves, chase.widths[1:], width=0.62, color="#bfe3d6", edgecolor=GREEN, linewidth=0.8, label="ours")
+        axes.plot(moves, printed, "o", ms=3.6, color=RED, label="the printed condition")
+        axes.set(yscale="log", ylim=(6, 200), xlabel="moves since the start", title=title)
+        axes.set_yticks([9, 17, 33, 65, 129], ["9", "17", "33", "65", "129"])
+        axes.minorticks_off()
+    right[0].set_ylabel("cells that the window is wide")
+    right[0].legend(loc="upper left", borderaxespad=0.2)
+    return figure
+
+
+def _blocks(axes: Axes) -> None:
+    axes.set(xlim=(-17.5, 17.5), ylim=(-17.5, 17.5), aspect="equal", xticks=[], yticks=[])
+    axes.grid(False)
+    for line in range(-16, 17, 4):
+        wide = 1.1 if line % 8 == 0 else 0.5
+        axes.axhline(line - 2.5, color="#c9ced4", lw=wide, zorder=0)
+        axes.axvline(line - 2.5, color="#c9ced4", lw=wide, zorder=0)
+    for width, colour, text in (
+        (9, GREEN, "9: every move"),
+        (17, BLUE, "17: out of a 4 x 4 block"),
+        (33, ORANGE, "33: out of an 8 x 8 block"),
+    ):
+        axes.add_patch(Rectangle((-width / 2, -width / 2), width, width, fill=False, ec=colour, lw=1.8))
+        axes.text(
+            0,
+            width / 2 - 0.3,
+            text,
+            color=colour,
+            fontsize=8.5,
+            ha="center",
+            va="top",
+            weight="bold",
+            bbox={"fc": "white", "ec": "none", "pad": 0.8},
+        )
+    axes.plot(0, 0, "*", ms=12, color=RED, mec="white")
+    axes.set_title("Windows for k_min = 2")
+
+
+def tracking() -> Figure:
+    """A vehicle whose route ends where the target was; and one whose route is renewed while it drives."""
+    pace = _hills(92, 132, seed=11, strength=0.7)
+    pace[46:49, :] = np.inf
+    for bridge in (62, 98):
+        pace[46:49, bridge : bridge + 4] = 1.0
+    start, target = (85, 50), (12, 65)
+    figure, panels = _figure(2, (9.2, 3.5))
+    sides = (
+        ("variable_range", "Windows, and a new route where the old one ends"),
+        ("exact", "Exact moves, newer routes pushed"),
+    )
+    for axes, (strategy, title) in zip(panels, sides, strict=True):
+        chase = Chase(pace, target, strategy=strategy, k_min=2)
+        was = chase.trail(start)
+        driven, ends, frames = _drive(chase, start, [(12, 65 + n) for n in range(1, 31)])
+        _ground(axes, pace)
+        _route(axes, driven, GREEN)
+        _route(axes, was, INK, dashed=True)
+        axes.plot([target[1], chase.target[1]], [target[0]] * 2, color=RED, lw=1.4, ls=":")
+        axes.plot(target[1], target[0], "*", ms=10, mfc="white", mec=RED)
+        for end in ends:
+            axes.annotate(
+                "the route ends here:\nthe target has gone",
+                (end[1], end[0]),
+                (end[1] - 42, end[0] + 9),
+                fontsize=8.5,
+                color=INK,
+                arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 0.8},
+            )
+        _vehicle(axes, start)
+        _target(axes, chase.target)
+        axes.set_title(f"{title}\ntarget reached after {frames} frames")
+    return figure
+
+
+def _drive(chase: Chase, start: Place, way: Sequence[Place]) -> tuple[Trail, list[Place], int]:
+    """A vehicle drives a cell a frame, its target one in two frames, until the two meet. It gets a newer route when
+    it stands in the grown window, and asks for one when its own has ended. Returns its way, ends and frames."""
+    path, place, at = chase.trail(start), start, 0
+    driven, ends = [start], []
+    frame = 0
+    while max(abs(place[0] - chase.target[0]), abs(place[1] - chase.target[1])) > 1 and frame < 400:
+        frame += 1
+        if frame % 2 == 0 and frame // 2 <= len(way) and chase.go(way[frame // 2 - 1]).window.contains(*place):
+            path, at = chase.trail(place), 0
+        if at + 1 >= len(path):
+            ends.append(place)
+            path, at = chase.trail(place), 0
+        at += 1
+        place = (int(path[at][0]), int(path[at][1]))
+        driven.append(place)
+    return np.array(driven), ends, frame
+
+
+def schedule() -> Figure:
+    """How far every cell's route is from the optimum after a target has moved 120 cells."""
+    pace = _hills(160, 160, seed=3, strength=1.6)
+    walls = gaussian_filter(np.random.default_rng(4).standard_normal(pace.shape), 5)
+    pace[walls > 1.7 * walls.std()] = np.inf
+    begin = (110, 22)
+    way = Chase(pace, (38, 140), strategy="full").trail(begin)[1:121]
+    exact = Chase(pace, (int(way[-1][0]), int(way[-1][1])), strategy="full").costs()
+    figure, panels = _figure(2, (8.4, 3.9))
+    for axes, row, name in zip(
+        panels,
+        (ROWS["variable_range"], STAGES["rotate"]),
+        ("The paper's windows", "Doubling windows, renewed every 13 moves"),
+        strict=True,
+    ):
+        chase = Chase(pace, begin, row, k_min=2, cpu_budget=1.2e-4)
+        for place in way:
+            chase.go((int(place[0]), int(place[1])))
+        with np.errstate(invalid="ignore"):
+            gap = (chase.costs() / exact - 1) * 100
+        gap[np.isnan(gap)] = 0
+        seen = gap[np.isfinite(pace)]
+        shown = axes.imshow(gap, cmap=_GAP.resampled(10), vmin=0, vmax=25)
+        axes.imshow(np.where(np.isfinite(pace), np.nan, 1.0), cmap=_WALL)
+        axes.plot(way[:, 1], way[:, 0], color=INK, lw=1.0, ls=":")
+        _target(axes, chase.target)
+        axes.set_title(f"{name}\nmean {seen.mean():.2f} %, 95th percentile {np.percentile(seen, 95):.1f} %")
+    figure.colorbar(shown, ax=panels, shrink=0.85, label="driven above the optimum, %", extend="max")
+    return figure
+
+
+def strides() -> Figure:
+    """A thin wall, under a lattice of every eighth cell and under blocks of as many."""
+    pace = _hills(64, 96, seed=8, strength=0.9)
+    pace[14:64, 30] = np.inf
+    pace[0:46, 62] = np.inf
+    start, target = (52, 4), (20, 84)
+    figure, (left, right) = _figure(2, (9.2, 3.6))
+    _ground(left, pace)
+    jumped = lattice_route(pace, start, target, stride=8)
+    crossed = [
+        (a, b) for a, b in pairwise(jumped) if any(not math.isfinite(pace[row, col]) for row, col in _between(a, b))
+    ]
+    rows, cols = np.mgrid[4:64:8, 4:96:8]
+    left.plot(cols.ravel(), rows.ravel(), ".", ms=2.4, color="#8b8371")
+    _route(left, jumped, RED)
+    for a, b in crossed:
+        left.plot((a[1] + b[1]) / 2, (a[0] + b[0]) / 2, "x", ms=11, mew=2.6, color=BLACK)
+    left.set_title("Every eighth cell: the route passes through two walls")
+    _ground(right, pace)
+    for line in range(0, 97, 8):
+        right.axvline(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
+        right.axhline(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
+    centres, ways = _network(pace, stride=8)
+    for way in ways:
+        right.plot(way[:, 1], way[:, 0], color=BLUE, lw=0.8, alpha=0.7)
+    right.plot(centres[:, 1], centres[:, 0], "o", ms=2.6, color=BLUE)
+    _route(right, Chase(pace, target, strategy="full").trail(start), GREEN)
+    right.set(xlim=(-0.5, 95.5), ylim=(63.5, -0.5), title="Nodes and links of a stride of 8, and the route")
+    for axes in (left, right):
+        _vehicle(axes, start)
+        _target(axes, target)
+    return figure
+
+
+def _network(pace: Pace, stride: int) -> tuple[Trail, list[Trail]]:
+    """(n, 2) places of the centres of a stride's nodes, and those of the way of each link."""
+    grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
+    costs = CostGrid(grid, PlannerConfig())
+    costs.load(pace)
+    centre, links = one_stride(costs, stride)
+    moves = np.stack((STEP_ROW, STEP_COL), axis=1)
+    begins = np.cumsum(links.length) - links.length
+    ways = []
+    for node, begin, length in zip(links.ends[0], begins, links.length, strict=True):
+        steps = moves[links.paths[begin : begin + length]]
+        start = np.array(divmod(int(centre[node]), costs.stride)) - 1
+        ways.append(np.concatenate([[start], start + np.cumsum(steps, axis=0)]))
+    return np.stack(np.divmod(centre.astype(np.int64), costs.stride), axis=1) - 1, ways
+
+
+def _between(a: Any, b: Any) -> list[Place]:
+    many = int(max(abs(b[0] - a[0]), abs(b[1] - a[1])))
+    return [
+        (round(a[0] + (b[0] - a[0]) * n / many), round(a[1] + (b[1] - a[1]) * n / many)) for n in range(many + 1)
+    ]
+
+
+# --- how it looks -----------------------------------------------------------------------------------------------
+
+
+def _hills(rows: int, cols: int, seed: int, strength: float) -> Pace:
+    """Paces of gentle hills, s/m, from 1 on."""
+    rough = gaussian_filter(np.random.default_rng(seed).standard_normal((rows, cols)), min(rows, cols) / 12)
+    pace: Pace = (1 + strength * np.abs(rough / rough.std()) ** 1.3).astype(np.float32)
+    return pace
+
+
+def _figure(panels: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(np.atleast_1d(figure.subplots(1, panels)))
+
+
+def _ground(axes: Axes, pace: Pace) -> None:
+    finite = np.where(np.isfinite(pace), pace, np.nan)
+    axes.imshow(finite, cmap=_GROUND, vmin=1, vmax=float(np.nanpercentile(finite, 99)))
+    axes.imshow(np.where(np.isfinite(pace), np.nan, 1.0), cmap=_WALL)
+    axes.grid(False)
+    axes.set(xticks=[], yticks=[])
+
+
+def _route(axes: Axes, trail: Trail, colour: str, dashed: bool = False) -> None:
+    if not dashed:
+        axes.plot(trail[:, 1], trail[:, 0], color="white", lw=3.6, solid_capstyle="round")
+    axes.plot(trail[:, 1], trail[:, 0], color=colour, lw=1.6 if dashed else 2.1, ls="--" if dashed else "-")
+
+
+def _vehicle(axes: Axes, place: Place) -> None:
+    axes.plot(place[1], place[0], "o", ms=8, color=GREEN, mec="white", mew=1.2)
+    axes.grid(False)
+    axes.set(xticks=[], yticks=[])
+
+
+def _target(axes: Axes, place: Place, colour: str = RED) -> None:
+    axes.plot(place[1], place[0], "*", ms=15, color=colour, mec="white", mew=1.0)
+    axes.grid(False)
+    axes.set(xticks=[], yticks=[])
+
+
+PICTURES: dict[str, Callable[[], Figure]] = {
+    "tree": tree,
+    "reversed-edges": reversed_edges,
+    "range-rule": range_rule,
+    "tracking": tracking,
+    "schedule": schedule,
+    "strides": strides,
+}
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a picture with a palette, without date or version: the same picture is the same file."""
+    raw = io.BytesIO()
+    figure.savefig(raw, format="png", dpi=100, metadata={"Software": None})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.open(raw).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.generate.method_pictures",
+        description="Draw the pictures of docs/method.md.",
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PICTURES)}; all if none")
+    for name in parser.parse_args().names or PICTURES:
+        with mpl.rc_context(STYLE):
+            save(PICTURES[name](), FOLDER / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()

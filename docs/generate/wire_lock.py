@@ -1,0 +1,160 @@
+"""The lock of the wire: every key and message as it was written last, so that no change breaks the rules of
+versions unnoticed (decision 87)."""
+
+from __future__ import annotations
+
+import enum
+import json
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from docs.generate.wire_page import default_text, messages, parts, type_text
+from swarm.wire.messages.base import WIRE_VERSION, Message
+from swarm.wire.topics import ALIVE_KEY, TOPICS
+from swarm.wire.versions import are_neighbours, name_and_version, read_schemas, written_schema
+
+PATH = Path(__file__).parents[2] / "docs" / "wire.lock"
+REQUIRED = "refused"
+"""The default of a field without one, as on the page of the wire."""
+NEVER_STEP = ("run", "nothing")
+"""Messages by which builds of any two versions say which they are."""
+
+Lock = Mapping[str, Any]
+"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes`, `structs`,
+each of which is a list of fields: name, type, default, `layouts` of these, and `values` of enumerations."""
+
+
+def lock() -> Lock:
+    """The wire of this build."""
+    return {
+        "wire_version": WIRE_VERSION,
+        "token": ALIVE_KEY,
+        "keys": {
+            topic.name: {
+                "key": topic.key,
+                "message": topic.message.__name__,
+                "request": None if topic.request is None else topic.request.__name__,
+                "bulk": None if topic.bulk is None else topic.bulk.__name__,
+                "trusted": topic.trusted,
+            }
+            for topic in TOPICS
+        },
+        "messages": {name_and_version(read_schemas(kind)[0])[0]: _locked(kind) for kind in messages()},
+    }
+
+
+def _locked(kind: type[Message]) -> dict[str, Any]:
+    structs = (kind, *parts(kind))
+    return {
+        "reads": sorted(name_and_version(schema)[1] for schema in read_schemas(kind)),
+        "writes": name_and_version(written_schema(kind))[1],
+        "structs": {struct.__name__: _fields(struct) for struct in structs},
+        "layouts": {struct.__name__: _layout(struct) for struct in structs},
+        "values": {each.__name__: [member.value for member in each] for each in _enumerations(structs)},
+    }
+
+
+def _layout(struct: type[msgspec.Struct]) -> str:
+    """How fields are written, and whether what a later build adds is read past."""
+    config = struct.__struct_config__
+    return ("list" if config.array_like else "map") + (", no other fields" if config.forbid_unknown_fields else "")
+
+
+def _enumerations(structs: Iterable[type[msgspec.Struct]]) -> list[type[enum.Enum]]:
+    """Those whose members are written, each once, in the order of the fields."""
+    found: dict[type[enum.Enum], None] = {}
+    for struct in structs:
+        hints: list[Any] = list(typing.get_type_hints(struct, include_extras=True).values())
+        for hint in hints:  # grows
+            hints.extend(typing.get_args(hint))
+            if isinstance(hint, type) and issubclass(hint, enum.Enum):
+                found[hint] = None
+    return list(found)
+
+
+def _fields(struct: type[msgspec.Struct]) -> list[list[str]]:
+    hints = typing.get_type_hints(struct, include_extras=True)
+    return [
+        [field.name, type_text(hints[field.name]), default_text(field)] for field in msgspec.structs.fields(struct)
+    ]
+
+
+def document() -> str:
+    """The lock as text: a topic a line, a field a line, so that a change shows where it is."""
+    return _text(lock(), "") + "\n"
+
+
+def _text(value: Any, margin: str) -> str:
+    """JSON in which only maps and lists of lists take more than one line."""
+    inner = margin + " "
+    if isinstance(value, dict) and any(isinstance(each, dict | list) for each in value.values()):
+        lines = [f"{inner}{json.dumps(name)}: {_text(each, inner)}" for name, each in value.items()]
+        return "{\n" + ",\n".join(lines) + f"\n{margin}}}"
+    if isinstance(value, list) and any(isinstance(each, list) for each in value):
+        return "[\n" + ",\n".join(inner + json.dumps(each) for each in value) + f"\n{margin}]"
+    return json.dumps(value)
+
+
+def faults() -> list[str]:
+    """What breaks the rules since the lock was written last, a sentence each."""
+    return list(broken(json.loads(PATH.read_text(encoding="utf-8")), lock())) if PATH.is_file() else []
+
+
+def broken(before: Lock, now: Lock) -> Iterator[str]:
+    """The rules that a change from one lock to another breaks."""
+    if before["token"] != now["token"]:
+        yield f"the key of liveliness tokens was {before['token']} and is {now['token']}: it never changes"
+    if not 0 <= now["wire_version"] - before["wire_version"] <= 1:
+        versions = f"was {before['wire_version']} and is {now['wire_version']}"
+        yield f"the wire version {versions}: it rises by one at a time"
+    if not are_neighbours(before["wire_version"], now["wire_version"]):
+        return
+    moved = now["wire_version"] != before["wire_version"]
+    for name, topic in before["keys"].items():
+        if topic != now["keys"].get(name) and not moved:
+            yield f"the key of topic {name} has changed: the wire version has to rise"
+    for name, message in before["messages"].items():
+        if name in now["messages"]:
+            yield from _broken_message(name, message, now["messages"][name], moved)
+        elif not moved:
+            yield f"the message {name} is gone: the wire version has to rise"
+
+
+def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator[str]:
+    if before["writes"] not in now["reads"]:
+        yield f"{name} of version {before['writes']}, which the build before writes, is no longer read"
+    if now["writes"] not in before["reads"]:
+        yield f"{name} is written in version {now['writes']}, which the build before does not read"
+    if max(now["reads"]) == max(before["reads"]):
+        yield from _broken_fields(name, before["structs"], now["structs"])
+        for what in ("layouts", "values"):
+            for part, was in before.get(what, {}).items():
+                is_now = now[what].get(part)
+                if is_now != was and (what == "values" or is_now is not None):
+                    yield (
+                        f"{part} was {json.dumps(was)} and is {json.dumps(is_now)}: {name} needs a step to its "
+                        "next version (swarm/wire/versions.py)"
+                    )
+    elif name in NEVER_STEP:
+        yield f"{name} has taken a step: it never does"
+    elif not moved:
+        yield f"{name} has taken a step: the wire version has to rise"
+
+
+def _broken_fields(name: str, before: Lock, now: Lock) -> Iterator[str]:
+    for struct, fields in before.items():
+        kept = now.get(struct, [])
+        for index, field in enumerate(fields):
+            if index >= len(kept) or kept[index] != field:
+                is_now = f"is {' | '.join(kept[index])}" if index < len(kept) else "is gone"
+                yield (
+                    f"{struct}.{field[0]} was {' | '.join(field)} and {is_now}: {name} needs a step to its next "
+                    "version (swarm/wire/versions.py)"
+                )
+        for field in kept[len(fields) :]:
+            if field[2] == REQUIRED:
+                yield f"{struct}.{field[0]} is added without a default: builds before this one do not send it"

@@ -1,0 +1,1 @@
+"""Adapters to other systems: ROS 2 and MAVLink."""

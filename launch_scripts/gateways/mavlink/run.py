@@ -1,0 +1,190 @@
+"""The shell: one thread that passes messages between a link, the core and the swarm's client."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from launch_scripts.gateways.mavlink.adapter import Adapter, Wishes
+from launch_scripts.gateways.mavlink.link import Address, Link, open_link
+from launch_scripts.gateways.mavlink.messages import Action, Follow, Report, Tell, Unfollow, Way, Withdraw
+from launch_scripts.gateways.mavlink.wire import Wire, pymavlink
+from launch_scripts.stop_requests import stop_requests
+from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
+
+_TURN_S = 0.02
+_MOST_READ = 200
+"""Pieces read in one turn, so that a flood leaves time for what is due."""
+_LAST_WORDS = 3
+"""Times that the last words are said: nobody answers them."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Who the vehicle is in the swarm, as `Swarm.vehicle` has it.
+
+    id  None: `mav` and its number on the link
+    """
+
+    id: str | None = None
+    group: str = "all"
+    radius_m: float = 1.0
+    vehicle_class: str = "ground"
+
+
+def read_key(path: Path) -> bytes:
+    """The 32 bytes of a signing key, a file of 64 hexadecimal digits. Raises ConfigError."""
+    try:
+        key = bytes.fromhex(path.read_text(encoding="ascii"))
+    except OSError as error:
+        raise ConfigError(f"--signing-key: cannot read {path}: {error.strerror or error}") from error
+    except ValueError:
+        key = b""
+    if len(key) != 32:
+        raise ConfigError(f"--signing-key: {path} holds no key, expected 64 hexadecimal digits")
+    return key
+
+
+def check_ground(frame: Frame) -> None:
+    """Raises ConfigError where the terrain has no coordinates, or pyproj is missing."""
+    try:
+        frame.to_wgs84(*frame.centre_m(0))
+    except ConfigError as error:
+        raise ConfigError(f"swarm mavlink needs latitudes and longitudes: {error}") from error
+
+
+def run(
+    connect: Callable[[], Swarm],
+    address: Address,
+    body: Body,
+    wishes: Wishes,
+    *,
+    sysid: int | None,
+    key: bytes | None,
+    tell: Callable[[str], None],
+) -> None:
+    """Until SIGINT or SIGTERM. Raises SwarmError if the swarm or the link cannot be reached, or the run is over."""
+    pymavlink()
+    with connect() as swarm:
+        check_ground(swarm.frame)
+        link = open_link(address)
+        try:
+            shell = Shell(swarm, link, Wire(sysid, key, time.time()), body, wishes, tell)
+            tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
+            with stop_requests() as stopping:  # so that the vehicle is told to stop
+                try:
+                    while not stopping():
+                        shell.turn()
+                except KeyboardInterrupt:
+                    pass
+                finally:
+                    shell.stop()
+        finally:
+            link.close()
+
+
+class Shell:
+    """One turn after the other: what the link and the swarm have brought, then what is due."""
+
+    def __init__(
+        self,
+        swarm: Swarm,
+        link: Link,
+        wire: Wire,
+        body: Body,
+        wishes: Wishes,
+        tell: Callable[[str], None],
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._swarm = swarm
+        self._now_ns = now_ns
+        self._link = link
+        self._wire = wire
+        self._body = body
+        self._tell = tell
+        self._adapter = Adapter(swarm.frame, wishes)
+        self._vehicle: Vehicle | None = None
+        self._routes: Stream[Route] | None = None
+        swarm.on_problem(tell)
+
+    def turn(self) -> None:
+        """Read what has come, and do what is due."""
+        within_s = _TURN_S
+        for _ in range(_MOST_READ):
+            data = self._link.read(within_s)
+            if data is None:
+                break
+            within_s = 0.0
+            heard = self._wire.read(data, whole=self._link.whole)
+            if heard:
+                self._link.answer_last()
+            for message in heard:
+                self._adapter.hear(message, self._now_ns())
+        else:
+            time.sleep(_TURN_S / 4)
+        self._adapter.hear_swarm(self._swarm.connected)
+        if (way := self._newest_way()) is not None:
+            self._adapter.hear_way(way)
+        failure: SwarmError | None = None
+        for action in self._adapter.tick(self._now_ns()):
+            try:
+                self._do(action)
+            except SwarmError as error:  # what is said to the vehicle is said all the same
+                failure = error
+        if failure is not None:
+            raise failure
+
+    def stop(self) -> None:
+        """Let the vehicle stop, as far as that is ours, and take it away."""
+        last = self._adapter.stop(self._now_ns())
+        for _ in range(_LAST_WORDS):
+            for action in last:
+                self._do(action)
+            time.sleep(_TURN_S)
+
+    def _newest_way(self) -> Way | None:
+        newest = None
+        while self._routes is not None and (route := self._routes.next(0.0)) is not None:
+            newest = route
+        if newest is None:
+            return None
+        leads = newest.ok or newest.searching
+        return Way(newest.points_m if leads else (), newest.status)
+
+    def _do(self, action: Action) -> None:
+        match action:
+            case Tell(sentence=sentence):
+                self._tell(sentence)
+            case Report():
+                if self._vehicle is None:
+                    self._vehicle = self._join()
+                self._vehicle.at(
+                    action.x_m,
+                    action.y_m,
+                    heading_rad=action.heading_rad,
+                    speed_m_per_s=action.speed_m_per_s,
+                )
+            case Withdraw():
+                if self._vehicle is not None:
+                    self._vehicle.leave()
+                self._vehicle = self._routes = None
+            case Follow(target=target):
+                if self._vehicle is not None:
+                    self._routes = self._vehicle.follow(target)
+            case Unfollow():
+                if self._vehicle is not None:
+                    self._vehicle.unfollow()
+                self._routes = None
+            case _:
+                self._link.write(self._wire.write(action))
+
+    def _join(self) -> Vehicle:
+        body = self._body
+        return self._swarm.vehicle(
+            body.id or f"mav{self._wire.vehicle}",
+            group=body.group,
+            radius_m=body.radius_m,
+            vehicle_class=body.vehicle_class,
+        )

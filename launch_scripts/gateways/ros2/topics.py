@@ -1,0 +1,80 @@
+"""The table of topics: what crosses between the swarm and ROS. Nothing else does.
+
+The gateway, `swarm ros2 --list` and the page of the reference all draw from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from launch_scripts.gateways.ros2.graph import Qos
+
+
+class Direction(StrEnum):
+    """Which way a topic goes."""
+
+    OUT = "to ROS"
+    IN = "from ROS"
+    SERVICE = "service"
+
+
+VEHICLE, TARGET = "{vehicle}", "{target}"
+"""Stand in names for that of each vehicle or target."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicRow:
+    """One topic, or one for each vehicle or target.
+
+    name       by which settings call it
+    topic      its name in ROS unless settings say otherwise; with {vehicle} or {target} there is one for each
+    type_name  such as nav_msgs/msg/Path
+    hz         how often it is put, at most; None: when something changes
+    says       what it tells, in a sentence
+    """
+
+    name: str
+    topic: str
+    type_name: str
+    qos: Qos
+    direction: Direction
+    hz: float | None
+    says: str
+
+    @property
+    def per(self) -> str | None:
+        """What there is one for each of: VEHICLE, TARGET, or None."""
+        return next((each for each in (VEHICLE, TARGET) if each in self.topic), None)
+
+
+_OUT = Direction.OUT
+TABLE: tuple[TopicRow, ...] = (
+    TopicRow("map", "/map", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _OUT, None,
+             "How fast each cell may be driven; put again when much of it has changed."),
+    TopicRow("map_updates", "/map_updates", "map_msgs/msg/OccupancyGridUpdate", Qos.DEFAULT, _OUT, 1.0,
+             "Windows of the map that marks have changed."),
+    TopicRow("tf", "/tf", "tf2_msgs/msg/TFMessage", Qos.TRANSFORMS, _OUT, 10.0,
+             "Where each vehicle is: odom frame to base frame."),
+    TopicRow("tf_static", "/tf_static", "tf2_msgs/msg/TFMessage", Qos.LATCHED, _OUT, None,
+             "The map frame to the odom frame of each vehicle, which is the same place."),
+    TopicRow("odom", "/{vehicle}/odom", "nav_msgs/msg/Odometry", Qos.DEFAULT, _OUT, 10.0,
+             "Pose and velocity; the velocity is the difference of two reports."),
+    TopicRow("pose", "/{vehicle}/pose", "geometry_msgs/msg/PoseStamped", Qos.DEFAULT, _OUT, 10.0,
+             "Pose in the map frame."),
+    TopicRow("plan", "/{vehicle}/plan", "nav_msgs/msg/Path", Qos.LATCHED, _OUT, None,
+             "The route that the vehicle follows, when it begins another one; at most once a second."),
+    TopicRow("fix", "/{vehicle}/fix", "sensor_msgs/msg/NavSatFix", Qos.SENSOR, _OUT, 1.0,
+             "Latitude and longitude, where the terrain has coordinates and pyproj is installed."),
+    TopicRow("poses", "/swarm/poses", "geometry_msgs/msg/PoseArray", Qos.DEFAULT, _OUT, 5.0,
+             "Poses of all vehicles, in order of their ids."),
+    TopicRow("targets", "/targets", "geometry_msgs/msg/PoseArray", Qos.DEFAULT, _OUT, 5.0,
+             "Poses of all targets that somebody tracks, in order of their ids."),
+    TopicRow("target_pose", "/targets/{target}/pose", "geometry_msgs/msg/PoseStamped", Qos.DEFAULT, _OUT, 5.0,
+             "Pose of a target, while somebody tracks it."),
+    TopicRow("markers", "/swarm/markers", "visualization_msgs/msg/MarkerArray", Qos.LATCHED, _OUT, 1.0,
+             "For RViz: routes, marked cells, zones, windows of the map that have just changed."),
+    TopicRow("diagnostics", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", Qos.DEFAULT, _OUT, 1.0,
+             "How many vehicles are in which state, targets, links, what was dropped."),
+)  # fmt: skip
+ROWS = {row.name: row for row in TABLE}

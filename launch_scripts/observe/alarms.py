@@ -1,0 +1,220 @@
+"""What went wrong in a run: one list for the view, the table, `swarm status` and the report. Pure.
+
+Whoever is concerned tells it (`swarm.runtime.alarms`), with each `Stats`, so that one who comes late knows it, too.
+What a process cannot tell of itself is found here: that it is gone or silent, and that a target is lost.
+
+A tree that was grown long ago is no alarm: what has changed since is repaired in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from launch_scripts.observe.latest_state import Observed
+from launch_scripts.observe.plan import RunPlan
+from launch_scripts.observe.tracked_targets import TrackedTargets
+from launch_scripts.plain_text import plain
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.ranks import job_of
+from swarm.wire.messages.processes import Alarm as Told
+
+SILENT_NS = 4 * NS_PER_S
+"""Every process tells its counts once a second: one that has not for so long hangs, or cannot be heard."""
+STARTING_S = 30.0
+"""A process that has not been seen yet is no alarm in the first seconds of a run."""
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmKind:
+    """One kind of alarm.
+
+    label    what people call it
+    serious  what must not be, or stops a part of the run; else it is worth knowing
+    meaning  what it says, and what to do
+    """
+
+    label: str
+    serious: bool
+    meaning: str
+
+
+KINDS: Mapping[str, AlarmKind] = {
+    "collision": AlarmKind("collision", True, "Two vehicles were on one cell at one time, which must not be."),
+    "lethal-entry": AlarmKind("lethal entry", True, "A vehicle entered a cell that is lethal in truth."),
+    "body-collision": AlarmKind("hit a body", True, "A vehicle and a body that reports its place met."),
+    "down": AlarmKind(
+        "down", True, "A process that the run needs is gone. Its launcher starts it again; see its log if it stays."
+    ),
+    "silent": AlarmKind("silent", True, "A process is there and has told nothing for 4 s: it hangs or is cut off."),
+    "keeper-behind": AlarmKind("keeper behind", True, "Marks wait to be stored, as on a full disk."),
+    "quota": AlarmKind("quarantined", False, "An author writes more marks than its quota; they are delayed."),
+    "target-lost": AlarmKind(
+        "target lost",
+        False,
+        "Nobody tracks the target; routes lead to where it was, and it is searched for after 30 s.",
+    ),
+    "behind": AlarmKind("behind", False, "A process skips ticks: the machine is too slow for what it does."),
+    "restarted": AlarmKind("restarted", False, "A process was started again after it had ended."),
+}
+"""By the word that stands on the wire."""
+_OTHER = AlarmKind("", False, "")
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """One thing that went wrong.
+
+    kind        a key of `KINDS`, or another word that a process said
+    about       the process, target, author or vehicle that it is about; a process as `planner-t3`
+    text        a sentence
+    target      the target that it concerns
+    cell        where it is; None if it has no place
+    since_s     time of the run at which it began; None if whoever looks came later
+    over_s      time of the run at which it was over; None while it lasts
+    """
+
+    kind: str
+    about: str
+    text: str
+    since_s: float | None
+    over_s: float | None = None
+    cell: int | None = None
+    target: str | None = None
+
+    @property
+    def lasts(self) -> bool:
+        return self.over_s is None
+
+    @property
+    def serious(self) -> bool:
+        return KINDS.get(self.kind, _OTHER).serious
+
+    @property
+    def label(self) -> str:
+        return KINDS.get(self.kind, _OTHER).label or self.kind
+
+    @property
+    def when(self) -> str:
+        """In words: `since 34 s`, `at 34 s`, `from 34 s to 50 s`."""
+        if self.since_s is None:
+            return "now" if self.lasts else f"until {self.over_s:.0f} s"
+        if self.over_s is None:
+            return f"since {self.since_s:.0f} s"
+        if self.over_s == self.since_s:
+            return f"at {self.since_s:.0f} s"
+        return f"from {self.since_s:.0f} s to {self.over_s:.0f} s"
+
+    def place(self, grid: GridSpec) -> tuple[int, int] | None:
+        """Row and column; None if it has no place, or names one that is not in the grid, as a tracker may."""
+        if self.cell is None or not 0 <= self.cell < grid.cells:
+            return None
+        return grid.row_col(self.cell)
+
+    def where(self, grid: GridSpec) -> str:
+        """In words: `row 40, col 200`; empty if it has no place."""
+        place = self.place(grid)
+        return "" if place is None else f"row {place[0]}, col {place[1]}"
+
+    def line(self, grid: GridSpec) -> str:
+        """All of it in one line."""
+        return ", ".join(part for part in (f"{self.label}: {self.text}", self.where(grid), self.when) if part)
+
+    def fields(self, grid: GridSpec) -> dict[str, object]:
+        """For a report."""
+        row, col = self.place(grid) or (None, None)
+        return {
+            "kind": self.kind, "about": self.about, "text": self.text, "since_s": self.since_s,
+            "over_s": self.over_s, "row": row, "col": col, "target": self.target,
+        }  # fmt: skip
+
+
+def alarms_of(
+    observed: Observed, tracked: TrackedTargets, plan: RunPlan, targets: Iterable[str], now_ns: int
+) -> tuple[Alarm, ...]:
+    """All alarms of a run at an instant: what lasts, the serious first, then what is over, the newest first."""
+    began_ns = plan.started_ns or 0
+    wanted = list(targets)
+    found = [
+        *_missing(observed, plan, wanted, now_ns),
+        *_silent(observed, now_ns),
+        *_lost(observed, tracked, wanted, now_ns),
+        *_told(observed),
+    ]
+    alarms = [_in_run(each, known, began_ns) for each, known in found]
+    lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
+    over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))
+    return (*lasting, *over)
+
+
+Found = tuple[Told, bool]
+"""An alarm, and whether it is known when it began."""
+
+
+def _in_run(told: Told, known: bool, began_ns: int) -> Alarm:
+    def seconds(stamp_ns: int) -> float:
+        return max(stamp_ns - began_ns, 0) / NS_PER_S
+
+    return Alarm(
+        plain(told.kind),
+        plain(told.about),
+        plain(told.text),
+        seconds(told.since_ns) if known else None,
+        None if told.over_ns is None else seconds(told.over_ns),
+        told.cell,
+        told.target,
+    )
+
+
+def _told(observed: Observed) -> Iterator[Found]:
+    """What processes say. What lasted when one went is not said any more."""
+    for (role, id), stats in observed.newest().items():
+        for alarm in stats.alarms:
+            if alarm.over_ns is not None or observed.is_well(role, id):
+                yield alarm, True
+
+
+def starts(observed: Observed, plan: RunPlan, role: str, id: str, now_ns: int) -> bool:
+    """Whether a process has not been seen yet, and has not been waited for for long."""
+    began = plan.started_ns is not None and now_ns - plan.started_ns < STARTING_S * NS_PER_S
+    return began and not observed.knows(role, id)
+
+
+def _missing(observed: Observed, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Found]:
+    for role, id in plan.crew_now(targets):
+        if observed.fills(role, id) or starts(observed, plan, role, id, now_ns):
+            continue
+        stats = observed.newest_stats(role, id)
+        leads = next((ranked for ranked in observed.ids_up(role) if job_of(ranked) == job_of(id)), None)
+        instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
+        text = f"{role}-{id} is gone{instead}"
+        target = job_of(id) if role == "planner" else None
+        since_ns = 0 if stats is None else stats.stamp_ns
+        yield (
+            Told(kind="down", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target),
+            stats is not None,
+        )
+
+
+def _silent(observed: Observed, now_ns: int) -> Iterator[Found]:
+    for role, id, heard_ns in observed.silent(now_ns - SILENT_NS):
+        text = f"{role}-{id} is there, but tells nothing"
+        target = job_of(id) if role == "planner" else None
+        stats = observed.newest_stats(role, id)
+        since_ns = heard_ns if stats is None else stats.stamp_ns
+        yield Told(kind="silent", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target), True
+
+
+def _lost(observed: Observed, tracked: TrackedTargets, targets: list[str], now_ns: int) -> Iterator[Found]:
+    for id in sorted(tracked.lost(now_ns).intersection(targets)):
+        status, pose = observed.told_by_planner(id), observed.poses.get(id)
+        since_ns, cell = None, None if pose is None else pose.cell
+        if status is not None and status.pose_age_s is not None:
+            # When the planner heard the last pose: the same whenever it is asked.
+            since_ns, cell = status.stamp_ns - int(status.pose_age_s * NS_PER_S), status.target_cell
+        elif pose is not None:
+            since_ns = pose.stamp_ns
+        text = f"nobody knows where {id} is; routes lead to where it was"
+        told = Told(kind="target-lost", about=id, text=text, since_ns=since_ns or 0, cell=cell, target=id)
+        yield told, since_ns is not None

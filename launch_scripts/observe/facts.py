@@ -1,0 +1,281 @@
+"""The table of facts: what people are shown of a run, in which words and units. Pure.
+
+Who shows a fact takes its label and its text from here, so that it reads the same everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from launch_scripts.observe.alarms import Alarm
+from launch_scripts.observe.certified_gap import CertifiedGap, gap_text, percent
+from launch_scripts.observe.state import RunState, TargetLine
+from swarm.config.classes import GROUND
+from swarm.grid import GridSpec
+
+NONE = "-"
+"""What is shown where nothing is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One fact of a run.
+
+    name     in the report, and for programs
+    label    what people call it
+    unit     of the value in the report; the text says it itself
+    of       its value at an instant; None where it is not known
+    text     the value in words
+    meaning  what it says, in a sentence
+    """
+
+    name: str
+    label: str
+    unit: str
+    of: Callable[[RunState], Any]
+    text: Callable[[Any], str]
+    meaning: str
+
+    def shown(self, state: RunState) -> str:
+        """What people see of it."""
+        return self.text(self.of(state))
+
+
+@dataclass(frozen=True, slots=True)
+class TargetFact:
+    """One fact of each target: a column. As `Fact`.
+
+    always  whether every table has it; else `swarm status` alone
+    """
+
+    name: str
+    label: str
+    unit: str
+    of: Callable[[TargetLine], Any]
+    text: Callable[[Any], str]
+    meaning: str
+    always: bool = True
+
+    def shown(self, line: TargetLine) -> str:
+        """What people see of it."""
+        return self.text(self.of(line))
+
+
+def count(value: float | None) -> str:
+    """12,345"""
+    return NONE if value is None else f"{value:,.0f}"
+
+
+def seconds(value: float | None) -> str:
+    """34 s"""
+    return NONE if value is None else f"{value:,.0f} s"
+
+
+def distance(value_m: float | None) -> str:
+    """480 m, 1.2 km"""
+    if value_m is None:
+        return NONE
+    return f"{value_m:.0f} m" if value_m < 999.5 else f"{value_m / 1000:.1f} km"
+
+
+def duration(milliseconds: float | None) -> str:
+    """1.2 ms, 3.4 s"""
+    if milliseconds is None:
+        return NONE
+    return f"{milliseconds:.1f} ms" if milliseconds < 999.95 else f"{milliseconds / 1000:.1f} s"
+
+
+def of_all(value: tuple[int, int]) -> str:
+    """15 of 16"""
+    return f"{value[0]:,} of {value[1]:,}"
+
+
+def each(value: Mapping[str, int]) -> str:
+    """17 following, 1 arrived"""
+    return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none yet"
+
+
+def factors(value: Mapping[str, float]) -> str:
+    """grass x 2.9, forest x 0.63"""
+    return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
+
+
+def _gap_mean(value: CertifiedGap | None) -> str:
+    return NONE if value is None else percent(value.mean)
+
+
+def _gap(value: CertifiedGap | Mapping[str, float | None]) -> str:
+    return gap_text(value.fields() if isinstance(value, CertifiedGap) else value)
+
+
+def _word(value: str | None) -> str:
+    return NONE if value is None else value
+
+
+def _vehicles(state: RunState) -> tuple[int, int]:
+    return state.vehicles, max(state.vehicles_planned, state.vehicles)
+
+
+FACTS: tuple[Fact, ...] = (
+    Fact("elapsed_s", "time", "s", lambda s: s.elapsed_s, seconds, "Time since the run began, start-up included."),
+    Fact("vehicles_driven", "vehicles", "", _vehicles, of_all, "Vehicles that an agent drives, of all of the run."),
+    Fact("states", "of these", "", lambda s: s.states, each, "What the vehicles do."),
+    Fact("classes", "classes", "", lambda s: s.classes, each, "The vehicles by class."),
+    Fact("following", "assigned", "", lambda s: s.following, count, "Vehicles that have a target."),
+    Fact("captures", "captures", "", lambda s: s.captures, count, "How often targets were caught."),
+    Fact("marks", "marks", "", lambda s: s.marks, count, "Cells that vehicles found other than the map said."),
+    Fact(
+        "reroute_requests", "re-route requests", "", lambda s: s.reroute_requests, count,
+        "How often a vehicle's own route did not lead it on, so that it asked for another.",
+    ),
+    Fact("routes_served", "routes served", "", lambda s: s.routes_served, count, "Routes that planners gave."),
+    Fact(
+        "certified_gap", "certified gap", "", lambda s: s.certified_gap, _gap,
+        "How far above the optimum the routes that vehicles began can be at most, as planners have proven.",
+    ),
+    Fact(
+        "learned", "learned", "", lambda s: s.learned, factors,
+        "By what the prior pace of a class of ground is multiplied, as vehicles have measured (map.learning).",
+    ),
+    Fact("collisions", "collisions", "", lambda s: s.collisions, count, "Two vehicles on one cell; must be 0."),
+    Fact(
+        "lethal_entries", "lethal cells entered", "", lambda s: s.lethal_entries, count,
+        "Vehicles on cells that are lethal in truth; must be 0.",
+    ),
+    Fact(
+        "driven_into", "bodies driven into", "", lambda s: s.driven_into, count,
+        "Vehicles that drove into a body which had said in time where it is; must be 0.",
+    ),
+    Fact("hit_by_bodies", "vehicles hit by bodies", "", lambda s: s.hit_by_bodies, count, "The bodies' own fault."),
+    Fact(
+        "processes_well", "processes", "", lambda s: (s.alive, s.expected), of_all,
+        "Processes that are alive, or ended as asked, of those that the run needs.",
+    ),
+    Fact("restarts", "restarts", "", lambda s: s.restarts, count, "How often a process was started again."),
+    Fact(
+        "messages_now_per_s", "messages/s", "1/s", lambda s: s.messages_per_s, count,
+        "Messages that all processes send per second, now.",
+    ),
+    Fact(
+        "payloads_dropped", "payloads dropped", "", lambda s: s.payloads_dropped, count,
+        "Messages that were no messages of this swarm, or came under a key that is not their sender's.",
+    ),
+)  # fmt: skip
+"""What is shown of a run. A new row appears everywhere."""
+
+TARGET_FACTS: tuple[TargetFact, ...] = (
+    TargetFact("target", "target", "", lambda t: t.title, _word, "Its id, and what is unusual about it."),
+    TargetFact("chased_by", "following", "", lambda t: t.following, count, "Vehicles that go for it."),
+    TargetFact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
+    TargetFact("captures", "captures", "", lambda t: t.captures, count, "How often it was caught."),
+    TargetFact(
+        "certified_gap", "certified gap", "", lambda t: t.gap, _gap_mean,
+        "How far above the optimum the routes to it can be at most, in the mean.",
+    ),
+    TargetFact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
+    TargetFact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
+    TargetFact("routes_served", "served", "", lambda t: t.routes_served, count, "Routes given to it.", False),
+    TargetFact("strategy", "strategy", "", lambda t: t.strategy, _word, "How its tree is kept.", False),
+    TargetFact("pose_age_s", "seen", "s", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
+    TargetFact("tracker", "tracker", "", lambda t: t.tracker, _word, "Who tells where it is.", False),
+)  # fmt: skip
+"""What is shown of each target, what matters most first: a narrow panel cuts off the end."""
+
+_BY_NAME = {fact.name: fact for fact in FACTS}
+
+
+def fact(name: str) -> Fact:
+    """A fact of the table. Raises KeyError on a name that is none."""
+    return _BY_NAME[name]
+
+
+def table(state: RunState, *, whole: bool = False) -> tuple[list[str], list[list[str]]]:
+    """The labels of the columns, and a row for each target.
+
+    whole  with the columns that `swarm status` alone has
+    """
+    columns = [column for column in TARGET_FACTS if whole or column.always]
+    rows = [[column.shown(line) for column in columns] for line in state.targets]
+    return [column.label for column in columns], rows
+
+
+LINES: tuple[tuple[str, ...], ...] = (
+    ("vehicles_driven", "states", "following"),
+    ("captures", "marks", "reroute_requests", "routes_served"),
+    ("certified_gap",),
+    ("processes_well", "restarts", "messages_now_per_s"),
+)
+"""How the facts of a run are set in lines."""
+IF_ANY = ("learned",)
+"""Facts that have a line of their own, where there is anything to say."""
+MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", "payloads_dropped")
+"""Facts that are shown only where they are not 0."""
+
+
+def lines(state: RunState) -> list[str]:
+    """The facts of a run but its time, in lines for people: `label text` with two spaces between facts."""
+    found = ["  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in names) for names in LINES]
+    if list(state.classes) not in ([], [GROUND]):
+        found.insert(1, f"{fact('classes').label} {fact('classes').shown(state)}")
+    found += [f"{fact(name).label} {fact(name).shown(state)}" for name in IF_ANY if fact(name).of(state)]
+    wrong = [name for name in MUST_BE_ZERO if fact(name).of(state)]
+    if wrong:
+        found.append("  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in wrong))
+    return found
+
+
+_SAID_SINGLY = 2
+"""Of more alarms of one kind there is one line for all: on a slow machine every process is behind."""
+_NAMED = 3
+
+
+def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
+    """The alarms that last, the most serious first, in lines for people; then how many lines are left out.
+
+    over  also what is over
+    """
+    return lines_of(state.alarms if over else state.standing_alarms, state.grid, most)
+
+
+def lines_of(alarms: Iterable[Alarm], grid: GridSpec, most: int) -> list[str]:
+    """Alarms in lines for people, and how many lines are left out."""
+    found: list[str] = []
+    for group in grouped(alarms):
+        found += [together(group)] if len(group) > 1 else [alarm.line(grid) for alarm in group]
+    return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
+
+
+def grouped(alarms: Iterable[Alarm]) -> list[list[Alarm]]:
+    """Alarms that people should read as one: many of a kind, all over or all not; others each alone."""
+    kinds: dict[tuple[str, bool], list[Alarm]] = {}
+    for alarm in alarms:
+        kinds.setdefault((alarm.kind, alarm.lasts), []).append(alarm)
+    found: list[list[Alarm]] = []
+    for of_kind in kinds.values():
+        found += [of_kind] if len(of_kind) > _SAID_SINGLY else [[alarm] for alarm in of_kind]
+    return found
+
+
+def together(alarms: Sequence[Alarm]) -> str:
+    """Many alarms of one kind in a line."""
+    first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
+    names = list(dict.fromkeys(alarm.about for alarm in alarms))
+    others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    lasting = "the first " if first.lasts else "over, the first "
+    return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when}"
+
+
+def for_report(state: RunState) -> dict[str, Any]:
+    """Every fact by its name, for a report, and every alarm."""
+    return {
+        **{each.name: _plain(each.of(state)) for each in FACTS},
+        "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, CertifiedGap):
+        return value.fields()
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,274 @@
+"""Records a run: takes messages, returns numbers. Launcher and simulation share it.
+
+Pure: time is an argument, and the owner of a bus passes it what comes on `RECORDED`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from launch_scripts.observe.begun_routes import BegunRoutes
+from launch_scripts.observe.certified_gap import of_excess
+from launch_scripts.observe.facts import for_report
+from launch_scripts.observe.latest_state import MarkedCells
+from launch_scripts.observe.results import Driven, results
+from launch_scripts.observe.run_figures import RunFigures
+from launch_scripts.observe.run_model import HEARD
+from launch_scripts.observe.samples import Sample, at_once, certified_gaps, messages_per_s
+from launch_scripts.observe.state import RunState
+from launch_scripts.observe.tracks import TrackKey, Tracks
+from launch_scripts.observe.vehicle_columns import VehicleColumns
+from swarm.clock import NS_PER_S
+from swarm.config.classes import flies
+from swarm.config.scenario import Scenario
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.runtime.stats import Histogram
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.topics import FOLLOWED, MARKS, NOTE, Topic
+
+TRACK_S = 0.5
+"""Places are sampled so often."""
+ROUTES_S = 2.0
+"""Of the routes that a vehicle begins within this time, the newest is kept."""
+RECORDED: dict[Topic, float] = {
+    **HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S
+}  # fmt: skip
+"""What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
+
+_TRACK_NS = int(TRACK_S * NS_PER_S)
+_NOTES_KEPT = 1000
+_CAPTURES_KEPT = 4096
+"""Places of captures: those of the first hours of a long run are forgotten, their number is not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    time_s: float
+    target: str
+    east_m: float
+    south_m: float
+
+
+_ON_THE_WAY = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
+
+
+class Recorder(RunFigures):
+    """Samples, tracks, routes, captures and notes of a run, in memory which does not grow with the rate of
+    messages."""
+
+    def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
+        super().__init__(scenario, grid, started_ns)
+        self.last_ns: int | None = None
+        self.ready_ns: int | None = None
+        """When all processes of the scenario were alive and the first vehicle had begun a route."""
+        self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
+        """Where and when targets were captured; how often, `Observed` counts."""
+        self.routes = BegunRoutes()
+        self.driven = Driven()
+        self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
+        self.vehicle_tracks = Tracks(_TRACK_NS)
+        self.target_tracks = Tracks(_TRACK_NS)
+        self.routed: set[str] = set()
+        self._track_ids: list[str] = []
+        self._track_keys: list[TrackKey] = []
+        """Of the vehicles heard of last."""
+        self._gap_max: float | None = None
+
+    def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
+        """Records one message; `fields` are the chunks of its key."""
+        self._touch(now_ns)
+        if self.model.heard(message, now_ns) is None:
+            return
+        match message:
+            case Followed():
+                self.routes.add(now_ns, message)
+            case PlannerStatus(gap_max=float(gap)):
+                self._gap_max = max(gap, self._gap_max or 0.0)
+            case Note():
+                if message.kind == "capture":
+                    self._capture(message, now_ns)
+                self.notes.append((self.seconds(now_ns), message))
+        self._look(now_ns)
+
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        self._touch(now_ns)
+        super().alive(peer, up, now_ns)
+
+    def finish(self, now_ns: int) -> None:
+        self._touch(now_ns)
+        super().finish(now_ns)
+
+    def seconds(self, now_ns: int) -> float:
+        """Time of the run."""
+        return 0.0 if self.model.began_ns is None else (now_ns - self.model.began_ns) / NS_PER_S
+
+    def missing(self) -> list[str]:
+        """Processes that the run needs which are not alive, as `role id`."""
+        return self.model.missing()
+
+    def marked(self) -> MarkedCells:
+        return self.observed.marked()
+
+    def _touch(self, now_ns: int) -> None:
+        self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
+
+    def _capture(self, note: Note, now_ns: int) -> None:
+        """Of targets that nobody tracks, too: the process that moves them tells of each capture."""
+        cell = note.cell
+        if note.target is None or cell is None or cell >= self.grid.cells:
+            return
+        x_m, y_m = self.grid.centre_m(cell)
+        east_m, south_m = x_m - self.grid.west_m, self.grid.north_m - y_m
+        self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
+
+    def _look(self, now_ns: int) -> None:
+        tracks_due, sample_due = self.vehicle_tracks.due(now_ns), self._sample_due(now_ns)
+        if tracks_due:
+            self._sample_tracks(now_ns, self.observed.vehicles())
+        super()._look(now_ns)
+        if (tracks_due or sample_due) and self.ready_ns is None and self.routed and not self.missing():
+            self.ready_ns = now_ns
+
+    def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
+        moving = np.isin(vehicles.states, _ON_THE_WAY)
+        if len(self.routed) < self.scenario.vehicle_count:
+            self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
+        if self._track_ids != vehicles.ids:
+            self._track_ids, self._track_keys = vehicles.ids, [(id, 0) for id in vehicles.ids]
+        self.driven.add(now_ns, vehicles, self.observed.groups)
+        self.vehicle_tracks.add(now_ns, self._track_keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
+        poses = sorted(self.observed.poses.items())
+        pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
+        places = [self.observed.place_m(pose) for _, pose in poses]
+        self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
+
+    def _sample(self, state: RunState) -> Sample:
+        waiting_s, standing_s = float(self.driven.waiting_s.sum()), float(self.driven.standing_s.sum())
+        return replace(super()._sample(state), waiting_s=waiting_s, standing_s=standing_s)
+
+    def report(
+        self,
+        *,
+        run_id: str | None = None,
+        seconds: float | None = None,
+        startup_s: float | None = None,
+    ) -> dict[str, Any]:
+        """The numbers of the run, None where not measured. The caller gives what it knows better."""
+        if seconds is None and self.model.first_ns is not None and self.last_ns is not None:
+            seconds = (self.last_ns - self.model.first_ns) / NS_PER_S
+        observed, total = self.observed, self.observed.total
+        # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
+        state = self.summary(self.tracked.moved_ns or self.last_ns or 0)
+        rates = [rate for _, rate in messages_per_s(self.samples.all())]
+        fields = {
+            "scenario": self.scenario.name,
+            "run_id": run_id,
+            "seed": self.scenario.seed,
+            "seconds": seconds,
+            "time_scale": self.scenario.time_scale,
+            "vehicles": self.scenario.vehicle_count,
+            "aloft": [each.name for each in self.scenario.groups if flies(self.scenario, each.vehicle_class)],
+            "targets": len(self.scenario.target_ids),
+            "processes": state.expected,
+            "startup_s": startup_s,
+            "vehicles_routed": len(self.routed),
+            **for_report(state),
+            "tracking": self.tracked.report(observed),
+            "stranded": state.states["stranded"] if observed.any_vehicles else None,
+            "lost": state.states["lost"] if observed.any_vehicles else None,
+            "marked_cells": len(self.marked().cells) if observed.any_marks else None,
+            "routes_received": total("routes_received"),
+            "growths": total("growths"),
+            "window_growths": total("window_growths"),
+            "gap": self._gap(),
+            **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
+            "messages_out": total("messages_out"),
+            "messages_in": total("messages_in"),
+            "bytes_out": total("bytes_out"),
+            "bytes_in": total("bytes_in"),
+            "messages_per_s": _mean(rates),
+            "ticks_late": total("ticks_late"),
+            "ticks_dropped": total("ticks_dropped"),
+            **results(observed, self.driven, self.scenario),
+        }
+        return {name: _rounded(value) for name, value in fields.items()}
+
+    def series(self, points: int = 120) -> dict[str, list[Any]]:
+        """The run over time, at about `points` instants at most: lists with one value per `t_s`."""
+        samples = self.samples.all()
+        samples = samples[:: max(1, -(-len(samples) // points))]
+        names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
+        rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
+        gaps = certified_gaps(samples)
+        fields: dict[str, list[Any]] = {
+            "t_s": [sample.time_s for sample in samples],
+            **{name: [getattr(sample, name) for sample in samples] for name in names},
+            **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
+            **{f"certified_gap_{name}": [gap[name] for gap in gaps] for name in ("mean", "p95", "max")},
+            "routes_begun": [gap["routes"] for gap in gaps],
+            "waiting_at_once": at_once(samples, lambda sample: sample.waiting_s),
+            "standing_at_once": at_once(samples, lambda sample: sample.standing_s),
+            "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
+            "messages_per_s": [rates.get(round(sample.time_s, 6)) for sample in samples],
+        }
+        return {name: [_rounded(value) for value in values] for name, values in fields.items()}
+
+    def distributions(self) -> dict[str, list[list[float]]]:
+        """Histograms as [value, count], in order of value: logarithmic buckets 4 % wide."""
+        return {
+            name: [[_rounded(value), count] for value, count in self.observed.histogram(name).values()]
+            for name in DISTRIBUTIONS
+        }
+
+    def notes_told(self) -> list[dict[str, Any]]:
+        """The newest events for people, in order of time."""
+        return [
+            {"t_s": round(time_s, 3), "from": f"{note.role} {note.id}", "kind": note.kind, "text": note.text}
+            for time_s, note in self.notes
+        ]
+
+    def _gap(self) -> dict[str, float | None]:
+        """Driven cost over optimum, as the planners measured it.
+
+        `gap_excess` counts gap - 1, which tells 1.002 from 1.01; `gap` itself has buckets of 4 %.
+        """
+        fine, coarse = self.observed.histogram("gap_excess"), self.observed.histogram("gap")
+        if fine.count:
+            gap = of_excess(fine)
+        else:
+            gap = {"mean": coarse.mean(), "p95": coarse.quantile(0.95), "max": coarse.quantile(1.0)}
+        return gap if self._gap_max is None else {**gap, "max": self._gap_max}
+
+
+DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
+"""Histograms that are reported whole."""
+TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
+"""Histograms whose quantiles are reported."""
+
+
+def quantiles(histogram: Histogram) -> dict[str, float | None]:
+    return {"p50": histogram.quantile(0.5), "p99": histogram.quantile(0.99)}
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    kept = list(values)
+    return sum(kept) / len(kept) if kept else None
+
+
+def _rounded(value: Any) -> Any:
+    """Rounds to six digits, finer than any measurement here. What JSON cannot express becomes None."""
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value

@@ -1,0 +1,170 @@
+"""What a run folder holds from its first second on: scenario as run, versions, machine. And which run was last."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+from launch_scripts.observe.files import write_file
+from launch_scripts.observe.machine import processor
+from swarm.config.input_files import FileKind, read_text
+from swarm.config.scenario import Scenario
+from swarm.config.write import scenario_text
+from swarm.errors import ConfigError, StoreError
+
+SCENARIO_FILE, RUN_FILE, REPORT_FILE = "scenario.toml", "run.json", "report.json"
+LAST = "LAST"
+"""In the folder of all runs: a link to the newest; where links are impossible a file that holds its name."""
+_PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
+
+
+def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool = True) -> list[str]:
+    """Write `scenario.toml` and `run.json`, and make `LAST` point here. Returns what a person should know: a run
+    goes on without them, as on a full disk.
+
+    recorded  whether a report follows; else another launcher of the run makes it
+    """
+    began = _now()
+    head = f"# Run {run_id}, {began}: every setting that it ran with. `swarm up` runs it again.\n"
+    facts = {
+        "run_id": run_id,
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "began": began,
+        "recorded": recorded,
+        **made_with(),
+    }
+    said = []
+    for name, text in (
+        (SCENARIO_FILE, head + scenario_text(scenario, Path.cwd())),
+        (RUN_FILE, json.dumps(facts, indent=1) + "\n"),
+    ):
+        try:
+            write_file(folder / name, text.encode())
+        except OSError as error:
+            said.append(f"cannot write {folder / name}: {error.strerror or error}")
+    sentence = point_last(folder)
+    return said if sentence is None else [*said, sentence]
+
+
+def made_with() -> dict[str, Any]:
+    """Versions and machine."""
+    return {
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(package) for name, package in _PACKAGES.items()},
+        },
+        "machine": {
+            "system": f"{platform.system()} {platform.release()}",
+            "processor": processor(),
+            "cores": os.cpu_count(),
+        },
+    }
+
+
+def ended(folder: Path) -> dict[str, Any]:
+    """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
+    facts = _facts(folder)
+    if not facts:
+        return {}
+    kept: dict[str, Any] = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
+    return {"began": kept.pop("began", None), "ended": _now(), **kept}
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """What `run.json` says; empty where it cannot be read."""
+    try:
+        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def point_last(folder: Path) -> str | None:
+    """Let `LAST` beside a run's folder mean that run, at one instant. Returns a sentence the first time that it
+    cannot be a link, and whenever it cannot be at all."""
+    last = folder.parent / LAST
+    partial = folder.parent / f".{LAST}.{os.getpid()}"
+    try:
+        try:
+            partial.unlink(missing_ok=True)
+            partial.symlink_to(folder.name, target_is_directory=True)
+        except (OSError, NotImplementedError):
+            was_file = last.is_file()
+            partial.write_text(f"{folder.name}\n", encoding="utf-8")
+            partial.replace(last)
+            if was_file:
+                return None
+            return f"no links can be made in {folder.parent}: {LAST} is a file there that holds the run's name"
+        partial.replace(last)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        return f"{last} still means another run: {error.strerror or error}"
+    return None
+
+
+def find_run(name: str, runs: Path) -> Path:
+    """The folder of a run: a path, or its name in `runs`; `LAST` where it is a file, too. Raises ConfigError."""
+    for path in (Path(name), runs / name):
+        if path.is_dir():
+            return path
+        if path.name == LAST and path.is_file():
+            named = path.parent / read_text(path, FileKind.RUN).strip()
+            if named.is_dir():
+                return named
+    raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}")
+
+
+def lacks(folder: Path, file: str) -> ConfigError:
+    """The error where a run's folder lacks a file that a run leaves at its end, and why it does."""
+    why = "the run has not ended yet, or its launcher was killed"
+    if _facts(folder).get("recorded") is False:
+        why = "the launcher of another machine records the run, and leaves it in its own folder"
+    return ConfigError(f"{folder} has no {file}: {why}")
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """`report.json` of a run. Raises ConfigError or StoreError in one sentence."""
+    path = folder / REPORT_FILE
+    if not path.exists():
+        raise lacks(folder, REPORT_FILE)
+    try:
+        report = json.loads(
+            read_text(path, FileKind.RUN), parse_int=_whole, parse_float=_finite, parse_constant=_finite
+        )
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    if not isinstance(report, dict):
+        raise StoreError(f"{path} is damaged: found no object, expected the figures of a run")
+    return report
+
+
+def _whole(text: str) -> int:
+    """A number of a report: sums of counts, of which each fits into 64 bits."""
+    if len(text) > 40:
+        raise ValueError(f"found a whole number of {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"found {text[:30]}, expected a number")
+    return value
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

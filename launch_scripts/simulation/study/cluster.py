@@ -1,0 +1,120 @@
+"""Trials on Dask's workers: a cluster of this machine, or one that is there."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import math
+import os
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import dask
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed.client import FutureCancelledError
+
+from launch_scripts.simulation.study.trial import Result, Trial, run_trial
+from swarm.errors import BusError
+
+AHEAD = 3
+"""Trials per worker that the scheduler has: those behind the running one spare a way from here."""
+MOST_DEATHS = 3
+"""A trial whose worker has died more often than this is given up: it kills them itself."""
+_CONNECT_S = 10.0
+_WORKERS_COUNT_S = 2.0
+"""How often the workers are counted: others may join."""
+_SETTINGS: dict[str, Any] = {
+    # A profiler, clocks that tick 50 times a second in each of five event loops, and watches on memory and the
+    # interpreter take it from the simulation: together 7 % of a core with two workers, without them 1 %.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "10s",
+    "distributed.admin.tick.limit": "60s",
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.scheduler.allowed-failures": MOST_DEATHS,
+    # A worker has the trial that it runs and no other: one that waits there would be blamed for a death, too.
+    "distributed.scheduler.worker-saturation": 1.0,
+}
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def local_client(workers: int) -> Iterator[Client]:
+    """A cluster of so many processes, all on loopback. One that dies is started again; all end with the block."""
+    with (
+        dask.config.set(_SETTINGS),
+        tempfile.TemporaryDirectory(prefix="swarm-sweep-") as folder,
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=0,  # a limit would kill what a plain loop lets run
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+            preload="launch_scripts.simulation.study.worker_process",
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@contextlib.contextmanager
+def client_of(address: str) -> Iterator[Client]:
+    """A cluster that is there. Raises BusError where no scheduler answers."""
+    # It writes a traceback where a scheduler is lost, which `run_trials` tells of in a sentence.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except Exception as error:  # also bytes that are not its protocol, and TLS without a certificate
+        raise BusError(f"--scheduler {address}: no scheduler of Dask answers within {_CONNECT_S:g} s") from error
+    with client:
+        yield client
+
+
+def run_trials(client: Client, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Result | None]]:
+    """The result of each trial, as they come; None of one that is given up (`MOST_DEATHS`). A worker that dies
+    loses nothing: what it had goes to another. Raises what a trial raises, and BusError if the scheduler
+    is gone."""
+    rest = iter(trials)
+    given: dict[str, Trial] = {}
+    done = as_completed(loop=client.loop)
+
+    room, asked_s = 0, -math.inf
+
+    def fill() -> None:
+        nonlocal room, asked_s
+        if time.monotonic() - asked_s > _WORKERS_COUNT_S:
+            threads = sum(each["nthreads"] for each in client.scheduler_info()["workers"].values())
+            room, asked_s = AHEAD * max(1, threads), time.monotonic()
+        for trial in itertools.islice(rest, max(0, room - len(given))):
+            future = client.submit(run_trial, trial, key=trial.key, retries=0)
+            given[trial.key] = trial
+            done.add(future)
+
+    fill()
+    while given:
+        future = next(done)
+        trial = given.pop(str(future.key))
+        try:
+            result = future.result()
+        except KilledWorker:
+            result = None
+        except FutureCancelledError as error:
+            raise BusError(
+                "the scheduler of Dask is gone: results so far are kept, start again to go on"
+            ) from error
+        yield trial, result
+        del future  # so that the cluster forgets it
+        fill()

@@ -1,0 +1,122 @@
+"""One trial: a simulation with one seed, and what became of it. Runs on a worker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgspec
+
+from launch_scripts.simulation.study.code_version import code_version
+from launch_scripts.simulation.trial import BrokenLaw, raised
+from swarm.config.scenario import Scenario
+from swarm.errors import ConfigError, SwarmError
+
+LAWS = {
+    "collisions": "no collision",
+    "lethal_entries": "no lethal entry",
+    "driven_into": "bodies are avoided",
+}
+"""Figure of a report that must be 0 -> the law. Of trials without faults."""
+_LEFT_OUT = ("by_vehicle", "seed")
+
+
+class Trial(msgspec.Struct, frozen=True, kw_only=True):
+    """What a worker is asked for.
+
+    key       digest of all that decides the result, the version of the code included
+    world     name of a small world, or that of the scenario
+    scenario  None: the world says it
+    version   of the code with which it is to run
+    """
+
+    key: str
+    world: str
+    scenario: Scenario | None
+    seed: int
+    seconds: float
+    faults: bool
+    version: str
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """What a worker answers.
+
+    figures  every number of the run's report, by dotted key, but those of single vehicles
+    broken   the laws that did not hold
+    wall_s   by the clock, and cpu_s of the processor, both of the simulation and the building of its terrain
+    """
+
+    key: str
+    figures: dict[str, float]
+    broken: list[BrokenLaw]
+    wall_s: float
+    cpu_s: float
+
+
+def run_trial(trial: Trial) -> Result:
+    """Simulate. A service that raises is a broken law; raises SwarmError on what the study, its files or this
+    worker have wrong."""
+    if (own := code_version()) != trial.version:
+        raise ConfigError(
+            f"a worker has version {own} of the code, expected {trial.version}: install the same there"
+        )
+    began_s, cpu_s = time.perf_counter(), time.thread_time()
+    report, broken = _with_faults(trial) if trial.faults else _plain(trial)
+    return Result(
+        key=trial.key,
+        figures=dict(numbers({name: value for name, value in report.items() if name not in _LEFT_OUT})),
+        broken=broken,
+        wall_s=time.perf_counter() - began_s,
+        cpu_s=time.thread_time() - cpu_s,
+    )
+
+
+def numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """Dotted key and value of every number in a report."""
+    match value:
+        case bool():
+            return
+        case int() | float():
+            yield name, float(value)
+        case Mapping():
+            for key, each in value.items():
+                yield from numbers(each, f"{name}.{key}" if name else str(key))
+        case list() | tuple():
+            for n, each in enumerate(value):
+                yield from numbers(each, f"{name}.{n}")
+
+
+def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
+    """As `swarm simulate SCENARIO --seed N`."""
+    from launch_scripts.simulation.simulate import simulate
+
+    assert trial.scenario is not None
+    reached_s = 0.0
+
+    def progress(now_s: float) -> None:
+        nonlocal reached_s
+        reached_s = now_s
+
+    try:
+        report = simulate(trial.scenario, trial.seed, trial.seconds, progress=progress).report
+    except SwarmError:
+        raise
+    except Exception as error:
+        return {}, [raised(error, reached_s)]
+    broken = [
+        BrokenLaw(law, f"{report[name]} {name.replace('_', ' ')}") for name, law in LAWS.items() if report.get(name)
+    ]
+    return report, broken
+
+
+def _with_faults(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
+    """As `swarm simulate SCENARIO --seeds N:N+1`."""
+    from launch_scripts.simulation.trial import try_simulation
+
+    verdict, report = try_simulation(trial.world, trial.seed, trial.seconds, trial.scenario)
+    told: dict[str, Any] = msgspec.to_builtins(verdict)
+    for name in ("broken", "wall_s"):
+        del told[name]
+    return {**report, **told}, verdict.broken

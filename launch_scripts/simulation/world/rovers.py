@@ -1,0 +1,157 @@
+"""The simulated rovers: outside vehicles that say where they are and look out for nobody.
+
+`Rovers` is a core; `service` puts what it returns on the bus. A rover drives straight, stops where the ground ahead
+is lethal or by chance, stands for a while or turns on the spot, and says where it goes before it sets out.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field
+
+from launch_scripts.simulation.world.walks import TrueTerrain
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import RoverConfig, Scenario, ids_of
+from swarm.wire.messages.bodies import MOST_M_PER_S, Body
+
+LEASE_S = 2.0
+TURN_S = 0.6
+"""It turns for so long, and has told its new heading meanwhile."""
+_LONGEST_REST_S = 8.0
+_TOLD_AGAIN_NS = NS_PER_S // 2
+_LONGEST_TICK_S = 1.0
+_LEGS_PER_S = 0.25
+_TRIES = 12
+
+
+@dataclass(slots=True, eq=False)
+class Rover:
+    """One rover.
+
+    rests_s  how long it stands or turns yet, by the wall clock; it drives at 0
+    turns    whether it drives on then, so that it says its speed already
+    """
+
+    id: str
+    config: RoverConfig
+    chance: random.Random
+    x_m: float
+    y_m: float
+    heading_rad: float = 0.0
+    rests_s: float = 0.0
+    turns: bool = False
+    seq: int = 0
+    told_ns: int = field(default=-_TOLD_AGAIN_NS)
+    told: tuple[float, ...] = ()
+
+
+class Rovers:
+    """All rovers of a scenario. Takes ticks, returns what they say.
+
+    incarnation  of the process that moves them
+    """
+
+    def __init__(self, scenario: Scenario, terrain: TrueTerrain, incarnation: int) -> None:
+        self.incarnation = incarnation
+        self._terrain = terrain
+        self._time_scale = scenario.time_scale
+        """As of the last tick; 0 while the run is paused."""
+        self._ticked_ns: int | None = None
+        self.all = [self._begin(id, each, scenario.seed) for each in scenario.rovers for id in ids_of(each)]
+        self._by_id = {rover.id: rover for rover in self.all}
+
+    def _begin(self, id: str, config: RoverConfig, seed: int) -> Rover:
+        chance = random.Random(f"{seed}/rover/{id}")
+        rover = Rover(id, config, chance, *self._terrain.grid.centre_m(self._terrain.random_home(chance)))
+        self._turn(rover)
+        return rover
+
+    def hear(self, body: Body) -> None:
+        """Take in where the process that leads has moved a rover: one that takes over goes on from there."""
+        rover = self._by_id.get(body.id)
+        if rover is not None and self._passable(body.x_m, body.y_m):
+            rover.x_m, rover.y_m = body.x_m, body.y_m
+            rover.seq = max(rover.seq, body.seq)
+
+    def tick(self, time_scale: float, now_ns: int) -> list[Body]:
+        """Move all rovers, so many seconds on the terrain per second. Returns what they say now."""
+        self._time_scale = time_scale
+        passed_s = 0.0 if self._ticked_ns is None else max(now_ns - self._ticked_ns, 0) / NS_PER_S
+        self._ticked_ns = now_ns
+        said = []
+        for rover in self.all:
+            if time_scale > 0.0:
+                self._move(rover, min(passed_s, _LONGEST_TICK_S))
+            speed = self._speed(rover) if self._goes(rover) else 0.0
+            state = (rover.x_m, rover.y_m, rover.heading_rad, speed)
+            if state == rover.told and 0 <= now_ns - rover.told_ns < _TOLD_AGAIN_NS:
+                continue
+            rover.told, rover.told_ns = state, now_ns
+            rover.seq += 1
+            said.append(
+                Body(
+                    id=rover.id,
+                    group="rovers",
+                    incarnation=self.incarnation,
+                    seq=rover.seq,
+                    stamp_ns=now_ns,
+                    x_m=rover.x_m,
+                    y_m=rover.y_m,
+                    heading_rad=rover.heading_rad,
+                    speed_m_per_s=speed,
+                    radius_m=rover.config.radius_m,
+                    lease_s=LEASE_S,
+                )
+            )
+        return said
+
+    def _speed(self, rover: Rover) -> float:
+        """By the wall clock; none is quicker than what vehicles believe."""
+        return min(rover.config.speed_m_per_s * self._time_scale, MOST_M_PER_S)
+
+    def _goes(self, rover: Rover) -> bool:
+        return rover.turns or rover.rests_s <= 0.0
+
+    def _move(self, rover: Rover, seconds: float) -> None:
+        if rover.rests_s > 0.0:
+            rover.rests_s -= seconds
+            if rover.rests_s <= 0.0 and not rover.turns:
+                self._turn(rover)
+            return
+        rover.turns = False
+        far_m = self._speed(rover) * seconds
+        x_m, y_m = self._ahead(rover, far_m)
+        if not self._free(rover, far_m):
+            self._turn(rover)
+            return
+        rover.x_m, rover.y_m = x_m, y_m
+        if rover.chance.random() < _LEGS_PER_S * seconds:
+            if rover.chance.random() < 0.5:
+                self._turn(rover)
+            else:
+                rover.rests_s = rover.chance.uniform(0.5, _LONGEST_REST_S)
+
+    def _turn(self, rover: Rover) -> None:
+        """Turn to where the ground is free for a cell at least; stand for a while if there is none."""
+        rover.rests_s, rover.turns = TURN_S, True
+        far_m = self._terrain.grid.resolution_m + self._speed(rover) * 0.2
+        for _ in range(_TRIES):
+            rover.heading_rad = rover.chance.uniform(0.0, math.tau)
+            if self._free(rover, far_m):
+                return
+        rover.rests_s, rover.turns = rover.chance.uniform(0.5, _LONGEST_REST_S), False
+
+    def _ahead(self, rover: Rover, far_m: float) -> tuple[float, float]:
+        return rover.x_m + math.sin(rover.heading_rad) * far_m, rover.y_m + math.cos(rover.heading_rad) * far_m
+
+    def _free(self, rover: Rover, far_m: float) -> bool:
+        step_m = self._terrain.grid.resolution_m / 4
+        steps = max(math.ceil((far_m + rover.config.radius_m) / step_m), 1)
+        return all(self._passable(*self._ahead(rover, step_m * step)) for step in range(1, steps + 1))
+
+    def _passable(self, x_m: float, y_m: float) -> bool:
+        grid = self._terrain.grid
+        col = math.floor((x_m - grid.west_m) / grid.resolution_m)
+        row = math.floor((grid.north_m - y_m) / grid.resolution_m)
+        return grid.inside(row, col) and not self._terrain.lethal(row * grid.cols + col)

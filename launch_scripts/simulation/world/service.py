@@ -1,0 +1,185 @@
+"""The bus side of the simulated targets: `TargetWorld` is the core."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry
+from launch_scripts.simulation.world.rovers import Rovers
+from launch_scripts.simulation.world.targets import Action, Captured, Publish, TargetWorld
+from launch_scripts.simulation.world.telling import Telling
+from shared_map.terrain.prepared import load_homes
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
+from swarm.liveness import Roster
+from swarm.ranks import job_of
+from swarm.runtime.candidacy import Candidacy
+from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.orders import Obey
+from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
+
+TICK_HZ = 10.0
+_ASK_NS = NS_PER_S // 2
+_ASK = "where"
+
+
+class TargetsService:
+    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`; `driven_into`, bodies
+    that vehicles drove into, and `hit_by_bodies`, the other way round."""
+
+    def __init__(
+        self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
+    ) -> None:
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
+        self._scenario = setup.scenario
+        self._bus = bus
+        self._post = post
+        self._ask_due_ns = 0
+        self._candidacy = Candidacy(setup, setup.scenario.standbys.targets, TICK_HZ, bus, post)
+        self._world = TargetWorld(
+            setup.scenario,
+            terrain,
+            truth,
+            setup.incarnation,
+            homes=load_homes(setup, terrain, truth),
+            leads=self._candidacy.leads,
+        )
+        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obeyed_version: int | None = None
+        self._anew = setup.anew
+        self._heard: set[str] = set()
+        """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
+        self._telling = Telling(terrain.grid.resolution_m)
+        self._planners = Roster()
+        self._member.needs("the orders of this run", lambda: self._obedience.known)
+        self._member.needs("places of its targets", lambda: self._world.ready)
+        self.counters = self._member.counters
+        for name in ("captures", "collisions", "driven_into", "hit_by_bodies", "lethal_entries", "poses"):
+            self.counters.count(name, 0)
+
+    @property
+    def leads(self) -> bool:
+        return self._world.leads
+
+    @property
+    def rovers(self) -> Rovers:
+        return self._world.rovers
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._bus.subscribe(FLEET, self._post)
+        self._bus.subscribe(BODY, self._post)
+        self._bus.subscribe(STATUS, self._post)
+        self._bus.watch_alive(self._post, role="planner")
+        self._hear_targets()
+        self._obedience.start(now_ns)
+        self._candidacy.start()
+
+    def _hear_targets(self) -> None:
+        for id, target in self._obedience.book.targets(self._scenario).items():
+            if id not in self._heard and (not target.is_simulated or self._scenario.standbys.targets):
+                self._heard.add(id)
+                self._bus.subscribe(self._topic(id), self._post, target=id)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if self._member.handle(event) or self._candidacy.handle(event, now_ns):
+            return
+        if self._obedience.handle(event, now_ns):
+            return
+        match event:
+            case Heard(message=Fleet() as fleet):
+                self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
+            case Heard(message=Body() as body):
+                self._world.hear_body(body, now_ns)
+            case Heard(message=PlannerStatus() as status):
+                self._world.hear_planner(status.target, status.target_cell)
+            case Replied(message=CostReply() as reply):
+                self._world.hear_planner(reply.target, reply.target_cell)
+            case Appeared(peer):
+                self._planners.appeared(peer)
+                self._world.planner_up(job_of(peer.id), True)
+            case Disappeared(peer):
+                self._planners.gone(peer)
+                left = {job_of(id) for id in self._planners.alive(peer.role)}
+                self._world.planner_up(job_of(peer.id), job_of(peer.id) in left)
+            case Heard(message=TargetPose() as pose):
+                self._world.hear_pose(pose, now_ns)
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> None:
+        leads = self._candidacy.tick(self._world.ready, now_ns)
+        if leads != self._world.leads:
+            self._world.lead(leads)
+            self._candidacy.tell(self._member, now_ns)
+        if leads and self._world.listening and now_ns >= self._ask_due_ns:
+            self._ask_due_ns = now_ns + _ASK_NS
+            self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
+        self._obey(now_ns)
+        self._perform(self._world.tick(now_ns), now_ns)
+        self._member.tell_faults(self._world.faults, now_ns)
+        self._member.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        self._candidacy.stop()
+        self._member.publish_stats(now_ns)
+
+    def _obey(self, now_ns: int) -> None:
+        """Go by what is ordered. Nothing moves before it is known whether the swarm is paused."""
+        orders, version = self._obedience, self._obeyed_version
+        if not orders.known:
+            self._world.paused = True
+        elif version != orders.book.version:
+            self._obeyed_version = orders.book.version
+            obeyed = self._world.obey(orders.book, self._scenario, now_ns, first=version is None)
+            self._perform(obeyed, now_ns)
+            if version is None and self._anew:
+                self._world.begin_anew()
+            self._hear_targets()
+        orders.tick(now_ns)
+
+    def _obeys(self, order: Obey) -> bool:
+        return self._obeyed_version == self._obedience.book.version
+
+    def _topic(self, target: str) -> Topic:
+        return TRUE_POSE if target in self._scenario.untracked else POSE
+
+    def _perform(self, actions: list[Action], now_ns: int) -> None:
+        for action in actions:
+            match action:
+                case Publish(pose) if self._telling.is_news(pose):
+                    self.counters.count("poses")
+                    self._bus.publish(self._topic(pose.target), pose, target=pose.target)
+                case Captured(target, vehicle, cell):
+                    self.counters.count("captures")
+                    self.counters.count_by(CAPTURES_OF, target)
+                    self.counters.count_by(CAPTURES_BY, vehicle)
+                    self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell, target=target)
+                case Collision(first, second, cell):
+                    self.counters.count("collisions")
+                    self._alarm("collision", f"{first} {second}", f"{first} and {second} on one cell", cell, now_ns)
+                case Body():
+                    self._bus.publish(BODY, action, id=action.id)
+                case BodyHit(cell=cell, by_vehicle=by_vehicle):
+                    self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
+                    self._alarm("body-collision", action.vehicle, action.sentence, cell, now_ns)
+                case LethalEntry(vehicle, cell):
+                    self.counters.count("lethal_entries")
+                    self._alarm("lethal-entry", vehicle, f"{vehicle} entered a lethal cell", cell, now_ns)
+
+    def _alarm(self, kind: str, about: str, text: str, cell: int, now_ns: int) -> None:
+        """Something happened that must not: to the log of who watches now, and to those who come late."""
+        self._member.note(now_ns, kind, text, cell)
+        self._member.alarms.happened(kind, about, text, now_ns, cell)

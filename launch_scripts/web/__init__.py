@@ -1,0 +1,1 @@
+"""One HTTP server: the page of the live view, health and metrics."""

@@ -1,0 +1,248 @@
+"""The boundary of a service: the bus, the worker and the objects outside, as it sees them.
+
+Everything that enters a service passes here, and everything that leaves it. The same wrappers record a run
+(`recording.py`) and feed a recording to the cores (`replaying.py`), so that both give an output the same name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+import numpy as np
+
+from swarm.bus.bus import Answerer, Bus, Heard, Post, Worker
+from swarm.liveness import Peer
+from swarm.recording.outside import Outside, content_of, unpack
+from swarm.runtime.process import Service
+from swarm.wire.codec import decode
+from swarm.wire.messages.base import Message
+from swarm.wire.topics import Topic
+
+T = TypeVar("T")
+
+
+class Boundary:
+    """What a service is given in place of what is outside: here that itself, and nothing is written down."""
+
+    def bus(self, bus: Bus) -> Bus:
+        return bus
+
+    def worker(self, worker: Worker) -> Worker:
+        return worker
+
+    def service(self, service: Service) -> Service:
+        return service
+
+    def function(self, name: str, function: Callable[[], T] | None, kind: Any) -> Callable[[], T] | None:
+        """A function that says what no message does, such as how much CPU was used; None where there is none."""
+        return function
+
+    def outside(self, thing: T, what: Outside) -> T:
+        """An object outside, such as a store; None where there is none."""
+        return thing
+
+
+class Crossing(Protocol):
+    """Takes down what is read and let out, or says what was."""
+
+    def read(self, what: str, of: Callable[[], bytes]) -> bytes:
+        """The value that a service reads, packed."""
+        ...
+
+    def let_out(self, to: str, content: bytes, what: object = None) -> None:
+        """Something left the service."""
+        ...
+
+    def read_as(self, what: str, of: Callable[[], T], kind: Any) -> T:
+        """As `read`, of a value that is as it was outside where nothing is fed."""
+        ...
+
+    def submit(self, worker: Worker, tag: str, job: Callable[[], object], post: Post, model_ns: int) -> None:
+        """A job is begun."""
+        ...
+
+
+class BoundaryBus:
+    """The bus of a service, whose outputs and readings cross the boundary."""
+
+    def __init__(self, bus: Bus, crossing: Crossing) -> None:
+        self._bus = bus
+        self._crossing = crossing
+
+    @property
+    def namespace(self) -> str:
+        return self._bus.namespace
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        return self._crossing.read_as("counts of the bus", lambda: dict(self._bus.counts), dict[str, int])
+
+    def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
+        self._crossing.let_out(f"put {topic.below(topic.one(fields))}", content_of(message), message)
+        self._bus.publish(topic, message, **fields)
+
+    def subscribe(
+        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
+    ) -> None:
+        self._says("subscribe", topic, fields, f" together={together} every_s={every_s:g}")
+        self._bus.subscribe(topic, post, together=together, every_s=every_s, **fields)
+
+    def collect(self, topic: Topic, **fields: str | int) -> None:
+        self._says("collect", topic, fields)
+        self._bus.collect(topic, **fields)
+
+    def collected(self, topic: Topic) -> list[Heard]:
+        heard: list[Heard] | None = None
+
+        def collect() -> bytes:
+            nonlocal heard
+            heard = self._bus.collected(topic)
+            return content_of([(list(each.fields.values()), content_of(each.message)) for each in heard])
+
+        content = self._crossing.read(f"collected {topic.name}", collect)
+        if heard is not None:
+            return heard
+        samples = unpack(content, list[tuple[list[str], bytes]])
+        return [
+            Heard(topic, dict(zip(topic.fields, chunks, strict=True)), decode(payload, topic.message))
+            for chunks, payload in samples
+        ]
+
+    def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
+        heard: list[tuple[str, Message]] | None = None
+
+        def collect() -> bytes:
+            nonlocal heard
+            heard = self._bus.collected_together(topic)
+            return content_of([(key, content_of(message)) for key, message in heard])
+
+        content = self._crossing.read(f"collected together {topic.name}", collect)
+        if heard is not None:
+            return heard
+        samples = unpack(content, list[tuple[str, bytes]])
+        return [(key, decode(payload, topic.message)) for key, payload in samples]
+
+    def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
+        self._says("unsubscribe", topic, fields)
+        self._bus.unsubscribe(topic, **fields)
+
+    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+        self._says("serve", topic, fields)
+        self._bus.serve(topic, post, undecoded=undecoded, **fields)
+
+    def unserve(self, topic: Topic, **fields: str | int) -> None:
+        self._says("unserve", topic, fields)
+        self._bus.unserve(topic, **fields)
+
+    def ask(
+        self,
+        topic: Topic,
+        request: Message,
+        post: Post,
+        *,
+        tag: str,
+        timeout_s: float = 2.0,
+        **fields: str | int,
+    ) -> None:
+        to = f"ask {topic.below(topic.every(fields))} {tag} timeout_s={timeout_s:g}"
+        self._crossing.let_out(to, content_of(request), request)
+        self._bus.ask(topic, request, post, tag=tag, timeout_s=timeout_s, **fields)
+
+    def declare_alive(self, peer: Peer) -> None:
+        self._crossing.let_out(f"alive {peer.role}/{peer.id}/{peer.incarnation}", b"")
+        self._bus.declare_alive(peer)
+
+    def watch_alive(self, post: Post, role: str = "*") -> None:
+        self._crossing.let_out(f"watch alive/{role}", b"")
+        self._bus.watch_alive(post, role)
+
+    def watch_links(self, post: Post) -> None:
+        self._crossing.let_out("watch links", b"")
+        self._bus.watch_links(post)
+
+    def close(self) -> None:
+        self._bus.close()
+
+    def _says(self, what: str, topic: Topic, fields: Mapping[str, str | int], how: str = "") -> None:
+        self._crossing.let_out(f"{what} {topic.below(topic.every(fields))}{how}", b"")
+
+
+class BoundaryAnswerer:
+    """Takes the answers to one query. `number` is that of the query among all that the service was asked."""
+
+    def __init__(self, answerer: Answerer, topic: Topic, number: int, crossing: Crossing) -> None:
+        self._answerer = answerer
+        self._topic = topic
+        self._number = number
+        self._crossing = crossing
+
+    @property
+    def timeout_s(self) -> float:
+        return self._answerer.timeout_s
+
+    def waited_s(self) -> float:
+        return self._crossing.read_as(f"waited for {self._number}", self._answerer.waited_s, float)
+
+    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
+        to = f"answer {self._number} {self._topic.below(self._topic.every(fields))}"
+        self._crossing.let_out(to, content_of(message), message)
+        self._answerer.answer(message, fields)
+
+    def refuse(self, reason: str) -> None:
+        self._crossing.let_out(f"refuse {self._number}", reason.encode(), reason)
+        self._answerer.refuse(reason)
+
+    def end(self) -> None:
+        self._crossing.let_out(f"end {self._number}", b"")
+        self._answerer.end()
+
+
+class BoundaryWorker:
+    """The worker of a service: which job ended, and what it read, crosses the boundary."""
+
+    def __init__(self, worker: Worker, crossing: Crossing) -> None:
+        self._worker = worker
+        self._crossing = crossing
+
+    def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
+        self._crossing.let_out(f"job {tag}", b"")
+        self._crossing.submit(self._worker, tag, job, post, model_ns)
+
+    def close(self) -> None:
+        self._worker.close()
+
+
+class BoundaryObject:
+    """Stands for an object outside: what its methods return crosses the boundary."""
+
+    def __init__(self, thing: object, what: Outside, crossing: Crossing) -> None:
+        self._thing = thing
+        self._what = what
+        self._crossing = crossing
+
+    def __getattr__(self, name: str) -> Any:
+        what, crossing = self._what, self._crossing
+        if name in what.fixed:
+            return getattr(self._thing, name)
+        if name in what.facts:
+            return crossing.read_as(name, lambda: getattr(self._thing, name), what.facts[name])
+        if name not in what.calls:
+            raise AttributeError(f"{name} is not among what a service may use of {type(self._thing).__name__}")
+        kind = what.calls[name]
+
+        def call(*arguments: object) -> Any:
+            given = [_kept(each) for each in arguments]
+            if given:
+                crossing.let_out(name, content_of(given), given)
+            return crossing.read_as(name, lambda: _kept(getattr(self._thing, name)(*given)), kind)
+
+        return call
+
+
+def _kept(value: object) -> object:
+    """What can be gone through only once, as a list."""
+    if isinstance(value, (str, bytes, list, tuple, set, dict, np.ndarray, msgspec.Struct)):
+        return value
+    return list(value) if isinstance(value, Iterable) else value

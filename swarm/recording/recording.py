@@ -1,0 +1,262 @@
+"""Recording what enters and leaves a service while it runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from hashlib import blake2b
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from platform import python_version
+from typing import Any, TypeVar, cast
+
+from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
+from swarm.clock import NS_PER_S
+from swarm.config.write import scenario_text
+from swarm.errors import StoreError
+from swarm.recording.boundary import Boundary, BoundaryAnswerer, BoundaryBus, BoundaryObject, BoundaryWorker
+from swarm.recording.events import JobDone, record_of
+from swarm.recording.loop_figures import LoopCounters
+from swarm.recording.outside import Outside, content_of, pack
+from swarm.recording.records import (
+    FOLDER,
+    SUFFIX,
+    Call,
+    Ended,
+    Head,
+    Output,
+    Outputs,
+    Read,
+    RecordWriter,
+    Started,
+    Stopped,
+    Ticked,
+)
+from swarm.runtime.process import Service
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
+
+T = TypeVar("T")
+FAILED = "!"
+"""Before the sentence of a StoreError, in the name of what was read."""
+RAISED = "raise "
+"""Before an error by which a service ended, as its last output."""
+_FLUSH_NS = NS_PER_S
+_LONGEST_ERROR = 500
+_PACKAGES = ("terrain-swarm", "numba", "numpy", "msgspec")
+
+
+def there_is(name: str) -> str:
+    """The name of the reading which says whether a function or an object is there."""
+    return f"there is {name}"
+
+
+def raised_as(error: BaseException) -> str:
+    """An error as an output."""
+    return f"{RAISED}{type(error).__name__}: {error}"[:_LONGEST_ERROR]
+
+
+def digest_of(content: bytes) -> bytes:
+    return blake2b(content, digest_size=8).digest()
+
+
+def versions() -> dict[str, str]:
+    """What a recording was made with, or is replayed with."""
+    found = {"python": python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def path_of(folder: Path, role: str, id: str, incarnation: int) -> Path:
+    """Where one life of a process is recorded, below a run's folder."""
+    return folder / FOLDER / f"{role}-{id}.{incarnation}{SUFFIX}"
+
+
+class Recording(Boundary):
+    """Writes down what enters and leaves one service.
+
+    Its calls are made by the thread that owns the service; jobs of the worker only note what they read, which is
+    written when the service takes their result.
+    """
+
+    def __init__(self, setup: RoleSetup, terrain: str, folder: Path) -> None:
+        self._writer = RecordWriter(path_of(folder, setup.role, setup.id, setup.incarnation))
+        self._outputs: list[Output] = []
+        self._asked = 0
+        self._jobs = 0
+        self._job = threading.local()
+        """Of the thread that runs a job: `reads`, what that has read."""
+        self._flush_due_ns = 0
+        self._writer.write(
+            Head(
+                role=setup.role,
+                id=setup.id,
+                run_id=setup.run_id,
+                incarnation=setup.incarnation,
+                started_ns=setup.started_ns,
+                scenario=scenario_text(setup.scenario, Path.cwd()),
+                terrain=terrain,
+                added=setup.added,
+                restarts=setup.restarts,
+                before=b"" if setup.before is None else content_of(setup.before),
+                versions=versions(),
+                anew=setup.anew,
+            )
+        )
+        self._writer.flush()  # a process that is killed at once is named, too
+
+    def bus(self, bus: Bus) -> Bus:
+        return BoundaryBus(bus, self)
+
+    def worker(self, worker: Worker) -> Worker:
+        return BoundaryWorker(worker, self)
+
+    def service(self, service: Service) -> Service:
+        return _RecordedService(service, self)
+
+    def function(self, name: str, function: Callable[[], T] | None, kind: Any) -> Callable[[], T] | None:
+        self.read_as(there_is(name), lambda: function is not None, bool)
+        return None if function is None else lambda: self.read_as(name, function, kind)
+
+    def outside(self, thing: T, what: Outside) -> T:
+        self.read_as(there_is(what.name), lambda: thing is not None, bool)
+        return thing if thing is None else cast(T, BoundaryObject(thing, what, self))
+
+    # --- what crosses ---------------------------------------------------------------------------------------
+
+    def read(self, what: str, of: Callable[[], bytes]) -> bytes:
+        content = of()
+        self._note(what, content)
+        return content
+
+    def read_as(self, what: str, of: Callable[[], T], kind: Any) -> T:
+        try:
+            value = of()
+        except StoreError as error:
+            self._note(FAILED + what, content_of(str(error)))
+            raise
+        self._note(what, pack(value))
+        return value
+
+    def _note(self, what: str, content: bytes) -> None:
+        reads = getattr(self._job, "reads", None)
+        if reads is not None:
+            reads.append((what, content))
+            return
+        self._let_go()  # what left before it, in order
+        self._writer.write(Read(what, content))
+
+    def let_out(self, to: str, content: bytes, what: object = None) -> None:
+        if getattr(self._job, "reads", None) is None:  # what a job lets out shows in what it returns
+            self._outputs.append(Output(to, len(content), digest_of(content)))
+
+    def submit(self, worker: Worker, tag: str, job: Callable[[], object], post: Post, model_ns: int) -> None:
+        number, reads = self._jobs, list[tuple[str, bytes]]()
+        self._jobs += 1
+
+        def run() -> object:
+            self._job.reads = reads
+            try:
+                return job()
+            finally:
+                self._job.reads = None
+
+        def done(event: Event) -> None:
+            assert isinstance(event, WorkDone)
+            post(JobDone(event.tag, event.result, event.took_ns, number, reads))
+
+        worker.submit(tag, run, done, model_ns)
+
+    # --- calls of the service -------------------------------------------------------------------------------
+
+    def asked(self, event: Asked) -> Asked:
+        """A query whose answers cross the boundary."""
+        self._asked += 1
+        return replace(event, answerer=BoundaryAnswerer(event.answerer, event.topic, self._asked, self))
+
+    @contextmanager
+    def call(self, record: Call) -> Iterator[None]:
+        """Around one call of the service."""
+        self._let_go()  # of what made it
+        self._writer.write(record)
+        try:
+            yield
+        except BaseException as error:
+            self.let_out(raised_as(error), b"")
+            self._let_go()
+            self._writer.flush()
+            raise
+        self._let_go()
+        if record.now_ns >= self._flush_due_ns:
+            self._flush_due_ns = record.now_ns + _FLUSH_NS
+            self._writer.flush()
+
+    def _let_go(self) -> None:
+        if self._outputs:
+            self._writer.write(Outputs(self._outputs))
+            self._outputs = []
+
+    def close(self, *, ended: bool) -> None:
+        """No more is recorded. `ended`: the process ended in order."""
+        if ended:
+            self._writer.write(Ended())
+        self._writer.close()
+
+
+class _RecordedService:
+    """A service whose calls are recorded."""
+
+    def __init__(self, service: Service, recording: Recording) -> None:
+        self._service = service
+        self._recording = recording
+        self._counters = LoopCounters(service.counters)
+
+    @property
+    def counters(self) -> Counters:
+        return self._counters
+
+    def lacks(self) -> Sequence[str]:
+        return self._service.lacks()
+
+    def start(self, now_ns: int) -> None:
+        with self._recording.call(Started(now_ns, self._counters.changed())):
+            self._service.start(now_ns)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        record = record_of(event, now_ns)
+        if isinstance(event, Asked):
+            event = self._recording.asked(event)
+        with self._recording.call(record):
+            self._service.handle(event, now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        with self._recording.call(Ticked(now_ns, self._counters.changed())):
+            self._service.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        with self._recording.call(Stopped(now_ns, self._counters.changed())):
+            self._service.stop(now_ns)
+
+
+@contextmanager
+def recorded(setup: RoleSetup, terrain: str) -> Iterator[Boundary]:
+    """The boundary of a process's service: recorded into the run's folder, if the setup asks for it.
+
+    terrain  digest
+    """
+    if not setup.record_inputs or setup.run_dir is None:
+        yield Boundary()
+        return
+    recording = Recording(setup, terrain, setup.run_dir)
+    ended = False
+    try:
+        yield recording
+        ended = True
+    finally:
+        recording.close(ended=ended)

@@ -1,0 +1,217 @@
+"""Routes of an air class beside the best way through a stack of levels over the same terrain."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from bench.machine import machine
+from bench.tables import table
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from shared_map.arrays import Floats
+from shared_map.terrain.air_floor import AirGround, Flight, air_ground, clearance_floor, grade_of
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.ground import TerrainConfig
+from swarm.config.scenario import PlannerConfig, Scenario
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+
+LEVELS = 64
+"""Of the stack, from the lowest flight to the highest."""
+_STEPS = tuple(zip(STEP_ROW, STEP_COL, strict=True))
+_EVERY = 2
+"""Of the terrain every second cell is taken, as flights are long."""
+
+
+def run(
+    source: str, cells: int, roots: int, starts: int, clearance_routes: int, grade: float | None, seed: int
+) -> dict[str, Any]:
+    """Costs of routes over those of the stack; the clearance along many; a tree beside scipy's and a level one.
+
+    source  a built-in terrain or a file
+    cells   a side of the crop
+    grade   of the surface; by the crop's relief if None
+    """
+    terrain = build_terrain(Scenario(seed=seed, terrain=TerrainConfig(source=source)))
+    heights: Floats = terrain.elevation_m[: _EVERY * cells : _EVERY, : _EVERY * cells : _EVERY].copy()
+    heights[np.isnan(heights)] = np.nanmax(heights)
+    rows, cols = heights.shape
+    grid = GridSpec(rows, cols, terrain.grid.resolution_m * _EVERY)
+    chosen = grade_of(heights, grid.resolution_m) if grade is None else grade
+    flight = Flight(speed_mps=15.0, grade=chosen)
+    flown = air_ground(grid, heights, flight)
+    rng = np.random.default_rng(seed)
+    ratios = np.concatenate(
+        [
+            _over_stack(grid, heights, flown, flight, int(root), rng.choice(grid.cells, starts))
+            for root in rng.choice(grid.cells, roots)
+        ]
+    )
+    routes, lowest_m = _clearance(grid, heights, flown, clearance_routes, rng)
+    tree, isotropic, error = _times(grid, flown, int(rng.choice(grid.cells)))
+    return {
+        "source": source,
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "resolution_m": grid.resolution_m,
+        "relief_m": round(float(heights.max() - heights.min())),
+        "levels": LEVELS,
+        "grade": flight.grade,
+        "routes": len(ratios),
+        "over_stack_mean": round(float(ratios.mean()), 4),
+        "over_stack_p95": round(float(np.quantile(ratios, 0.95)), 4),
+        "clearance_routes": routes,
+        "clearance_m": flight.clearance_m,
+        "lowest_m": round(lowest_m, 4),
+        "clearance_broken": int(lowest_m < flight.clearance_m),
+        "tree_over_isotropic": round(tree / isotropic, 2),
+        "worst_over_scipy": float(f"{error:.2e}"),
+        **machine(),
+    }
+
+
+def tables(report: dict[str, Any]) -> Iterator[Table | str]:
+    """What people are shown."""
+    yield (
+        f"{report['source']}: {report['rows']} x {report['cols']} cells of {report['resolution_m']:g} m, relief"
+        f" {report['relief_m']} m; a surface of grade {report['grade']:g}."
+    )
+    found = table(f"Flights over the best way through {LEVELS} levels", "<what", "figure")
+    found.add_row("routes compared", f"{report['routes']}")
+    found.add_row("cost over the stack's, mean", f"{report['over_stack_mean']:.3f}")
+    found.add_row("p95", f"{report['over_stack_p95']:.3f}")
+    found.add_row("routes whose clearance was looked at", f"{report['clearance_routes']:,}")
+    found.add_row("lowest flight over ground, m", f"{report['lowest_m']:.2f} of {report['clearance_m']:g}")
+    found.add_row("tree over one of level ground, CPU", f"{report['tree_over_isotropic']:.2f}")
+    found.add_row("costs off scipy's at worst", f"{report['worst_over_scipy']:.1e}")
+    yield found
+
+
+def _neighbours(grid: GridSpec, south: int, east: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Flat cells that have a neighbour in a direction, and those neighbours."""
+    index = np.arange(grid.cells).reshape(grid.rows, grid.cols)
+    rows, cols = grid.rows, grid.cols
+    tails = index[max(-south, 0) : rows - max(south, 0), max(-east, 0) : cols - max(east, 0)]
+    heads = index[max(south, 0) : rows + min(south, 0), max(east, 0) : cols + min(east, 0)]
+    return tails.ravel(), heads.ravel()
+
+
+def _over_stack(
+    grid: GridSpec, heights: Floats, flown: AirGround, flight: Flight, root: int, starts: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Both ways go from the floor to the floor: to climb to the surface or a level counts."""
+    floor = clearance_floor(heights, flight.clearance_m).ravel()
+    surface = flown.height_m.astype(np.float64).ravel()
+    up, down = flight.climb_s_per_m, flight.descent_s_per_m
+    tree, costs = _grown(grid, flown, root)
+    ours = tree.cost_at(costs.pad_all(starts))
+    ours = ours + (surface - floor)[starts] * up + (surface - floor)[root] * down
+    levels = np.linspace(floor.min(), floor.max(), LEVELS)
+    lowest = np.searchsorted(levels, floor - 1e-6)
+    best = _stack(grid, levels, lowest, flight, root)[lowest[starts] * grid.cells + starts]
+    best = best + (levels[lowest] - floor)[starts] * up + (levels[lowest] - floor)[root] * down
+    away = starts != root
+    ratios: NDArray[np.float64] = ours[away] / best[away]
+    return ratios
+
+
+def _stack(
+    grid: GridSpec, levels: NDArray[np.float64], lowest: NDArray[np.intp], flight: Flight, root: int
+) -> NDArray[np.float64]:
+    """Costs to the root from every cell of every level, by scipy: 26 neighbours."""
+    apart_m = float(levels[1] - levels[0])
+    tails, heads, seconds = [], [], []
+    for south, east in [*_STEPS, (0, 0)]:
+        below, ahead = _neighbours(grid, south, east)
+        level_s = grid.resolution_m * math.hypot(south, east) / flight.speed_mps
+        for rise in (-1, 0, 1):
+            if not (south or east or rise):
+                continue
+            cost_s = level_s + apart_m * (0.0, flight.climb_s_per_m, flight.descent_s_per_m)[rise]
+            for level in range(max(-rise, 0), LEVELS - max(rise, 0)):
+                free = (lowest[below] <= level) & (lowest[ahead] <= level + rise)
+                tails.append((level * grid.cells + below[free]).astype(np.int32))
+                heads.append(((level + rise) * grid.cells + ahead[free]).astype(np.int32))
+                seconds.append(np.full(int(free.sum()), cost_s, np.float32))
+    size = LEVELS * grid.cells
+    graph = csr_array((np.concatenate(seconds), (np.concatenate(heads), np.concatenate(tails))), shape=(size, size))
+    found: NDArray[np.float64] = dijkstra(
+        graph, directed=True, indices=np.asarray(lowest[root] * grid.cells + root)
+    )
+    return found
+
+
+def _grown(grid: GridSpec, flown: AirGround, root: int) -> tuple[CostToGoTree, CostGrid]:
+    costs = CostGrid(grid, PlannerConfig(), flown.climb)
+    costs.load(flown.pace_s_per_m)
+    tree = CostToGoTree(costs)
+    tree.grow(root)
+    return tree, costs
+
+
+def _clearance(
+    grid: GridSpec, heights: Floats, flown: AirGround, routes: int, rng: np.random.Generator
+) -> tuple[int, float]:
+    """How many routes, and the least height over ground of any: along a step over the highest cell that it touches.
+
+    Every cell of a tree is the start of one route, and each step of a route is the first step of another: so of a
+    tree every step is looked at once.
+    """
+    lowest_m, seen = math.inf, 0
+    while seen < routes:
+        tree, costs = _grown(grid, flown, int(rng.choice(grid.cells)))
+        cells = np.arange(grid.cells)
+        parents = tree.parent[costs.pad_all(cells)]
+        for code, (south, east) in enumerate(zip(STEP_ROW, STEP_COL, strict=True)):
+            tails, heads = _neighbours(grid, south, east)
+            taken = parents[tails] == code
+            under = heights.ravel()[tails[taken]]
+            for beside in (heads, tails + south * grid.cols, tails + east):
+                under = np.maximum(under, heights.ravel()[beside[taken]])
+            flown_m = np.minimum(flown.height_m.ravel()[tails[taken]], flown.height_m.ravel()[heads[taken]])
+            if taken.any():
+                lowest_m = min(lowest_m, float((flown_m.astype(np.float64) - under).min()))
+        seen += grid.cells
+    return seen, lowest_m
+
+
+def _times(grid: GridSpec, flown: AirGround, root: int) -> tuple[float, float, float]:
+    """CPU of a tree over the surface and of one over level ground; and how far scipy's costs are off at worst."""
+    took: dict[bool, list[float]] = {True: [], False: []}
+    for _ in range(7):
+        for climbs in (True, False):
+            costs = CostGrid(grid, PlannerConfig(), flown.climb if climbs else None)
+            costs.load(flown.pace_s_per_m)
+            tree = CostToGoTree(costs)
+            tree.grow(root)
+            began = time.thread_time()
+            tree.grow(root)
+            took[climbs].append(time.thread_time() - began)
+    tree, costs = _grown(grid, flown, root)
+    ours = tree.cost_at(costs.pad_all(np.arange(grid.cells)))
+    heights = flown.height_m.astype(np.float64).ravel()
+    tails, heads, seconds = [], [], []
+    for south, east in _STEPS:
+        below, ahead = _neighbours(grid, south, east)
+        rise_m = heights[ahead] - heights[below]
+        length_m = grid.resolution_m * math.hypot(south, east)
+        rises = np.linspace(-flown.climb.steepest, flown.climb.steepest, len(flown.climb.factors))
+        factors = np.interp(rise_m / length_m, rises, flown.climb.factors.astype(np.float64))
+        tails.append(below)
+        heads.append(ahead)
+        seconds.append(length_m * flown.pace_s_per_m.ravel()[ahead].astype(np.float64) * factors)
+    graph = csr_array(
+        (np.concatenate(seconds), (np.concatenate(heads), np.concatenate(tails))), shape=(grid.cells,) * 2
+    )
+    exact = dijkstra(graph, directed=True, indices=np.asarray(root))
+    away = np.arange(grid.cells) != root
+    worst = float(np.abs(ours[away] / exact[away] - 1).max())
+    return float(np.median(took[True])), float(np.median(took[False])), worst

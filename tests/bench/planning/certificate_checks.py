@@ -1,0 +1,303 @@
+"""Random checks of what planners say of their routes: rules, strategies and lives, against an independent oracle.
+
+A life is one tree over a small random map: its target steps and jumps, marks come and go, a worker's growths are
+adopted late, some routes are asked for in between. After each event every cell's route is checked.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, get_args
+
+import numpy as np
+from rich.table import Table
+
+from bench.machine import machine
+from bench.planning.route_oracle import Cells, Driven, Seconds, best_costs, drive
+from bench.tables import Progress, table
+from planner_service.full_growth import GrownTree
+from planner_service.kernel_build import load_all
+from planner_service.target_tree import TargetTree
+from shared_map.arrays import Floats
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.wind import Wind
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import SlopeRule, Strategy
+from swarm.grid import GridSpec, Window
+from swarm.wire.routes import LETHAL_START, OK, UNREACHABLE, RouteBatch
+
+LAWS = {
+    "status": "a cell has a route exactly where there is a way",
+    "legal": "a route breaks no rule and ends at the target",
+    "bound": "no way is quicker than the lower bound",
+    "optimum": "no route is quicker than the best way",
+    "stated": "a whole route's stated cost is driven, within 1e-6",
+    "cut": "a cut route's stated cost is driven, and so is what remains, within 1e-6",
+    "batch": "a route has the same numbers alone, in a batch and asked for again",
+    "exact": "the route of an exact tree is as good as any, within float32",
+}
+"""What is checked of every route, and how a violation is called."""
+
+STATED = 1e-6
+"""Relative; what a stated cost may be off by."""
+_FLOAT64 = 1e-12
+"""Relative; sums of float64 over other orders of the same steps."""
+
+_RULES: tuple[dict[str, Any], ...] = (
+    {},
+    {"corner_cutting": True},
+    {"edge": "paper"},
+    {"edge": "paper", "corner_cutting": True},
+    {"neighbours": 4},
+)
+
+
+@dataclass
+class Findings:
+    """What a campaign has found.
+
+    checks      routes checked, whole ones and cut ones each
+    violations  by law
+    worst       by law, relative; how far the worst one is off
+    example     by law: the seed of the first life that broke it
+    stated      worst relative difference of a stated cost from what is driven, whole or cut, allowed or not
+    """
+
+    checks: int = 0
+    lives: int = 0
+    violations: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LAWS, 0))
+    worst: dict[str, float] = field(default_factory=dict)
+    example: dict[str, int] = field(default_factory=dict)
+    stated: float = 0.0
+
+    def note(self, law: str, off: Seconds, allowed: float, seed: int) -> None:
+        """Count those of `off` (relative) that are more than allowed, or no number."""
+        broken = ~(off <= allowed)
+        many = int(np.count_nonzero(broken))
+        if many:
+            self.violations[law] += many
+            self.worst[law] = max(self.worst.get(law, 0.0), float(np.nan_to_num(off[broken], nan=math.inf).max()))
+            self.example.setdefault(law, seed)
+
+    def row(self) -> dict[str, Any]:
+        return {
+            "checks": self.checks,
+            "lives": self.lives,
+            "violations": sum(self.violations.values()),
+            "stated_over_driven_worst": self.stated,
+            "laws": {
+                law: {"violations": many, "worst": self.worst.get(law), "seed": self.example.get(law)}
+                for law, many in self.violations.items()
+            },
+        }
+
+
+def run_checks(
+    checks: int, seed: int = 1, seconds: float = math.inf, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Live lives until so many routes are checked, or so many seconds have gone by. Each has a seed of its own,
+    counted up from `seed`: a violation's is named, and `--seed` of it begins there."""
+    load_all()
+    findings, began = Findings(), time.monotonic()
+    while findings.checks < checks and time.monotonic() - began < seconds:
+        Life(seed + findings.lives, findings).live()
+        findings.lives += 1
+        if progress is not None:
+            progress(min(findings.checks, checks), checks)
+    return {"seed": seed, "asked": checks, **findings.row(), **machine()}
+
+
+class Life:
+    """One tree, the map that it is told of, and a worker's growth that it may wait for."""
+
+    def __init__(self, seed: int, findings: Findings) -> None:
+        self._seed = seed
+        self._findings = findings
+        rng = self._rng = np.random.default_rng(seed)
+        in_pieces = rng.random() < 0.25
+        rows, cols = (int(rng.integers(1, 161 if in_pieces else 49)) for _ in "rc")
+        resolution_m = float(rng.choice([1.0, 0.1, 7.3, 30.0]))
+        self._grid = GridSpec(rows, cols, resolution_m)
+        self._pace = _random_pace(rng, rows, cols)
+        kind = int(rng.integers(2 if in_pieces else 3))
+        self._climb = _random_climb(rng, self._grid) if kind == 2 else None
+        self.config = PlannerConfig(
+            strategy=str(rng.choice(["exact", "auto"] if in_pieces else get_args(Strategy))),
+            k_min=int(rng.integers(3)),
+            cpu_budget=float(rng.choice([1e-9, 1e-4, 0.5])),
+            length_weight=float(10.0 ** rng.uniform(-6, 6)) if kind == 1 else 0.0,
+            **_RULES[rng.integers(len(_RULES))],
+        )
+        self._tree = TargetTree(self._grid, self.config, self._climb)
+        self._tree.times.in_pieces = in_pieces  # as if the map were large
+        self._target = int(rng.choice(np.flatnonzero(np.isfinite(self._pace))))
+        self._version = 0
+        self._grown: GrownTree | None = None
+        self._dirty: list[Window] = []
+        self._tree.update(self._pace, self._target, [], 0)
+
+    def live(self) -> None:
+        self._check()
+        for _ in range(int(self._rng.integers(4, 25))):
+            event = self._rng.random()
+            if event < 0.55:
+                self._move(1)
+            elif event < 0.65:
+                self._move(16)
+            elif event < 0.8:
+                self._mark()
+            elif event < 0.9:
+                self._job()
+            elif event < 0.95:
+                self._tree.force(self._some(3))
+            else:
+                self._tree.routes(self._some(5), int(self._rng.integers(9)))
+                self._tree.cost_to_go_at(self._some(5))
+            self._check()
+
+    def _some(self, most: int) -> Cells:
+        return self._rng.integers(self._grid.cells, size=int(self._rng.integers(1, most + 1)))
+
+    def _move(self, most: int) -> None:
+        row, col = self._grid.row_col(self._target)
+        down, right = (int(by) for by in self._rng.integers(-most, most + 1, 2))
+        row = min(max(row + down, 0), self._grid.rows - 1)
+        col = min(max(col + right, 0), self._grid.cols - 1)
+        self._target = self._grid.cell(row, col)
+        self._tree.update(self._pace, self._target, [], self._version)
+
+    def _mark(self) -> None:
+        rng, dirty = self._rng, Window(0, 0, 0, 0)
+        for _ in range(int(rng.integers(1, 7))):
+            row, col = (int(rng.integers(side)) for side in self._pace.shape)
+            self._pace[row, col] = rng.choice(np.array([np.inf, 0.5, 1.0, 20.0, 500.0], np.float32))
+            dirty = dirty.union(Window(row, col, row + 1, col + 1))
+        self._version += 1
+        self._dirty.append(dirty)
+        self._tree.update(self._pace, self._target, [dirty], self._version)
+
+    def _job(self) -> None:
+        if self._grown is None:
+            self._grown = self._tree.full_job(self._target)()
+            self._dirty = []
+            return
+        followed = self._some(5)
+        self._tree.adopt(self._grown, self._pace, self._target, self._dirty, self._version, followed)
+        self._grown = None
+        if self._tree.wants_strides:
+            self._tree.take_strides(self._tree.stride_job().run())
+
+    def _check(self) -> None:
+        if not self._tree.ready:
+            return
+        ground = self._grid, self.config, self._pace, self._climb
+        best_s = best_costs(*ground, self._target)
+        every = np.arange(self._grid.cells)
+        if self._rng.random() < 0.5:  # what a cut route says must not need the whole one to have been asked for
+            cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
+            whole = self._tree.routes(every)
+        else:
+            whole = self._tree.routes(every)
+            cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
+        self._findings.checks += 2 * every.size
+        self._check_statuses(whole, best_s)
+        self._check_statuses(cut, best_s)
+        there = np.flatnonzero(np.isfinite(best_s) & (whole.statuses == OK) & (cut.statuses == OK))
+        driven, first = drive(*ground, whole), drive(*ground, cut)
+        self._note("legal", np.where(driven.last[there] == self._target, 0.0, math.inf), 0.0)
+        if not (driven.last[there] == self._target).all():
+            return
+        self._check_stated(whole, cut, driven, first, there)
+        for routes in (whole, cut):
+            self._note("bound", _above(routes.lower_bound_s[there], best_s[there]), _FLOAT64)
+        self._note("optimum", _above(best_s[there], driven.time_s[there]), _FLOAT64)
+        if self._tree.strategy.is_exact:
+            best = best_costs(*ground, self._target, self.config.length_weight)[there]
+            asked = driven.time_s[there] + self.config.length_weight * whole.length_m[there]
+            self._note("exact", _above(asked, best), self._grid.cells * 2.0**-23)
+        self._check_alone(whole, cut, there)
+
+    def _check_statuses(self, routes: RouteBatch, best_s: Seconds) -> None:
+        expected = np.where(np.isfinite(best_s), OK, UNREACHABLE)
+        expected[~np.isfinite(self._pace).reshape(-1)] = LETHAL_START
+        self._note("status", np.where(routes.statuses == expected, 0.0, math.inf), 0.0)
+
+    def _check_stated(
+        self, whole: RouteBatch, cut: RouteBatch, driven: Driven, first: Driven, there: Cells
+    ) -> None:
+        time_s = driven.time_s[there]
+        off = _apart(whole.cost_s[there], time_s)
+        self._note("stated", off, STATED)
+        rest = driven.time_s[first.last[there]]
+        for stated, is_driven in ((cut.cost_s[there], time_s), (cut.remaining_s[there], rest)):
+            cut_off = _apart(stated, is_driven)
+            self._note("cut", cut_off, STATED)
+            off = np.concatenate((off, cut_off))
+        self._findings.stated = max(self._findings.stated, float(off.max(initial=0.0)))
+
+    def _check_alone(self, whole: RouteBatch, cut: RouteBatch, there: Cells) -> None:
+        if not there.size:
+            return
+        cell = int(self._rng.choice(there))
+        steps = int(np.diff(cut.ends, prepend=0).max())
+        for many, alone in ((whole, self._tree.routes([cell])), (cut, self._tree.routes([cell], steps))):
+            same = many[cell] == alone[0]
+            self._note("batch", np.array([0.0 if same else abs(alone[0].cost_s / many[cell].cost_s - 1)]), 0.0)
+            if not same:
+                self._note("batch", np.array([math.inf]), 0.0)
+
+    def _note(self, law: str, off: Seconds, allowed: float) -> None:
+        self._findings.note(law, off, allowed, self._seed)
+
+
+def _above(one: Seconds, other: Seconds) -> Seconds:
+    """How much more one is than the other, relatively to the other; 0 where it is not."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(one <= other, 0.0, one / other - 1.0)
+
+
+def _apart(one: Seconds, other: Seconds) -> Seconds:
+    return np.maximum(_above(one, other), _above(other, one))
+
+
+def _random_pace(rng: np.random.Generator, rows: int, cols: int) -> Floats:
+    ratio = float(rng.choice([1.0, 3.0, 100.0, 1e4, 1e8]))
+    pace = np.exp(rng.random((rows, cols)) * math.log(ratio)).astype(np.float32)
+    pace[rng.random((rows, cols)) < rng.choice([0.0, 0.1, 0.3, 0.5])] = np.inf
+    if not np.isfinite(pace).any():
+        pace[0, 0] = 1.0
+    return pace
+
+
+def _random_climb(rng: np.random.Generator, grid: GridSpec) -> Climb:
+    """Rough ground with voids, in some winds; steps that rise too steeply are forbidden, and falls from twice as
+    steep on, so that some lead one way only."""
+    heights = rng.normal(0, rng.choice([0.0, 0.1, 0.5]), (grid.rows, grid.cols)).astype(np.float32)
+    heights *= np.float32(grid.resolution_m)
+    heights[rng.random(heights.shape) < 0.03] = np.nan
+    rules: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
+    rule = rules[rng.integers(len(rules))]
+    climb = climb_of(grid, heights, CostConfig(directional=True, slope_rule=rule))
+    assert climb is not None
+    entry = int(ENTRIES * min(float(rng.choice([0.1, 0.3, 10.0])) / climb.steepest, 1.0))
+    factors = climb.factors.copy()
+    factors[ENTRIES + entry + 1 :] = np.inf
+    factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
+    wind = Wind(float(rng.choice([0.0, 0.0, 0.3])), float(rng.choice([0.0, 0.0, -0.2])))
+    return replace(climb, factors=factors, wind=wind)
+
+
+def tables(report: dict[str, Any]) -> Iterator[Table | str]:
+    yield (
+        f"{report['checks']:,} routes of {report['lives']:,} lives checked: {report['violations']:,} violations."
+        f" Stated over driven cost: {report['stated_over_driven_worst']:.1e} at worst."
+    )
+    shown = table("Laws", "<law", "violations", "worst", "seed")
+    for law, row in report["laws"].items():
+        worst = "-" if row["worst"] is None else f"{row['worst']:.1e}"
+        shown.add_row(LAWS[law], f"{row['violations']:,}", worst, "-" if row["seed"] is None else str(row["seed"]))
+    yield shown

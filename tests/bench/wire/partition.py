@@ -1,0 +1,218 @@
+"""How soon all replicas are equal after a partition heals: two routers in network namespaces, over mutual TLS.
+
+Two namespaces stand for two machines, a pair of veth for the cable between them. On each side run, as processes of
+their own, a router, a keeper with its store on disk, two authors that say something about eight cells every 50 ms,
+and a listener; the sides meet over tls/ with certificates made for the purpose. A round takes the cable down, lets
+both sides write, stops writing, puts the cable up, and measures until every replica of both sides tells the same
+digest and none has changed for a second.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.machine import machine
+from bench.tables import Progress
+from bench.wire import partition_side
+from bench.wire.partition_side import ADDRESSES, SIDES
+from launch_scripts.deploy.certificates import issue
+from swarm.errors import SwarmError
+
+SETTLED_S = 1.0
+GIVE_UP_S = 30.0
+_SETTLE_START_S = 60.0
+
+
+@dataclass(slots=True)
+class _Child:
+    name: str
+    process: subprocess.Popen[str]
+    author: bool
+    replica: bool
+    newest: tuple[float, str] = (0.0, "")
+    """Time of the last change of its digest, and the digest."""
+
+
+class TwoSides:
+    """Two network namespaces, the cable between them, and their processes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._spaces = {side: f"swarm-{side}-{os.getpid()}" for side in SIDES}
+        self._ends = {side: f"sw{side[0]}{os.getpid() % 1_000_000}" for side in SIDES}
+        self._told: queue.SimpleQueue[tuple[_Child, list[object]]] = queue.SimpleQueue()
+        self.children: list[_Child] = []
+
+    def __enter__(self) -> TwoSides:
+        east, west = SIDES
+        try:
+            for side in SIDES:
+                issue(self._folder, f"router.{side}", [ADDRESSES[side]], 2)
+                _ip("netns", "add", self._spaces[side])
+            _ip("link", "add", self._ends[east], "type", "veth", "peer", "name", self._ends[west])
+            for side in SIDES:
+                space, end = self._spaces[side], self._ends[side]
+                _ip("link", "set", end, "netns", space)
+                _ip("-n", space, "addr", "add", f"{ADDRESSES[side]}/30", "dev", end)
+                _ip("-n", space, "link", "set", "lo", "up")
+                _ip("-n", space, "link", "set", end, "up")
+            for role, ids in (("router", "0"), ("keeper", "0"), ("agent", "01"), ("planner", "0")):
+                for side in SIDES:
+                    for id in ids:
+                        self._start(side, role, id)
+                if role == "router":
+                    self.wait_until(lambda: all(child.newest[0] > 0 for child in self.children), _SETTLE_START_S)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for child in reversed(self.children):
+            with contextlib.suppress(OSError):
+                child.process.stdin.close()  # type: ignore[union-attr]
+        for child in reversed(self.children):
+            try:
+                child.process.wait(5)
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait(5)
+        for space in self._spaces.values():
+            subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
+
+    def cable(self, up: bool) -> None:
+        side = SIDES[0]
+        _ip("-n", self._spaces[side], "link", "set", self._ends[side], "up" if up else "down")
+
+    def say(self, word: str) -> None:
+        """Sends a word to all authors."""
+        for child in self.children:
+            if child.author and child.process.stdin is not None:
+                child.process.stdin.write(word + "\n")
+                child.process.stdin.flush()
+
+    def listen(self, for_s: float) -> None:
+        until_s = time.monotonic() + for_s
+        while (left_s := until_s - time.monotonic()) > 0:
+            try:
+                child, words = self._told.get(timeout=left_s)
+            except queue.Empty:
+                break
+            child.newest = (float(str(words[0])), str(words[1]))
+        for child in self.children:
+            if child.process.poll() is not None:
+                log = (self._folder / f"{child.name}.log").read_text()[-2000:]
+                raise SwarmError(f"{child.name} ended by itself with {child.process.returncode}: {log}")
+
+    def wait_until(self, true: Callable[[], object], within_s: float) -> None:
+        until_s = time.monotonic() + within_s
+        while not true():
+            if time.monotonic() > until_s:
+                raise SwarmError(f"not within {within_s:g} s; {self._state()}")
+            self.listen(0.05)
+
+    def equal_since(self) -> float | None:
+        """Time at which the last replica reached the common digest; None while they differ."""
+        newest = [child.newest for child in self.children if child.replica]
+        if len({digest for _, digest in newest}) > 1 or not newest[0][1]:
+            return None
+        return max(when_s for when_s, _ in newest)
+
+    def settled(self, after_s: float = 0.0) -> bool:
+        since_s = self.equal_since()
+        return since_s is not None and time.monotonic() - max(since_s, after_s) > SETTLED_S
+
+    def _state(self) -> str:
+        return ", ".join(f"{child.name} {child.newest[1][:6] or '-'}" for child in self.children if child.replica)
+
+    def _start(self, side: str, role: str, id: str) -> None:
+        name = f"{side}-{role}-{id}"
+        here = [sys.executable, "-m", partition_side.__name__, side, role, id, str(self._folder)]
+        command = ["ip", "netns", "exec", self._spaces[side], *here]
+        with (self._folder / f"{name}.log").open("w") as log:
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
+            )
+        child = _Child(name, process, author=role == "agent", replica=role != "router")
+        self.children.append(child)
+        threading.Thread(target=self._hear, args=(child,), daemon=True).start()
+
+    def _hear(self, child: _Child) -> None:
+        assert child.process.stdout is not None
+        for line in child.process.stdout:
+            self._told.put((child, json.loads(line)))
+
+
+def rounds(count: int, seconds: float, folder: Path) -> Iterator[dict[str, float]]:
+    """For each round: seconds from the cable's return until all are equal, and the number of digests before it."""
+    with TwoSides(folder) as sides:
+        sides.say("write")
+        sides.listen(1.0)
+        sides.say("hush")
+        sides.wait_until(sides.settled, _SETTLE_START_S)
+        for _ in range(count):
+            sides.cable(up=False)
+            sides.say("write")
+            sides.listen(seconds)
+            apart = len({child.newest[1] for child in sides.children if child.replica})
+            sides.say("hush")
+            sides.listen(0.3)  # the last sets reach their own side
+            healed_s = time.monotonic()
+            sides.cable(up=True)
+            sides.wait_until(partial(sides.settled, healed_s), GIVE_UP_S)
+            since_s = sides.equal_since()
+            assert since_s is not None
+            yield {"equal_after_s": round(max(since_s - healed_s, 0.0), 3), "digests_apart": apart}
+
+
+def why_not() -> str | None:
+    """Why this machine cannot run two namespaces; None if it can."""
+    if shutil.which("ip") is None:
+        return "there is no command ip (iproute2)"
+    space = f"swarm-try-{os.getpid()}"
+    tried = subprocess.run(["ip", "netns", "add", space], capture_output=True, text=True, check=False)
+    if tried.returncode:
+        return f"network namespaces are not permitted: {tried.stderr.strip()}"
+    name = f"swt{os.getpid() % 1_000_000}"
+    link = ["ip", "-n", space, "link", "add", name, "type", "veth", "peer", "name", f"{name}p"]
+    tried = subprocess.run(link, capture_output=True, text=True, check=False)
+    subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
+    return f"veth links are not permitted: {tried.stderr.strip()}" if tried.returncode else None
+
+
+def _ip(*arguments: str) -> None:
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SwarmError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+
+
+def run(count: int, seconds: float, progress: Progress | None = None) -> dict[str, Any]:
+    """Quantiles over all rounds. Raises SwarmError where two namespaces cannot run."""
+    reason = why_not()
+    if reason is not None:
+        raise SwarmError(f"this machine cannot run two network namespaces: {reason}")
+    found: list[float] = []
+    with tempfile.TemporaryDirectory() as name:
+        for figures in rounds(count, seconds, Path(name)):
+            found.append(figures["equal_after_s"])
+            if progress is not None:
+                progress(len(found), count)
+    p50, p99 = (round(float(np.percentile(found, q)), 3) for q in (50, 99))
+    measured = {"p50_s": p50, "p99_s": p99, "max_s": max(found)}
+    return {"rounds": len(found), "partition_s": seconds, **measured, "equal_after_s": found, **machine()}

@@ -1,0 +1,268 @@
+"""Queries and positions on the wire beside raw Zenoh."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import closing
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from bench.wire.marks import ratios, rounded
+from bench.wire.remote import RAW, Far, asked, read_on_thread, run_service
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import AskEnded, Event, Heard, Replied
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.clock import MonotonicClock
+from swarm.config.scenario import NetworkConfig, Scenario, TargetConfig
+from swarm.errors import SwarmError
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import ThreadWorker
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
+from swarm.wire.codec import encode
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import RouteReply, RouteRequest
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import FLEET, POSE, ROUTE
+
+_SIDE = 512
+_TARGET = "t0"
+_HZ = 10.0
+_LONGEST_S = 60.0
+_SESSIONS = 10
+"""Agents per sending process: forty interpreters would measure how they share two cores."""
+
+
+# --- path queries -------------------------------------------------------------------------------------------
+
+
+def planner_peer(network: NetworkConfig, pipe: Connection, target: str = _TARGET) -> None:
+    """A planner on level terrain of 512 x 512 cells, and a raw queryable which answers with given bytes."""
+    from planner_service.kernel_build import load_all
+    from planner_service.service import PlannerService
+
+    load_all()
+    clock, inbox = MonotonicClock(), Inbox()
+    terrain = terrain_of_pace(np.random.default_rng(1).uniform(0.1, 1.0, (_SIDE, _SIDE)).astype(np.float32))
+    scenario = Scenario(network=network, targets=(TargetConfig(name=target),))
+    setup = RoleSetup(scenario, "bench", "planner", target, time.time_ns(), time.time_ns())
+    with open_bus(network) as bus, closing(ThreadWorker("grow-tree", inbox)) as worker:
+        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
+        payloads: list[bytes] = []
+
+        def reply(query: zenoh.Query) -> None:
+            query.payload.to_bytes()  # type: ignore[union-attr]
+            query.reply(f"{RAW}/route", payloads[-1])
+            query.drop()  # type: ignore[no-untyped-call]
+
+        queryable = bus.session.declare_queryable(f"{RAW}/route", zenoh.handlers.FifoChannel(4096))
+        kept = read_on_thread(queryable, reply)
+        pipe.send("ready")
+        run_service(service, inbox, pipe, payloads.append)
+        del kept
+
+
+def route_queries(far: Far, queries: int) -> dict[str, float]:
+    """Microseconds from a route request to the parsed reply, beside a raw get of the same bytes, in turn."""
+    peer = far.start(planner_peer)
+    ours_us, raw_us = [], []
+    random = np.random.default_rng(2)
+    with open_bus(far.network) as bus:
+        inbox = Inbox()
+        reply = _first_route(bus, inbox)
+        for _ in range(queries):
+            request = RouteRequest(cells=[int(random.integers(_SIDE * _SIDE))])
+            began_ns = time.monotonic_ns()
+            answered = ask_route(bus, inbox, request)
+            ours_us.append((time.monotonic_ns() - began_ns) / 1e3)
+            if answered is None:
+                raise SwarmError("the planner gave no route")
+            reply = answered
+            asked(peer, encode(reply))
+            payload = encode(request)
+            time.sleep(0.002)
+            began_ns = time.monotonic_ns()
+            [raw] = bus.session.get(f"{RAW}/route", zenoh.handlers.FifoChannel(4), payload=payload)
+            if raw.ok is None or not raw.ok.payload.to_bytes():
+                raise SwarmError("a raw query was not answered")
+            raw_us.append((time.monotonic_ns() - began_ns) / 1e3)
+            time.sleep(0.002)
+    far.end()
+    figures = {
+        "reply_bytes": len(encode(reply)),
+        "ours_p50": np.percentile(ours_us, 50),
+        "ours_p99": np.percentile(ours_us, 99),
+        "raw_p50": np.percentile(raw_us, 50),
+        "raw_p99": np.percentile(raw_us, 99),
+    }
+    return rounded(figures) | ratios(figures, "p50", "p99")
+
+
+def _first_route(bus: ZenohBus, inbox: Inbox) -> RouteReply:
+    deadline_s = time.monotonic() + _LONGEST_S
+    cell = _SIDE * _SIDE // 2 + _SIDE // 2
+    pose = TargetPose(target=_TARGET, incarnation=1, seq=1, stamp_ns=time.time_ns(), cell=cell, x_m=0.0, y_m=0.0)
+    while time.monotonic() < deadline_s:
+        bus.publish(POSE, pose, target=_TARGET)
+        reply = ask_route(bus, inbox, RouteRequest(cells=[0]))
+        if reply is not None and reply.routes[0].status is RouteStatus.OK:
+            return reply
+        time.sleep(0.1)
+    raise SwarmError("the planner was not ready in time")
+
+
+def ask_route(
+    bus: ZenohBus, inbox: Inbox, request: RouteRequest, target: str = _TARGET, timeout_s: float = 2.0
+) -> RouteReply | None:
+    """A planner's answer; None if there is none in time."""
+    asked_as = str(time.monotonic_ns())
+    bus.ask(ROUTE, request, inbox.post, tag=asked_as, timeout_s=timeout_s, target=target)
+    found: RouteReply | None = None
+    while found is None:
+        match inbox.take(timeout_s + 3.0):
+            case Replied(tag=tag, message=RouteReply() as reply) if tag == asked_as and reply.routes:
+                found = reply
+            case AskEnded(tag=tag) if tag == asked_as:
+                return None
+            case None:
+                return None
+    return found
+
+
+# --- positions ----------------------------------------------------------------------------------------------
+
+
+def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles: int) -> None:
+    """Agents, each with its own session, which publish positions ten times a second while told to."""
+    buses = [open_bus(network) for _ in range(_SESSIONS)]
+    pipe.send("ready")
+    seq = 0
+    while (question := pipe.recv()) != "end":
+        raw, seconds = question
+        due_s = time.monotonic()
+        sent = 0
+        for _ in range(int(seconds * _HZ)):
+            seq += 1
+            for n, bus in enumerate(buses):
+                fleet = _fleet(f"a{first + n}.1", first + n, seq, vehicles)
+                if raw:
+                    bus.session.put(f"{RAW}/fleet/{fleet.region}/{fleet.author}", encode(fleet))
+                else:
+                    bus.publish(FLEET, fleet, region=fleet.region, author=fleet.author)
+                sent += 1
+            due_s += 1 / _HZ
+            time.sleep(max(0.0, due_s - time.monotonic()))
+        pipe.send(sent)
+    for bus in buses:
+        bus.close()
+
+
+def _fleet(author: str, region: int, seq: int, vehicles: int) -> Fleet:
+    agent = author.partition(".")[0]
+    places = np.linspace(0.0, 1000.0, vehicles) + seq
+    return Fleet(
+        author=author,
+        group="all",
+        region=region,
+        seq=seq,
+        stamp_ns=time.time_ns(),
+        ids=[f"{agent}-{n:02d}" for n in range(vehicles)],
+        target_ids=[_TARGET],
+        cells=pack_column(places, "<u4"),
+        east_m=pack_column(places, "<f4"),
+        south_m=pack_column(places, "<f4"),
+        heading_rad=pack_column(places / 1000, "<f4"),
+        states=bytes(vehicles),
+        targets=bytes(vehicles),
+    )
+
+
+class _Watcher:
+    """Keeps the newest positions of each agent and region, as an agent does."""
+
+    def __init__(self, bus: ZenohBus, inbox: Inbox) -> None:
+        self.counters = Counters()
+        self.received = 0
+        self.newest: dict[tuple[int, str], Fleet] = {}
+        self._bus = bus
+        self._inbox = inbox
+
+    def start(self, now_ns: int) -> None:
+        self._bus.subscribe(FLEET, self._inbox.post)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Fleet):
+            self.received += 1
+            self.newest[event.message.region, event.message.author] = event.message
+
+    def tick(self, now_ns: int) -> None:
+        pass
+
+    def stop(self, now_ns: int) -> None:
+        pass
+
+
+def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
+    """Receives positions, ours parsed and newest only, raw ones through a FIFO; reports counts and CPU time."""
+    raw_received: list[int] = []
+    with open_bus(network) as bus:
+        inbox = Inbox()
+        watcher = _Watcher(bus, inbox)
+        raw = bus.session.declare_subscriber(f"{RAW}/fleet/**", zenoh.handlers.FifoChannel(1 << 14))
+        kept = read_on_thread(raw, lambda sample: raw_received.append(len(sample.payload.to_bytes())))
+
+        def answer(_: str) -> tuple[int, int, int, int]:
+            return watcher.received, inbox.superseded, len(raw_received), time.process_time_ns()
+
+        pipe.send("ready")
+        run_service(watcher, inbox, pipe, answer)
+        del kept
+
+
+def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str, float]:
+    """CPU time for all positions in one process: ours, and raw Zenoh which only receives the bytes."""
+    watcher = far.start(watcher_peer)
+    senders = [far.start(fleet_sender, first, vehicles) for first in range(0, agents, _SESSIONS)]
+    figures: dict[str, Any] = {"vehicles": agents * vehicles, "bytes": len(encode(_fleet("a0.1", 0, 1, vehicles)))}
+    for name, raw in (("raw", True), ("ours", False)):
+        before = asked(watcher, "counts")
+        began_s = time.monotonic()
+        sent = sum(_all_answers(senders, (raw, seconds), seconds))
+        time.sleep(0.3)
+        took_s = time.monotonic() - began_s - 0.3
+        received, superseded, raw_count, cpu_ns = (
+            now - then for now, then in zip(asked(watcher, "counts"), before, strict=True)
+        )
+        figures[f"{name}_cpu_ms_per_s"] = cpu_ns / 1e6 / took_s
+        figures[f"{name}_received_per_s"] = (raw_count if raw else received) * vehicles / took_s
+        if not raw:
+            figures["newer_in_its_place"] = superseded
+            figures["lost"] = sent - received - superseded
+        else:
+            figures["raw_lost"] = sent - raw_count
+    for _ in range(len(senders) + 1):
+        far.end()
+    figures["ratio_cpu"] = figures["ours_cpu_ms_per_s"] / figures["raw_cpu_ms_per_s"]
+    return rounded(figures)
+
+
+def _all_answers(pipes: list[Connection], question: Any, seconds: float) -> list[int]:
+    answers: dict[int, int] = {}
+
+    def ask(n: int) -> None:
+        answers[n] = asked(pipes[n], *question, within_s=seconds + _LONGEST_S)
+
+    threads = [threading.Thread(target=ask, args=(n,)) for n in range(len(pipes))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if len(answers) < len(pipes):
+        raise SwarmError("a process that tells positions did not answer")
+    return list(answers.values())

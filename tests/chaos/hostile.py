@@ -1,0 +1,107 @@
+"""Hostile messages, made of what was heard and of the table of topics. Pure."""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Collection
+from typing import Any
+
+import msgpack
+
+from chaos.lies import Lies
+from swarm.wire.codec import encode
+from swarm.wire.topics import TOPICS
+
+KINDS = ("flipped", "numbers", "replayed", "lies")
+"""flipped   a few bits of a message that was said
+numbers   fields of one, replaced by what no field should be
+replayed  said once more, byte for byte
+lies      well-formed, by somebody whom it does not come from, within all bounds"""
+_BIG = (1 << 61) + 12345
+_KEPT = 32
+"""Payloads kept of each key: a replay may be seconds old."""
+_KEYS = 5000
+
+
+class Hostile:
+    """Makes hostile messages.
+
+    spared  names of topics whose keys get none
+    """
+
+    def __init__(
+        self, namespace: str, lies: Lies, seed: int, kinds: Collection[str] = KINDS, spared: Collection[str] = ()
+    ) -> None:
+        self._namespace = namespace
+        self._lies = lies
+        self._kinds = [kind for kind in KINDS if kind in kinds]
+        self._chance = random.Random(f"hostile/{seed}")
+        self._spared = [topic for topic in TOPICS if topic.name in spared]
+        self._topics = [topic for topic in TOPICS if topic.published and topic.name not in spared]
+        self._heard: dict[str, deque[tuple[bytes, bytes | None]]] = {}
+        """Key -> what was said under it lately, each with its code."""
+        self._keys: list[str] = []
+
+    def heard(self, key: str, payload: bytes, code: bytes | None = None) -> None:
+        """Keep a genuine message as material. `code` came with it, and proves who said it."""
+        kept = self._heard.get(key)
+        if kept is None:
+            if len(self._keys) >= _KEYS or any(topic.parse(self._namespace, key) for topic in self._spared):
+                return
+            kept = self._heard[key] = deque(maxlen=_KEPT)
+            self._keys.append(key)
+        kept.append((payload, code))
+
+    def next(self) -> tuple[str, str, bytes, bytes | None]:
+        """Kind, key, payload and code of one message. A thief has the codes of what he heard, and no other."""
+        chance = self._chance
+        kind = chance.choice(self._kinds)
+        if kind == "lies" or not self._keys:
+            topic = chance.choice(self._topics)
+            message = self._lies.lie(topic.message)
+            return "lies", topic.keyed(self._namespace, **self._lies.fields(topic, message)), encode(message), None
+        key = chance.choice(self._keys)
+        payload, code = chance.choice(self._heard[key])
+        if kind == "flipped":
+            payload = self._flipped(payload)
+        elif kind == "numbers":
+            payload = self._with_numbers(payload)
+        return kind, key, payload, code
+
+    def _flipped(self, payload: bytes) -> bytes:
+        bits = bytearray(payload)
+        for _ in range(self._chance.randint(1, 8) if bits else 0):
+            bits[self._chance.randrange(len(bits))] ^= 1 << self._chance.randrange(8)
+        return bytes(bits)
+
+    def _with_numbers(self, payload: bytes) -> bytes:
+        try:
+            message = msgpack.unpackb(payload, strict_map_key=False)
+        except ValueError:
+            return payload
+        if not isinstance(message, dict):
+            return payload
+        for field, value in message.items():
+            if field != "schema" and self._chance.random() < 0.3:
+                message[field] = self._instead_of(value)
+        packed: bytes = msgpack.packb(message)
+        return packed
+
+    def _instead_of(self, value: Any) -> Any:
+        choice = self._chance.choice
+        match value:
+            case bool():
+                return value
+            case int():
+                return choice([0, -1, _BIG, 2**32 - 1, 2**63])
+            case float():
+                return choice([float("nan"), float("inf"), -1e308, -1.0])
+            case str():
+                return choice(["", "a/b", "*", "x" * 1000])
+            case bytes():
+                return choice([b"", b"\xff" * len(value), value[:1000] * 50])
+            case list():
+                return choice([[], value[:100] * 40, [_BIG] * 5])
+            case _:
+                return value

@@ -1,0 +1,151 @@
+"""What a siege came to: one outcome per blow, samples of what the processes take up, and the laws. Pure."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from chaos.blows import CALM
+
+GROWTH_LIMIT = 0.05
+"""Memory, threads and files may grow by this share once a run has settled."""
+SETTLED_S = 600.0
+LONG_S = 1200.0
+"""From this length on a run is held to `GROWTH_LIMIT`; before, start-up dominates."""
+QUICK_S = 2.0
+"""Recovered so soon is as it should be; slower ones are counted."""
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """One blow and what followed. Seconds count from the blow; of a hang or burst, from its end.
+
+    back_s    until every killed process ran again
+    routed_s  until every vehicle had a route; None: not while it was watched
+    moving_s  until every vehicle moved or had arrived
+    late      vehicles that did not
+    """
+
+    at_s: float
+    kind: str
+    whom: tuple[str, ...] = ()
+    lasts_s: float = 0.0
+    messages: int = 0
+    back_s: float = 0.0
+    routed_s: float | None = None
+    moving_s: float | None = None
+    late: tuple[str, ...] = ()
+
+    @property
+    def recovered_s(self) -> float | None:
+        return None if self.routed_s is None or self.moving_s is None else max(self.routed_s, self.moving_s)
+
+
+class Ended(msgspec.Struct, frozen=True, kw_only=True):
+    """A process that ended without being killed."""
+
+    at_s: float
+    name: str
+    reason: str
+
+
+class Sample(msgspec.Struct, frozen=True, kw_only=True):
+    """What all processes took up at one time, when none was missing."""
+
+    at_s: float
+    rss_mb: float
+    threads: int
+    files: int
+
+
+class Tally(msgspec.Struct, kw_only=True):
+    """A whole siege."""
+
+    scenario: str
+    seed: int
+    within_s: float
+    seconds: float = 0.0
+    outcomes: list[Outcome] = []
+    ended: list[Ended] = []
+    samples: list[Sample] = []
+    messages: dict[str, int] = {}
+    collisions: list[str] = []
+    lethal_entries: list[str] = []
+    left_behind: list[str] = []
+    """Processes that still ran after the launcher had ended."""
+
+    def broken(self) -> list[str]:
+        """A sentence per law that broke."""
+        found = [f"{each.name} ended by itself at {each.at_s:.0f} s: {each.reason}" for each in self.ended]
+        for each in self.outcomes:
+            if each.kind == CALM:
+                continue
+            if each.recovered_s is None:
+                late = f"{len(each.late)} vehicles, such as {', '.join(each.late[:3])}"
+                found.append(f"after {name_of(each)} at {each.at_s:.0f} s not recovered: {late}")
+            elif each.recovered_s > self.within_s:
+                found.append(f"after {name_of(each)} at {each.at_s:.0f} s recovered after {each.recovered_s:.1f} s")
+        found += [f"collision: {text}" for text in self.collisions]
+        found += [f"lethal entry: {text}" for text in self.lethal_entries]
+        found += [f"{name} was left behind" for name in self.left_behind]
+        if self.seconds >= LONG_S:
+            for what, growth in self.growth().items():
+                if growth is not None and growth > GROWTH_LIMIT:
+                    found.append(f"{what} grew by {100 * growth:.1f} %")
+        return found
+
+    def growth(self) -> dict[str, float | None]:
+        """By which share memory, threads and files grew: the last fifth of the run over the fifth after it had
+        settled. None without samples of both."""
+        settled_s = SETTLED_S if self.seconds >= LONG_S else self.seconds / 3
+        fifth_s = (self.seconds - settled_s) / 5
+        first = [each for each in self.samples if settled_s <= each.at_s < settled_s + fifth_s]
+        last = [each for each in self.samples if each.at_s >= self.seconds - fifth_s]
+        growth: dict[str, float | None] = {}
+        for what in ("rss_mb", "threads", "files"):
+            if not first or not last:
+                growth[what] = None
+                continue
+            before = statistics.median(getattr(each, what) for each in first)
+            growth[what] = statistics.median(getattr(each, what) for each in last) / before - 1
+        return growth
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Per kind of blow: how many, and seconds until all had recovered."""
+        rows = []
+        for kind in dict.fromkeys(each.kind for each in self.outcomes):
+            some = [each for each in self.outcomes if each.kind == kind]
+            took = sorted(each.recovered_s for each in some if each.recovered_s is not None)
+            routed = sorted(each.routed_s for each in some if each.routed_s is not None)
+            rows.append(
+                {
+                    "kind": kind,
+                    "blows": len(some),
+                    "routed_p50_s": _quantile(routed, 0.5),
+                    "routed_max_s": _quantile(routed, 1.0),
+                    "moving_p50_s": _quantile(took, 0.5),
+                    "moving_max_s": _quantile(took, 1.0),
+                    "slower_than_2_s": sum(each > QUICK_S for each in took),
+                    "never": len(some) - len(took),
+                }
+            )
+        return rows
+
+    def report(self) -> dict[str, Any]:
+        """All of it, for chaos.json."""
+        fields = msgspec.to_builtins(self)
+        return {**fields, "rows": self.rows(), "growth": self.growth(), "broken": self.broken()}
+
+
+def name_of(outcome: Outcome) -> str:
+    """Such as "kill of agent-a1, planner-t0"."""
+    of = f" of {', '.join(outcome.whom)}" if outcome.whom else ""
+    lasts = f" for {outcome.lasts_s:g} s" if outcome.lasts_s else ""
+    many = f", {outcome.messages} messages" if outcome.messages else ""
+    return f"{outcome.kind}{of}{lasts}{many}"
+
+
+def _quantile(values: Sequence[float], share: float) -> float | None:
+    return values[min(int(share * len(values)), len(values) - 1)] if values else None

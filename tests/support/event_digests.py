@@ -1,0 +1,66 @@
+"""Digests of the event logs of simulated runs: equal digests before and after a change show that it changed nothing.
+
+    PYTHONPATH=.:tests python -m support.event_digests > after.txt
+
+Each line is: world or scenario, seed, deliveries, digest of the whole log. Worlds run with faults, scenarios without.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from typing import Any
+
+import msgspec
+
+from launch_scripts.launcher.options import find_scenario
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import few_of_layer, nodes_of
+from launch_scripts.simulation.worlds import WORLDS, world
+
+SECONDS = 12.0
+RUNS = (
+    *((name, seed) for name in WORLDS for seed in (1, 2)),
+    *((name, 3) for name in ("jacksboro", "walkers", "aloft", "bodies", "clustered", "demo", "synthetic")),
+)
+
+
+class _Digest:
+    """A text file of which only the digest is kept."""
+
+    def __init__(self) -> None:
+        self.sum = hashlib.sha256()
+
+    def write(self, text: str) -> int:
+        self.sum.update(text.encode())
+        return len(text)
+
+    def flush(self) -> None:
+        pass
+
+
+def digest_of(name: str, seed: int, seconds: float = SECONDS) -> tuple[int, str]:
+    """Number of deliveries and hexadecimal digest of the event log of one run."""
+    log: Any = _Digest()
+    if name in WORLDS:
+        scenario, terrain = world(name, seed)
+        plan = random_plan(seed, nodes_of(scenario), seconds, few_of_layer(scenario))
+        simulation = Simulation(scenario, faults=plan, terrain=terrain, trace=log)
+    else:
+        scenario = msgspec.structs.replace(find_scenario(name), seed=seed, seconds=seconds)
+        simulation = Simulation(scenario, trace=log)
+    simulation.run_until(seconds)
+    simulation.finish()
+    return simulation.log.deliveries, log.sum.hexdigest()[:16]
+
+
+def main() -> None:
+    chosen = [run for run in RUNS if not sys.argv[1:] or run[0] in sys.argv[1:]]
+    for name, seed in chosen:
+        deliveries, digest = digest_of(name, seed)
+        print(f"{name} {seed} {deliveries} {digest}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
