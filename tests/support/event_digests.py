@@ -1,8 +1,8 @@
-"""Digests of the event logs of simulated runs: equal digests before and after a change show that it changed nothing.
+"""Digests of the event logs of simulated runs, which are equal before and after a change that changes nothing.
 
     PYTHONPATH=.:tests python -m support.event_digests > after.txt
 
-Each line is: world or scenario, seed, deliveries, digest of the whole log. Worlds run with faults, scenarios without.
+A line for each run: world or scenario, seed, deliveries, digest of the log. Worlds run with faults, scenarios without.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def main() -> None:
     chosen = [run for run in RUNS if not sys.argv[1:] or run[0] in sys.argv[1:]]
     for name, seed in chosen:
         deliveries, digest = digest_of(name, seed)
-        print(f"{name} {seed} {deliveries} {digest}", flush=True)
+        sys.stdout.write(f"{name} {seed} {deliveries} {digest}\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":
