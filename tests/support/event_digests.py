@@ -2,7 +2,7 @@
 
     PYTHONPATH=.:tests python -m support.event_digests > after.txt
 
-A line for each run: world or scenario, seed, deliveries, digest of the log. Worlds run with faults, scenarios without.
+A line for each run: world or scenario, seed, deliveries, digest of the log. Worlds run with faults, scenarios not.
 """
 
 from __future__ import annotations
