@@ -1,7 +1,9 @@
-# Sourced by demo, test and .ci/run: makes .venv what uv.lock says, or stops with one sentence.
+# Sourced by demo, test, bench, docs and .ci/run: makes .venv what uv.lock says, or stops with one sentence.
 # Nothing outside this folder changes, caches aside. An up-to-date .venv is left alone, so that needs no network.
+#
+#     install          what a run needs
+#     install tools    the developer's tools, too: tests, linters, the documentation, peers of benchmarks
 
-uv_version=0.13.8 # used where no uv is installed; the same lock, so the same versions
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv="$root/.venv"
 stamp="$venv/.installed"
@@ -26,12 +28,26 @@ find_python() {
 
 wanted() { cat "$root/uv.lock" "$root/pyproject.toml" "$root/launch_scripts/install.sh" | cksum; }
 
+# A .venv with the tools has all that a run needs.
+is_current() {
+    [[ -x $venv/bin/python && -f $stamp ]] && suits "$venv/bin/python" || return 1
+    local found
+    found=$(<"$stamp")
+    [[ $found == "$(wanted) tools" || ($1 == run && $found == "$(wanted) run") ]]
+}
+
 sync_with() { (cd "$root" && env -u VIRTUAL_ENV UV_PROJECT_ENVIRONMENT="$venv" UV_PYTHON_DOWNLOADS=never \
-    "$@" sync --frozen --extra all --inexact --quiet --python "$python"); }
+    "$@" sync --frozen --extra all "${groups[@]}" --inexact --quiet --python "$python"); }
 
 install() {
-    if [[ -x $venv/bin/python && -f $stamp && $(<"$stamp") == "$(wanted)" ]] && suits "$venv/bin/python"; then
+    local what=${1:-run}
+    local groups=(--no-dev)
+    if is_current "$what"; then
         return
+    fi
+    # Tools that are there stay: whoever has run the tests once keeps them.
+    if [[ $what == tools || (-f $stamp && $(<"$stamp") == *tools) ]]; then
+        what=tools groups=()
     fi
     if ! python=$(find_python); then
         say "This needs Python 3.11 or newer, and none of python3.13, python3.12, python3.11 and python3 on PATH is."
@@ -46,8 +62,8 @@ install() {
         python="$venv/bin/python"
         if ! "$python" -m uv --version >/dev/null 2>&1; then
             "$python" -m ensurepip >/dev/null 2>&1 || true
-            if ! "$python" -m pip install --quiet --disable-pip-version-check "uv==$uv_version"; then
-                say "Cannot install uv $uv_version with pip: the first start needs the network."
+            if ! "$python" -m pip install --quiet --disable-pip-version-check --require-hashes -r "$root/launch_scripts/uv.txt"; then
+                say "Cannot install uv with pip, as launch_scripts/uv.txt names it: the first start needs the network."
                 exit 1
             fi
         fi
@@ -56,6 +72,6 @@ install() {
             exit 1
         fi
     fi
-    wanted >"$stamp"
+    echo "$(wanted) $what" >"$stamp"
     say "Installed. The first start loads and compiles what all later ones find ready: half a minute, or more from a slow disk."
 }
