@@ -1,5 +1,7 @@
 """Order of the tests: those of the network last; `--network` leaves these out, or all others. `--seeds` lets tests
-that replay seeded histories run others; `--thorough` adds those of which the others show enough for each commit."""
+that replay seeded histories run others; `--thorough` adds those of which the others show enough for each commit.
+Properties are tried with the same examples in every run, so that a gate answers the same twice; `--random` looks for
+new ones."""
 
 from __future__ import annotations
 
@@ -16,6 +18,9 @@ EXAMPLES = 100
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--seeds", metavar="A:B", help="these histories instead of the ones that tests name")
     parser.addoption("--network", choices=("none", "only"), help="no test of the network, or nothing else")
+    parser.addoption(
+        "--random", action="store_true", help="properties from a new seed, which is printed on failure"
+    )
     parser.addoption("--thorough", action="store_true", help="also the tests marked thorough")
 
 
@@ -23,7 +28,12 @@ def pytest_configure(config: pytest.Config) -> None:
     # No deadline: on a busy machine a test is not to fail for taking long.
     if config.getoption("--thorough"):
         try_all()
-    settings.register_profile("ours", max_examples=few(EXAMPLES), deadline=None)
+    if config.getoption("--random"):
+        settings.register_profile("ours", max_examples=few(EXAMPLES), deadline=None, print_blob=True)
+    else:
+        settings.register_profile(
+            "ours", max_examples=few(EXAMPLES), deadline=None, derandomize=True, database=None
+        )
     settings.load_profile("ours")
 
 

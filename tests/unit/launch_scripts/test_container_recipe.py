@@ -85,7 +85,7 @@ def test_what_the_recipe_copies_is_there_and_let_through(steps: list[Step]) -> N
         if line.startswith("!")
     }
     copied = {source for value in values(steps, "COPY", 1) for source in value.split()[:-1]}
-    assert copied == let_through
+    assert {source.partition("/")[0] for source in copied} == let_through
     assert all((ROOT / source).exists() for source in copied)
 
 

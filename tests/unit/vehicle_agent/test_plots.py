@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
-from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS, GridSpec
+from swarm.grid import MAX_CELLS, MOST_PLOT_REGIONS, REGION_CELLS, GridSpec
 from swarm.right_of_way.plots import MOST_PLOTS_AN_AGENT, Plots, fitting_regions
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Known, KnownRequest
@@ -27,6 +27,8 @@ def rights(own: OwnRecord, side: int = WIDE) -> RightOfWay:
 
 @given(st.integers(1, 20_000), st.integers(1, 20_000), st.integers(1, 500))
 def test_plots_are_the_least_of_which_there_are_not_too_many(rows: int, cols: int, agents: int) -> None:
+    assume(rows * cols <= MAX_CELLS)
+
     def count(regions: int) -> int:
         return Plots(GridSpec(rows, cols, 1.0), (), regions * REGION_CELLS).count
 
