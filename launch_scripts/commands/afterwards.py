@@ -29,10 +29,6 @@ def compare(
             metavar="RUN...", help="Folders of runs, or their names in --runs.", autocompletion=complete.runs
         ),
     ],
-    out: Annotated[
-        Path | None, typer.Option(help="Also write plots: .html, a page with plots and tables, or .png.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file of --out.")] = False,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
@@ -41,12 +37,10 @@ def compare(
     Where a run listened is left out: free ports differ each time.
 
     swarm compare 20261122-154115-44bb LAST
-
-    swarm compare RUN RUN RUN --out compared.html
     """
     from launch_scripts.commands.compare import compare_runs
 
-    compare_runs(run, runs, as_json, out, force)
+    compare_runs(run, runs, as_json)
 
 
 @app.command(rich_help_panel=LEFT)
@@ -84,13 +78,12 @@ def export(
         Path | None, typer.Option(help="Folder to write to; by default export/ in the run's folder.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
-    gif: Annotated[bool, typer.Option("--gif", help="Write a moving picture of the run instead.")] = False,
     mcap: Annotated[
         bool, typer.Option("--mcap", help="Write a recording with ROS 2 messages instead, for Foxglove.")
     ] = False,
     runs: Runs = Path("runs"),
 ) -> None:
-    """Write what a run has left for a GIS, a spreadsheet, Foxglove, or as a moving picture.
+    """Write what a run has left for a GIS, a spreadsheet or Foxglove.
 
     Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
     their certified gaps, and marks as areas that say the same. GeoJSON and the columns lat and lon of CSV are in
@@ -100,13 +93,11 @@ def export(
 
     swarm export LAST --format gpkg --what tracks --what marks
 
-    swarm export LAST --gif
-
     swarm export LAST --mcap
     """
     from launch_scripts.commands.report import export_from
 
-    export_from(run, runs, what or (), format, out, force, gif, mcap)
+    export_from(run, runs, what or (), format, out, force, mcap)
 
 
 @app.command(rich_help_panel=LEFT)

@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.terminal import REPORTED
-from launch_scripts.observe.files import write_file
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
 from launch_scripts.report.results.compare import (
@@ -24,20 +23,13 @@ from launch_scripts.report.results.compare import (
     text_of,
 )
 from swarm.config.input_files import FileKind, parse_toml, read_text
-from swarm.errors import ConfigError, StoreError
-
-_PLOTTED = (".html", ".png")
+from swarm.errors import ConfigError
 
 
-def compare_runs(names: Sequence[str], runs: Path, as_json: bool, out: Path | None, force: bool) -> None:
-    """Print what differs between the scenarios of runs, and their figures. Raises ConfigError or StoreError.
-
-    out  a page or a picture that is written, too
-    """
+def compare_runs(names: Sequence[str], runs: Path, as_json: bool) -> None:
+    """Print what differs between the scenarios of runs, and their figures. Raises ConfigError or StoreError."""
     if len(names) < 2:
         raise ConfigError("compare takes two runs or more, such as two folders in runs/")
-    if out is not None:
-        _check_out(out, force)
     found = [_left(name, runs) for name in names]
     settings, made = settings_that_differ(found), circumstances_that_differ(found)
     numbers = figures(found, REPORTED)
@@ -48,11 +40,6 @@ def compare_runs(names: Sequence[str], runs: Path, as_json: bool, out: Path | No
         print(json.dumps({**named, **told}, indent=2, default=str))
     else:
         _print(found, settings, made, numbers)
-    if out is not None:
-        tables = [("Settings that differ", settings), ("Versions and machines", made), ("Figures", numbers)]
-        _plot(out, found, tables)
-        if not as_json:
-            print(out)
 
 
 def _print(found: Sequence[LeftRun], settings: list[Row], made: list[Row], numbers: list[Row]) -> None:
@@ -79,33 +66,6 @@ def _show(console: Console, found: Sequence[LeftRun], heading: str, rows: Sequen
     for label, values in rows:
         table.add_row(Text(plain(label)), *(Text(plain(text_of(label, value))) for value in values))
     console.print(table)
-
-
-def _check_out(out: Path, force: bool) -> None:
-    """Raise ConfigError before the work."""
-    if out.suffix.lower() not in _PLOTTED:
-        raise ConfigError(f"--out {out}: write {' or '.join(_PLOTTED)}")
-    if out.is_dir() or not out.parent.is_dir():
-        raise ConfigError(f"--out {out}: cannot write there, it is a folder or lies in none")
-    if out.exists() and not force:
-        raise ConfigError(f"{out} is there already; --force replaces it")
-
-
-def _plot(out: Path, found: Sequence[LeftRun], tables: Sequence[tuple[str, list[Row]]]) -> None:
-    try:
-        if out.suffix.lower() == ".png":
-            from launch_scripts.report.pictures.comparison import save_comparison
-
-            save_comparison(out, found)
-        else:
-            from launch_scripts.report.page.compare_page import compare_page
-
-            write_file(out, compare_page(found, remarks(found), tables).encode())
-    except OSError as error:
-        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    except (TypeError, ValueError, KeyError, AttributeError, IndexError, ArithmeticError) as error:
-        names = ", ".join(run.name for run in found)
-        raise StoreError(f"report.json of one of {names} is damaged: {error}") from error
 
 
 def _left(name: str, runs: Path) -> LeftRun:

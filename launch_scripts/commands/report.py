@@ -24,7 +24,6 @@ def export_from(
     format: str,
     out: Path | None,
     force: bool,
-    gif: bool,
     mcap: bool,
 ) -> None:
     """Write files of a run. Raises ConfigError or StoreError in one sentence."""
@@ -34,18 +33,11 @@ def export_from(
         for each in given:
             if each not in allowed:
                 raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
-    if gif and mcap:
-        raise ConfigError("--gif and --mcap: found both, expected one of them")
     folder = find_run(run, runs)
     if mcap:
         from launch_scripts.report.foxglove.mcap_export import export_mcap
 
         print(export_mcap(folder, out, force))
-        return
-    if gif:
-        from launch_scripts.report.pictures.animation import export_gif
-
-        print(export_gif(folder, out, force))
         return
     for line in export_run(folder, what, format, out, force):
         print(line)

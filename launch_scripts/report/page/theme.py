@@ -31,10 +31,10 @@ _VARIABLES = {colour.lower(): variable for colour, variable in _THEMED.items()}
 _COLOUR = re.compile("|".join(_THEMED), re.IGNORECASE)
 
 
-def themed_svg(draw: Callable[[Axes], None], size_in: tuple[float, float] = (WIDTH_IN, HEIGHT_IN)) -> Markup:
+def themed_svg(draw: Callable[[Axes], None]) -> Markup:
     """What `draw` draws, as an SVG element. Its text is text; the page says in which font."""
     with mpl.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": "run"}):
-        figure = Figure(figsize=size_in)
+        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN))
         axes = figure.add_axes((0.125, 0.135, 0.775, 0.7))
         axes.set_facecolor("none")
         draw(axes)

@@ -78,19 +78,14 @@ def in_km(track: Track, grid: GridSpec) -> Points:
     return np.stack([track.xy_m[:, 0] - grid.west_m, grid.north_m - track.xy_m[:, 1]], axis=1) / 1000
 
 
-def mark_overlay(tracks: RunTracks, known: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """Marked cells, uint8 (rows, cols, 4); of a large grid blocks of cells in which any is marked.
-
-    known  which of the marks to draw; all by default
-    """
+def mark_overlay(tracks: RunTracks) -> NDArray[np.uint8]:
+    """Marked cells, uint8 (rows, cols, 4); of a large grid blocks of cells in which any is marked."""
     grid, marks = tracks.grid, tracks.marks
     side = max(1, math.ceil(math.sqrt(grid.cells / _MARK_PIXELS)))
     rows, cols = -(-grid.rows // side), -(-grid.cols // side)
     overlay = np.zeros((rows * cols, 4), np.uint8)
     row, col = np.divmod(marks.cells, grid.cols)
     blocks, lethal = row // side * cols + col // side, marks.kinds == MarkKind.LETHAL
-    if known is not None:
-        blocks, lethal = blocks[known], lethal[known]
     for some, colour, alpha in ((~lethal, MARKED_SLOW, 0.85), (lethal, MARKED_LETHAL, 0.95)):
         overlay[blocks[some]] = [round(255 * part) for part in to_rgba(colour, alpha)]
     return overlay.reshape(rows, cols, 4)

@@ -264,7 +264,6 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(
         ((run, "--what", "mark"), "--what: found 'mark'; did you mean 'marks'?"),
         ((run, "--out", run / TRACKS_FILE), "is a file; expected a folder"),
         ((tmp_path / "empty",), "has no tracks.npz: the run has not ended yet"),
-        ((run, "--gif"), "has no report.json"),
     ):
         assert swarm(monkeypatch, "export", *words) == 2
         told = capsys.readouterr().err
