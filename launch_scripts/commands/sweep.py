@@ -10,8 +10,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from launch_scripts.simulation.study.needs import check_installed
 from swarm.config.input_files import shown
@@ -110,18 +112,19 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
 
 
 def _print(summary: Summary, folder: Path) -> None:
-    from bench.tables import table
-
     from launch_scripts.simulation.study.page import between, number
     from launch_scripts.simulation.study.run import PAGE, RESULTS
 
     console = Console(highlight=False, markup=False, emoji=False)
     several = len({case.scenario for case in summary.cases}) > 1
     for name in summary.cases[0].outcomes:
-        shown = table(name, "<case", "n", "mean", "95 %", "to the first", "95 %")
+        table = Table(title=name, title_justify="left", box=box.SIMPLE_HEAD)
+        table.add_column("case", no_wrap=True)
+        for heading in ("n", "mean", "95 %", "to the first", "95 %"):
+            table.add_column(heading, justify="right", no_wrap=True)
         for case in summary.cases:
             outcome = case.outcomes[name]
-            shown.add_row(
+            table.add_row(
                 f"{case.scenario}: {case.label}" if several else case.label,
                 str(len(outcome.values)),
                 number(outcome.mean),
@@ -129,7 +132,7 @@ def _print(summary: Summary, folder: Path) -> None:
                 number(outcome.difference, "+"),
                 between(outcome.difference, "+"),
             )
-        console.print(shown)
+        console.print(table)
     for failure in summary.failing[:20]:
         console.print(f"failed: {failure.replay}", soft_wrap=True)
     missing = f"; {summary.missing:,} have no result" if summary.missing else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -13,7 +12,6 @@ from bench.planning import commands as planning
 from bench.scaling import commands as scaling
 from bench.show import progress_of, show
 from bench.whole_swarm import commands as whole_swarm
-from swarm.errors import ConfigError
 
 app = typer.Typer(
     name="bench",
@@ -43,32 +41,6 @@ def terrain(
     with progress_of("terrain") as progress:
         report = run(size, repeats, degrees=degrees, progress=progress)
     show(report, as_json)
-
-
-@app.command()
-def water(
-    dem: Annotated[Path | None, typer.Option(help="A height model of your own instead of the made ones.")] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(help="What its cells are, as `swarm terrain classify --out` writes it: 0 not known, 1 water."),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """How much water is taken for ground, and dry ground for water, where only heights are known.
-
-    \b
-    ./launch_scripts/bench water
-    ./launch_scripts/bench water --dem dem.tif --truth classes.tif
-
-    The made models have coasts, lakes, reservoirs, rivers and deltas as surveys
-    store them: levelled, rounded, warped, packed, and rough by a laser; and dry
-    ground that is as level. Columns "off shore" leave out cells at a shore.
-    """
-    from bench.water import run, run_on, tables
-
-    if (dem is None) != (truth is None):
-        raise ConfigError("--dem and --truth: found one of them, expected both or none")
-    show(run() if dem is None or truth is None else run_on(dem, truth), as_json, tables)
 
 
 @app.command()
@@ -205,75 +177,6 @@ def presence(
 
     with progress_of("presence") as progress:
         report = run(numbers_of(vehicles, "vehicles", 25), rounds, progress)
-    show(report, as_json)
-
-
-@app.command()
-def search(
-    scenario: Annotated[Path, typer.Argument(help="Its terrain, sensor range and speeds.")],
-    walks: Annotated[
-        str, typer.Option(help="How the target moves: waypoints, evade, random, still.")
-    ] = "waypoints",
-    strategies: Annotated[str, typer.Option(help="stay, random (within reach), belief.")] = "random,belief",
-    seeds: Annotated[str, typer.Option(help="First and behind the last, as 0:50.")] = "0:10",
-    vehicles: Annotated[int, typer.Option(min=1, help="How many search.")] = 10,
-    lost: Annotated[float, typer.Option(min=0, help="Seconds since the target was seen last.")] = 900.0,
-    hours: Annotated[float, typer.Option(min=0.01, help="Never seen is: not within so long.")] = 3.0,
-    near: Annotated[bool, typer.Option("--near", help="Vehicles start where it was seen last.")] = False,
-    join: Annotated[
-        list[Path] | None, typer.Option(help="Reports (--json) of other seeds to join instead.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Seconds until vehicles see a target again that nobody sees, by how they search.
-
-    \b
-    ./launch_scripts/bench search jacksboro.toml --walks waypoints,evade --seeds 0:50
-    ./launch_scripts/bench search jacksboro.toml --lost 30 --near
-
-    A loop without claims, messages or hidden ground; the search is the planner's.
-    Runs of many seeds may be split: write parts with --json, and join them.
-    """
-    import json
-
-    from bench.search_times import STRATEGIES, joined, run, tables
-    from launch_scripts.simulation.world.walks import WALKS
-    from swarm.config.load import load_scenario
-
-    if join:
-        show(joined([json.loads(path.read_text()) for path in join]), as_json, tables)
-        return
-    first, colon, behind = seeds.partition(":")
-    if not (colon and first.isdigit() and behind.isdigit() and int(first) < int(behind)):
-        raise ConfigError(f"--seeds is {seeds!r}, expected two numbers such as 0:50")
-    chosen = names_of(walks, "walks", tuple(WALKS)), names_of(strategies, "strategies", STRATEGIES)
-    span = range(int(first), int(behind))
-    with progress_of("search") as progress:
-        report = run(load_scenario(scenario), *chosen, span, vehicles, lost, hours, near, progress)
-    show(report, as_json, tables)
-
-
-@app.command()
-def sweep(
-    trials: Annotated[int, typer.Option(min=2, help="Simulations of the scenario `synthetic`, 10 s each.")] = 200,
-    processes: Annotated[int, typer.Option(min=2, help="Of the loop, and workers of the sweep.")] = 2,
-    rounds: Annotated[int, typer.Option(min=1, help="Loop and sweep, in turn.")] = 1,
-    as_json: AsJson = False,
-) -> None:
-    """What `swarm sweep` costs beside a plain loop over the same simulations in as many processes. Ten minutes.
-
-    \b
-    ./launch_scripts/bench sweep --trials 40
-
-    With the cluster's start and end, results on the disk and the summary. On a busy machine look at the CPU.
-    """
-    from launch_scripts.simulation.study.needs import check_installed
-
-    check_installed()
-    from bench.sweep_overhead import run
-
-    with progress_of("sweep") as progress:
-        report = run(trials, processes, rounds, progress)
     show(report, as_json)
 
 

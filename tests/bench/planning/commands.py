@@ -101,48 +101,6 @@ def paper(
 
 
 @app.command()
-def learning(
-    seeds: Annotated[str, typer.Option(help="Seeds A:B, B not among them.")] = "0:12",
-    agents: Annotated[int, typer.Option(min=1, max=10, help="Authors that ten vehicles report to.")] = 1,
-    right: Annotated[bool, typer.Option("--right", help="The prior is right: count false alarms.")] = False,
-    simulated: Annotated[
-        bool, typer.Option("--simulated", help="The scenario jacksboro, with and without learning.")
-    ] = False,
-    seconds: Annotated[float, typer.Option(min=1, help="--simulated: how long each run is.")] = 60.0,
-    as_json: AsJson = False,
-) -> None:
-    """What vehicles learn of a class whose prior pace is wrong by three: error of the map and regret of routes.
-
-    \b
-    ./launch_scripts/bench learning
-    ./launch_scripts/bench learning --right --seeds 0:50
-    ./launch_scripts/bench learning --simulated --seeds 7:11
-
-    --simulated runs the scenario jacksboro, where grass is three times as slow as its
-    prior says: captures, and how far vehicles came. Two runs of some 40 s of CPU a seed.
-    """
-    if simulated:
-        from bench.learning_runs import run as run_jacksboro
-        from bench.learning_runs import tables as tables_of_jacksboro
-        from launch_scripts.simulation.campaign import parse_seeds
-
-        with progress_of("learning") as progress:
-            report = run_jacksboro(parse_seeds(seeds), seconds, progress)
-        show(report, as_json, tables_of_jacksboro)
-        return
-    from bench.planning.learning import run_learning, tables
-    from launch_scripts.simulation.campaign import parse_seeds
-    from shared_map.terrain.terrain import build_terrain
-    from swarm.config.ground import TerrainConfig
-    from swarm.config.scenario import Scenario
-
-    terrain = build_terrain(Scenario(terrain=TerrainConfig(source="jacksboro")))
-    with progress_of("learning") as progress:
-        report = run_learning(terrain, list(parse_seeds(seeds)), agents, not right, progress)
-    show(report, as_json, tables)
-
-
-@app.command()
 def scale(
     sizes: Annotated[
         str | None,

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bench.options import AsJson, Picture, Seed, check_picture, names_of, numbers_of
+from bench.options import AsJson, names_of, numbers_of
 from bench.show import progress_of, show
 from swarm.errors import ConfigError
 
@@ -105,55 +105,6 @@ def swarm(
 
 
 @app.command()
-def assignment(
-    seeds: Annotated[str, typer.Option(metavar="A:B", help="The seeds A to B - 1.")] = "0:20",
-    rows: Annotated[str, typer.Option(help="Which of the five chases, several with commas.")] = "1,2,3,4,5",
-    per_agent: Annotated[int, typer.Option(min=1, max=1000, help="Vehicles that an agent hosts.")] = 25,
-    alone: Annotated[bool, typer.Option("--alone", help="And each target as if it were alone.")] = False,
-    simulated: Annotated[
-        bool, typer.Option("--simulated", help="The scenario `clustered` instead, as `swarm simulate` runs it.")
-    ] = False,
-    picture: Picture = None,
-    as_json: AsJson = False,
-) -> None:
-    """How soon targets are captured, by each rule that says which vehicle chases which. Some six minutes.
-
-    \b
-    ./launch_scripts/bench assignment
-    ./launch_scripts/bench assignment --rows 1,3 --seeds 0:5 --picture sharing.png
-    ./launch_scripts/bench assignment --simulated --seeds 7:8
-
-    Chases on the demo's terrain in cells of 150 m, without messages and traffic: 20 vehicles that start
-    clustered after 5 targets, 100 after 10, 20 after 5 that evade and of which each needs 3; and the first two from
-    starts all over the map. A target that is captured is gone. Every rule meets the same starts and targets. With
-    --alone also how soon all vehicles together would capture each target if it were the only one: near what any
-    rule can reach. The picture is of the first chase, of the first seed.
-    """
-    from bench.assignment import ROWS, World, run, run_simulated, tables
-    from launch_scripts.simulation.campaign import parse_seeds
-
-    some = parse_seeds(seeds)
-    numbers = numbers_of(rows, "rows")
-    if max(numbers) > len(ROWS):
-        raise ConfigError(f"--rows is {rows!r}, expected numbers of 1 to {len(ROWS)}")
-    check_picture(picture)
-    chosen = [ROWS[n - 1] for n in numbers]
-    if simulated:
-        with progress_of("assignment") as progress:
-            report = run_simulated(some, progress)
-        show(report, as_json)
-        return
-    world = World(per_agent)
-    if picture is not None:
-        from bench.assignment_picture import save_chases
-
-        save_chases(world, chosen[0], some.start, picture)
-    with progress_of("assignment") as progress:
-        report = run(world, chosen, some, alone, progress)
-    show(report, as_json, tables)
-
-
-@app.command()
 def crowd(
     worlds: Annotated[str, typer.Option(help="open, doors, corridor, maze; several with commas.")] = (
         "open,doors,corridor,maze"
@@ -230,34 +181,3 @@ def ending_in_order() -> Iterator[None]:
 def _exit_if(failed: bool) -> None:
     if failed:
         raise typer.Exit(1)
-
-
-@app.command()
-def view(
-    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, several with commas.")] = "100,1000",
-    targets: Annotated[int, typer.Option(min=1, max=200, help="Targets.")] = 10,
-    groups: Annotated[int, typer.Option(min=1, max=20, help="Groups of vehicles.")] = 1,
-    seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to draw, after the first frames.")] = 20,
-    seed: Seed = 5,
-    out: Annotated[Path | None, typer.Option(help="Keep the recording here (.rrd), to look at it.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """The live view: CPU time of a frame and size of a recording, by number of vehicles.
-
-    \b
-    ./launch_scripts/bench view --vehicles 1000 --json
-    ./launch_scripts/bench view --vehicles 1000 --groups 3 --out view.rrd      then: rerun view.rrd
-
-    Made-up vehicles drive along real routes and say so ten times a second; the monitor's own service draws them to
-    a file. No network and no viewer is part of it.
-    """
-    from bench.view import run_view, tables
-
-    counts = numbers_of(vehicles, "vehicles")
-    if out is not None and (out.suffix != ".rrd" or len(counts) > 1 or not out.absolute().parent.is_dir()):
-        raise ConfigError(
-            f"--out {out}: expected a name that ends in .rrd, in a folder that is there, and one number"
-        )
-    with progress_of("view") as progress:
-        report = run_view(counts, targets, groups, seconds, seed, out, progress)
-    show(report, as_json, tables)

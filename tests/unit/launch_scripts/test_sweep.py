@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from bench.learning_runs import wrong_prior
 from hypothesis import given
 from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
@@ -198,12 +197,6 @@ def test_each_study_of_the_project_can_be_read_and_its_trials_run(name):
         assert not result.broken or study.faults  # the quiet at the end of so short a run may be too short
         told = [outcome for outcome in study.outcomes if outcome in result.figures]
         assert told == list(study.outcomes), f"{name}: the report has {sorted(result.figures)}"
-
-
-def test_the_study_of_learning_is_that_of_the_benchmark():
-    path = study_path("learning")
-    found = {each.case.variant: each.scenario for each in plan(load_study(path), path.parent, "x")}
-    assert found == {"without": wrong_prior(False), "learning": wrong_prior(True)}
 
 
 def test_a_study_is_found_by_its_name_and_a_name_that_is_none_is_told_with_the_nearest(tmp_path):

@@ -6,19 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench.water import counted, run_on
-from bench.water_models import MODELS, UNKNOWABLE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from support.height_models import SIDE, hills, is_water, load, written
+from support.water_models import MODELS, UNKNOWABLE, counted
 
 from shared_map.importers.grids.plain_files import read_npz
 from shared_map.importers.sources import _jacksboro_path
 from shared_map.importers.water import level_ground as module
 from shared_map.importers.water.level_ground import level_ground
 from shared_map.importers.water.voids import undeclared_voids
-from swarm.errors import TerrainError
 
 # --- level ground -------------------------------------------------------------------------------------------
 
@@ -97,7 +95,7 @@ def test_water_of_every_kind_of_model_is_found_and_dry_ground_is_left(name: str)
         assert shares["taken"] > 0.2
         return
     assert shares["taken"] <= 0.003
-    # What is missed where water is rough are ponds; `./launch_scripts/bench water` has the figures.
+    # What is missed where water is rough are ponds.
     rough = "laser" in name or "packed" in name or "filter" in name
     assert (shares["missed"] or 0) <= (0.1 if rough else 0.002)
 
@@ -125,23 +123,6 @@ def test_the_arms_of_norris_lake_are_water() -> None:
     found = level_ground(heights).mask
     assert found[120:280, 270:][lake].mean() > 0.97
     assert found.sum() < 1.1 * lake.sum()
-
-
-def test_a_model_of_ones_own_is_counted_on_the_cells_whose_truth_is_known(tmp_path: Path) -> None:
-    ground = np.maximum(hills(8, 900) - 300, 0)
-    dem = written(tmp_path / "coast.tif", ground)
-    truth = np.where(ground == 0, 1, 4)
-    truth[:, :50] = 0
-    (row,) = run_on(dem, written(tmp_path / "truth.tif", truth, "uint8"))["models"]
-    assert row["water_cells"] + row["dry_cells"] == SIDE * 150
-    assert row["missed"] < 0.01
-    assert row["taken"] == 0
-    wrong = np.where(truth == 1, 4, truth)
-    (row,) = run_on(dem, written(tmp_path / "wrong.tif", wrong, "uint8"))["models"]
-    assert row["missed"] is None
-    assert row["taken"] > 0.1
-    with pytest.raises(TerrainError, match="has 10 x 10 cells, the terrain 200 x 200"):
-        run_on(dem, written(tmp_path / "small.tif", truth[:10, :10], "uint8"))
 
 
 # --- undeclared voids ---------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -194,3 +195,17 @@ MODELS: Mapping[str, Callable[[], WaterModel]] = {
 """A model of each kind by name, in the order of the table."""
 UNKNOWABLE = ("dry: salt lake",)
 """Models that no look at heights can tell from their opposite."""
+
+
+def counted(water: Bools, dry: Bools, found: Bools) -> dict[str, Any]:
+    """Shares of labelled cells taken for the other kind; and the same without the cells next to a shore."""
+    shore = ndimage.binary_dilation(water, _AROUND) & ndimage.binary_dilation(dry, _AROUND)
+    shares: dict[str, Any] = {"water_cells": int(water.sum()), "dry_cells": int(dry.sum())}
+    for name, cells, wrong in (("missed", water, ~found), ("taken", dry, found)):
+        shares[name] = _share(int((cells & wrong).sum()), int(cells.sum()))
+        shares[f"{name}_off_shore"] = _share(int((cells & wrong & ~shore).sum()), int((cells & ~shore).sum()))
+    return shares
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 5) if whole else None
