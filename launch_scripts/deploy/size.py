@@ -1,0 +1,234 @@
+"""How many machines a swarm needs, from a table of measured swarms (`measured_runs.toml`). Pure.
+
+Each figure of one process, such as the CPU of a planner, is interpolated between the measured runs: linear radial
+functions over the logarithms of vehicles, targets, agents, side of the map and tick rate (scipy's RBFInterpolator).
+They meet every measured run, and go on as a power law beyond the largest. A measured run that is left out of the
+table is foretold to within 7 to 17 % at the median, by figure.
+
+Agents and planners are placed in equal blocks; keeper, targets and monitor run on the first machine, whose launcher
+records. Every router is linked with every other one. A message crosses once to each machine on which somebody takes
+it, so what enters a machine is at most what its processes take, and at most what all others send.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+
+from launch_scripts.process_table import LAUNCHER, ROLES
+from swarm.errors import ConfigError
+
+USED_SHARE = 0.6
+"""Of the cores and the memory of a machine, and of one core by a process: beyond it work waits (decision 58)."""
+LINK_SHARE = 0.5
+"""Of a link's capacity."""
+OVERHEAD_BYTES = 100
+"""Of a message on a link: key, Zenoh's and TCP/IP's headers. Assumed, not measured."""
+MOST_MACHINES = 2000
+MOST_SESSIONS = 8192
+"""`transport/unicast/max_sessions` of a router (swarm/bus/zenoh_config.py)."""
+CELLS_PER_VEHICLE = 262.144
+"""As the scenario `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
+
+_SINGLE = ("targets", "keeper", "monitor")
+"""Roles of one process, all on the first machine."""
+_SPREAD = ("agent", "planner")
+"""Roles whose processes are shared out over all machines."""
+_SMOOTHING = 0.1
+"""Of the interpolation: two runs of nearly one size differ by what else the machine did."""
+_RUNS = Path(__file__).with_name("measured_runs.toml")
+
+
+class Swarm(msgspec.Struct, frozen=True, kw_only=True):
+    """The size of a swarm; `side` is that of its square map in cells, `tick_hz` that of agents and planners."""
+
+    vehicles: int
+    targets: int
+    agents: int
+    side: int
+    tick_hz: float
+
+
+class Measured(Swarm, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One run of the table: role -> what all its processes together took, as the head of the file says."""
+
+    cpu_ms_per_s: dict[str, float]
+    memory_mb: dict[str, float]
+    messages_in: dict[str, float]
+    messages_out: dict[str, float]
+    bytes_in: dict[str, float]
+    bytes_out: dict[str, float]
+
+
+class Machine(msgspec.Struct, frozen=True):
+    """A kind of machine."""
+
+    cores: int
+    memory_gb: float
+    link_mbit_per_s: float
+
+
+class Needs(msgspec.Struct, frozen=True, kw_only=True):
+    """What a swarm takes on so many machines.
+
+    cpu_cores        role -> cores of all its processes, all machines together
+    process          role -> share of a core that one process takes; of launchers the one that records
+    machine_cores    cores that work on each machine
+    first_cores      on the first
+    memory_gb, first_memory_gb  of each machine, of the first
+    crossings_per_s  messages from one machine to another, at most
+    link_mbit_per_s, first_link_mbit_per_s  into each machine, and as much out of it; into the first
+    link_out_mbit_per_s  out of each machine where a router of the region passes on: each message leaves once
+    sessions         of a machine's router
+    """
+
+    size: Swarm
+    machines: int
+    cpu_cores: dict[str, float]
+    process: dict[str, float]
+    machine_cores: float
+    first_cores: float
+    memory_gb: float
+    first_memory_gb: float
+    crossings_per_s: float
+    link_mbit_per_s: float
+    link_out_mbit_per_s: float
+    first_link_mbit_per_s: float
+    sessions: int
+
+
+class MeasuredTable:
+    """The measured runs, and what lies between them."""
+
+    def __init__(self, runs: Sequence[Measured]) -> None:
+        self._runs = runs
+
+    @cached_property
+    def _places(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        return np.array([_place(run) for run in self._runs])
+
+    def process(self, figure: str, role: str, swarm: Swarm) -> float:
+        """A figure of one process of a role, in a swarm of this size."""
+        taken = [getattr(run, figure)[role] / _count(run, role) for run in self._runs]
+        between = RBFInterpolator(self._places, np.log(taken), kernel="linear", degree=1, smoothing=_SMOOTHING)
+        return float(np.exp(between([_place(swarm)])[0]))
+
+    def reaches(self, swarm: Swarm) -> bool:
+        """Whether no side of a swarm is larger than in all measured runs."""
+        return all(
+            getattr(swarm, name) <= max(getattr(run, name) for run in self._runs)
+            for name in ("vehicles", "targets", "agents", "side")
+        )
+
+
+def measured_table() -> MeasuredTable:
+    return MeasuredTable(msgspec.convert(tomllib.loads(_RUNS.read_text())["runs"], list[Measured]))
+
+
+class Estimate:
+    """What the processes of one swarm take, asked of the table once for any number of machines."""
+
+    def __init__(self, table: MeasuredTable, swarm: Swarm, standbys: int = 0) -> None:
+        self._swarm = swarm
+        self._count = dict.fromkeys((*ROLES, LAUNCHER), 1)
+        self._count |= {"agent": swarm.agents, "planner": swarm.targets * (1 + standbys)}
+        self._cpu = {role: table.process("cpu_ms_per_s", role, swarm) / 1000 for role in self._count}
+        self._memory_gb = {role: table.process("memory_mb", role, swarm) / 1000 for role in self._count}
+        speaking = (*_SPREAD, *_SINGLE)
+        self._messages_in, self._messages_out, self._bytes_in, self._bytes_out = (
+            {role: table.process(figure, role, swarm) for role in speaking}
+            for figure in ("messages_in", "messages_out", "bytes_in", "bytes_out")
+        )
+
+    def on(self, machines: int) -> Needs:
+        """What the swarm needs on so many machines."""
+        spread, count = 1 / machines, self._count
+        cores = {role: self._cpu[role] * count[role] for role in count}
+        shared = spread * (sum(cores[role] for role in _SPREAD) + cores["router"])
+        # A process takes one core at most, and falls behind.
+        single = sum(min(self._cpu[role], 1.0) for role in (*_SINGLE, LAUNCHER))
+        both = self._memory_gb[LAUNCHER] + self._memory_gb["router"]
+        memory = both + spread * sum(self._memory_gb[role] * count[role] for role in _SPREAD)
+        messages, first_messages = self._enters(self._messages_in, self._messages_out, machines)
+        size, first_size = self._enters(self._bytes_in, self._bytes_out, machines)
+        leaves, said = (self._sum(sent, self._count) for sent in (self._bytes_out, self._messages_out))
+        return Needs(
+            size=self._swarm,
+            machines=machines,
+            cpu_cores=cores,
+            process={role: share * spread if role == "router" else share for role, share in self._cpu.items()},
+            machine_cores=shared + (self._cpu[LAUNCHER] if machines == 1 else 0.0),
+            first_cores=shared + single,
+            memory_gb=memory,
+            first_memory_gb=memory + sum(self._memory_gb[role] for role in _SINGLE),
+            crossings_per_s=messages * (machines - 1) + first_messages,
+            link_mbit_per_s=_mbit(size, messages),
+            first_link_mbit_per_s=_mbit(first_size, first_messages),
+            link_out_mbit_per_s=min(_mbit(leaves, said) * spread, _mbit(size, messages)),
+            sessions=math.ceil((count["agent"] + count["planner"]) * spread) + len(_SINGLE) + machines,
+        )
+
+    def _enters(self, taken: Mapping[str, float], sent: Mapping[str, float], machines: int) -> tuple[float, float]:
+        """What enters each machine a second from all others, and the first."""
+        elsewhere = 1 - 1 / machines
+        here = self._sum(taken, {role: self._count[role] / machines for role in _SPREAD})
+        most = self._sum(sent, self._count) * elsewhere
+        # The launcher that records hears what the monitor hears.
+        first = here + sum(taken[role] for role in (*_SINGLE, "monitor"))
+        return min(here * elsewhere, most), min(first * elsewhere, most)
+
+    @staticmethod
+    def _sum(figure: Mapping[str, float], count: Mapping[str, float]) -> float:
+        return sum(each * count.get(role, 0.0) for role, each in figure.items())
+
+
+def fewest_machines(estimate: Estimate, machine: Machine) -> Needs:
+    """The fewest machines of a kind that carry a swarm. Raises ConfigError if none do; it says what is full."""
+    machines = 1
+    while machines <= MOST_MACHINES:
+        found = estimate.on(machines)
+        full = [each for each in too_much(found, machine) if not each.startswith("one ")]
+        if not full:
+            return found
+        machines += max(1, machines // 50)
+    raise ConfigError(f"no number of machines up to {MOST_MACHINES} carries this swarm: {'; '.join(full)}")
+
+
+def too_much(found: Needs, machine: Machine) -> list[str]:
+    """What is fuller than it may be, in sentences. No further machine mends those that begin with "one"."""
+    said = [
+        f"one {role} process takes {share:.2f} of a core"
+        for role, share in sorted(found.process.items(), key=lambda each: -each[1])
+        if share > USED_SHARE and role != "router"
+    ]
+    limits = (
+        ("cores", found.first_cores, USED_SHARE, machine.cores, ""),
+        ("memory", found.first_memory_gb, USED_SHARE, machine.memory_gb, " GB"),
+        ("link", found.first_link_mbit_per_s, LINK_SHARE, machine.link_mbit_per_s, " Mbit/s"),
+        ("sessions of a router", found.sessions, 1.0, MOST_SESSIONS, ""),
+    )
+    return said + [
+        f"{what}: {taken:,.1f} of {there:,g}{unit}"
+        for what, taken, share, there, unit in limits
+        if taken > share * there
+    ]
+
+
+def _count(swarm: Swarm, role: str) -> int:
+    return {"agent": swarm.agents, "planner": swarm.targets}.get(role, 1)
+
+
+def _place(swarm: Swarm) -> list[float]:
+    """Where a swarm lies among others: the logarithms of its size."""
+    return [math.log(getattr(swarm, name)) for name in Swarm.__struct_fields__]
+
+
+def _mbit(bytes_per_s: float, messages_per_s: float) -> float:
+    return 8e-6 * (bytes_per_s + OVERHEAD_BYTES * messages_per_s)
