@@ -1,7 +1,7 @@
 """Order of the tests: those of the network last; `--network` leaves these out, or all others. `--seeds` lets tests
 that replay seeded histories run others; `--thorough` adds those of which the others show enough for each commit.
-Properties are tried with the same examples in every run, so that a gate answers the same twice; `--random` looks for
-new ones."""
+Properties are tried with the same examples in every run, so that a gate answers the same twice; `--random` looks
+for new ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs a command, and ends whatever it leaves behind: `python contained.py COMMAND...`, with the command's exit code.
+"""Runs a command, and ends whatever it leaves behind: `python contained.py COMMAND...`. It has the command's code.
 
 Live tests start launchers in sessions of their own, which a Ctrl-C does not reach, and pytest's workers are ended
 before their fixtures clean up. Orphans become children of this process, which asks them to stop and then ends them.
