@@ -28,7 +28,7 @@ from launch_scripts.commands.shared_options import (
     spread,
 )
 from swarm.errors import ConfigError
-from swarm.ranks import HIGHEST_RANK
+from swarm.liveness import HIGHEST_RANK
 
 
 def _began_s() -> float:

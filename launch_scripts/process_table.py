@@ -10,7 +10,7 @@ import msgspec
 
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario, ids_of
-from swarm.ranks import ranked_id
+from swarm.liveness import ranked_id
 
 Restart = Literal["always", "never"]
 

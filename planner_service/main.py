@@ -17,7 +17,7 @@ from shared_map.terrain.prepared import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
-from swarm.ranks import job_of
+from swarm.liveness import job_of
 from swarm.recording.recording import recorded
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase

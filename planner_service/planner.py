@@ -35,8 +35,8 @@ from swarm.wire.messages.planning import (
     PushedRoute,
     RouteReply,
     RouteRequest,
+    TargetPose,
 )
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 

@@ -33,15 +33,22 @@ from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.config.classes import GROUND, class_numbers
+from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
-from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import Believed, CostRequest, PlannerStatus, PushedRoute, RouteRequest
-from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.planning import (
+    Believed,
+    CostRequest,
+    PlannerStatus,
+    PushedRoute,
+    RouteRequest,
+    Sighted,
+    TargetPose,
+)
 from swarm.wire.messages.vehicles import Chasers, Fleet
 from swarm.wire.topics import BELIEVED, CHASERS, COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 

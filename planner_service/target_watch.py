@@ -9,7 +9,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.runtime.tracking import Tracking, Verdict
-from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 COUNTS = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off", "trackers_lost")
 FASTEST_M_PER_S = 100.0

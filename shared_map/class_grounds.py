@@ -17,7 +17,7 @@ from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.classes import GROUND, ClassConfig, class_named, driven_classes
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
-from swarm.wire.statements import PACE_LEAST
+from swarm.wire.messages.map_data import PACE_LEAST
 
 
 @dataclass(frozen=True, eq=False)

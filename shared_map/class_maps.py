@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from shared_map.arrays import Floats
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import Terrain
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSet
 
 
 def read_by(own_prior: Floats, prior: Floats, paces: Floats, least: float = PACE_LEAST) -> Floats:

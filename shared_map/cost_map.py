@@ -21,8 +21,7 @@ from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import PACE_MOST, MarkKind
+from swarm.wire.messages.map_data import PACE_MOST, MarkKind, MarkSet
 
 MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""

@@ -16,7 +16,7 @@ from shared_map.replication.filter import MarkFilter
 from swarm.clock import NS_PER_S
 from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.fields import LONGEST_LEASE_S
-from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.planning import Sighted, TargetPose
 
 LONGEST_NS = 120 * NS_PER_S
 _MOST = 10_000

@@ -17,8 +17,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
-from swarm.wire.messages.planning import PushedRoute, RouteReply
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
-from swarm.wire.messages.bodies import MOST_M_PER_S, MOST_RADIUS_M, Body
+from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body
 from vehicle_agent.discs import Capsule
 
 REACTION_S = 0.5

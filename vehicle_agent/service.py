@@ -22,20 +22,24 @@ from swarm.config.agents import AgentPlan, plan_agents
 from swarm.config.classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.config.plugin_names import assignment_key
 from swarm.errors import ConfigError
-from swarm.liveness import Roster
+from swarm.liveness import Roster, job_of
 from swarm.plugins.find import named_plugin
-from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column, pack_column
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
-from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Followed, SharedCosts, VehicleState
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+    Sighted,
+    TargetPose,
+)
+from swarm.wire.messages.vehicles import Body, Followed, Removed, RemoveVehicles, SharedCosts, VehicleState
 from swarm.wire.routes import directions_of
 from swarm.wire.topics import (
     BODY,

@@ -15,8 +15,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, ids_of
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import TargetPose
+from swarm.wire.messages.vehicles import Body
 
 _LEASE_S = 2.0
 _LONGEST_NS = NS_PER_S

@@ -12,7 +12,7 @@ from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
 from swarm.clock import NS_PER_S
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 from vehicle_agent.agent_maps import AgentMaps
 from vehicle_agent.sensing.sensor import Findings
 

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from docs.generate.wire_page import default_text, messages, parts, type_text
-from swarm.wire.messages.base import WIRE_VERSION, Message
+from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.topics import ALIVE_KEY, TOPICS
 from swarm.wire.versions import are_neighbours, name_and_version, read_schemas, written_schema
 

@@ -19,7 +19,7 @@ from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is_help=True)
 

@@ -20,7 +20,7 @@ from launch_scripts.commands.shared_options import (
     Tls,
     spread,
 )
-from swarm.ranks import ranked_id
+from swarm.liveness import ranked_id
 
 if TYPE_CHECKING:
     from swarm.runtime.health import Health

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import typer
 
 from launch_scripts.command_line import complete, panels
-from swarm.ranks import HIGHEST_RANK
+from swarm.liveness import HIGHEST_RANK
 
 if TYPE_CHECKING:
     from swarm.config.scenario import TlsConfig

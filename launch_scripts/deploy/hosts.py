@@ -17,7 +17,7 @@ from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import check_endpoint, is_loopback
 from swarm.config.values import Section
 from swarm.errors import ConfigError
-from swarm.ranks import HIGHEST_RANK
+from swarm.liveness import HIGHEST_RANK
 
 HostName = Annotated[
     str,

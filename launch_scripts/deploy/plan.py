@@ -20,7 +20,7 @@ from launch_scripts.process_table import (
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
-from swarm.ranks import job_of
+from swarm.liveness import job_of
 
 _CORES = {"keeper": 0.04, "monitor": 0.17, "targets": 0.09}
 """Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, in docs/scale-figures.md."""

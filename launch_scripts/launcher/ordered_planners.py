@@ -11,8 +11,8 @@ from launch_scripts.launcher.local_swarm import LocalSwarm
 from launch_scripts.process_table import ProcessSpec, planner_spec
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
-from swarm.order_book import OrderBook
-from swarm.ranks import job_of, ranked_id
+from swarm.liveness import job_of, ranked_id
+from swarm.runtime.order_book import OrderBook
 
 log = logging.getLogger(__name__)
 

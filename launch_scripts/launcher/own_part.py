@@ -18,9 +18,8 @@ from launch_scripts.observe.process_load import ProcessLoad, ProcessLoads, by_ro
 from launch_scripts.observe.run_model import RunModel
 from launch_scripts.process_table import ROLES, ProcessSpec
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
-from swarm.ranks import job_of
-from swarm.wire.messages.base import Message
+from swarm.liveness import Peer, job_of
+from swarm.wire.messages import Message
 from swarm.wire.messages.processes import Stats
 
 _NOT_NEEDED = ("router", "monitor")

@@ -23,7 +23,7 @@ from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
-from swarm.wire.messages.base import WIRE_VERSION
+from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from pathlib import Path
 from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.run_processes import has_ended, processes, writing
 from swarm.errors import ConfigError
-from swarm.ranks import job_of
+from swarm.liveness import job_of
 from swarm.runtime.health import LIFE_BEFORE
 
 log = logging.getLogger(__name__)

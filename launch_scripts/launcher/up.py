@@ -46,10 +46,10 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
-from swarm.order_book import OrderBook
+from swarm.liveness import job_of
 from swarm.plugins.find import check_plugins
-from swarm.ranks import job_of
 from swarm.runtime.membership import check_belongs
+from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)

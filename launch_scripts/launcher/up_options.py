@@ -16,7 +16,7 @@ from launch_scripts.web.loopback_guard import LOOPBACK
 from swarm.config.explain import choice
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
-from swarm.ranks import split_rank
+from swarm.liveness import split_rank
 from swarm.wire.fields import check_id
 from swarm.wire.messages.processes import RunInfo
 

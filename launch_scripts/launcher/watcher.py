@@ -15,7 +15,7 @@ from swarm.clock import Clock
 from swarm.errors import RunMismatchError
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.vehicles import Followed

@@ -36,7 +36,7 @@ from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED, Counters
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet

@@ -17,7 +17,7 @@ from launch_scripts.observe.tracked_targets import TrackedTargets
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.ranks import job_of
+from swarm.liveness import job_of
 from swarm.wire.messages.processes import Alarm as Told
 
 SILENT_NS = 4 * NS_PER_S

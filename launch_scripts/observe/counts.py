@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from swarm.ranks import job_of
+from swarm.liveness import job_of
 from swarm.runtime.stats import Histogram, merged
 from swarm.wire.messages.processes import Stats
 

@@ -16,17 +16,14 @@ from launch_scripts.observe.vehicle_columns import VehicleColumns, gathered
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.liveness import Peer
-from swarm.ranks import HIGHEST_RANK, ranked_id, split_rank
+from swarm.liveness import HIGHEST_RANK, Peer, ranked_id, split_rank
 from swarm.runtime.stats import ENDED
 from swarm.wire.fields import column
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Beat, Stats
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.statements import MarkKind
 
 _VEHICLES_LAST_NS = 3 * NS_PER_S
 """Vehicles of whoever raises no liveliness token are there for so long after the last word."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from swarm.config.agents import crew_of
 from swarm.config.scenario import Scenario
-from swarm.order_book import OrderBook
-from swarm.ranks import split_rank
+from swarm.liveness import split_rank
+from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.processes import RunInfo
 
 

@@ -30,7 +30,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import Histogram
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.vehicles import Followed, VehicleState

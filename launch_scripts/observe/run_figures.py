@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 
 _SAMPLE_NS = NS_PER_S
 _SHOWN_NS = 5 * NS_PER_S // 4

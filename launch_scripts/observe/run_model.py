@@ -8,10 +8,10 @@ from launch_scripts.observe.state import RunState, state_of
 from launch_scripts.observe.tracked_targets import TrackedTargets
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.order_book import OrderBook
-from swarm.wire.messages.base import Message
+from swarm.runtime.order_book import OrderBook
+from swarm.wire.messages import Message
 from swarm.wire.messages.orders import Orders
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.topics import FLEET, LEAD, ORDERS, POSE, STATS, STATUS, Topic
 

@@ -18,7 +18,7 @@ from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND
 from swarm.grid import GridSpec
-from swarm.order_book import OrderBook
+from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 from swarm.wire.messages.vehicles import VehicleState
 

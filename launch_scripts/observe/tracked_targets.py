@@ -9,8 +9,7 @@ from launch_scripts.observe.latest_state import Observed
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.tracking import Trackings
-from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import PlannerStatus, TargetPose
 
 ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
 """What planners count of poses that do not count, or look wrong."""

@@ -16,7 +16,7 @@ from launch_scripts.simulation.world.service import TargetsService
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode
-from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.vehicles import Body
 from swarm.wire.topics import BODY
 from vehicle_agent.service import AgentService
 

@@ -16,7 +16,7 @@ from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Event, Heard
 from swarm.config.agents import plan_agents
 from swarm.config.classes import flies
-from swarm.wire.messages.marks import DIGEST_ROW, Digest
+from swarm.wire.messages.map_data import DIGEST_ROW, Digest
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.topics import DIGEST
 from vehicle_agent.placement import spawn_cells

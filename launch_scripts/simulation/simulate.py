@@ -28,11 +28,11 @@ from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
-from swarm.order_book import OrderBook
-from swarm.ranks import ranked_id
+from swarm.liveness import ranked_id
 from swarm.runtime.garbage import collected_rarely
-from swarm.wire.authentication import Authenticator
-from swarm.wire.messages.base import Message
+from swarm.runtime.order_book import OrderBook
+from swarm.wire.access import Authenticator
+from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, ZONES
 

@@ -9,7 +9,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Re
 from swarm.clock import NS_PER_S
 from swarm.liveness import Roster
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo, Stats
 from swarm.wire.topics import RUN, STATS, STATUS

@@ -18,8 +18,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.classes import least_sense_range_m
 from swarm.config.scenario import Scenario, ids_of
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.planning import MOST_BELIEVED, Believed
-from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.planning import MOST_BELIEVED, Believed, Sighted, TargetPose
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S

@@ -20,7 +20,7 @@ from shared_map.terrain.terrain import Terrain, finished
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
-from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap, BaseMapTile
+from swarm.wire.messages.map_data import BASE_DIGEST_BYTES, BaseMap, BaseMapTile
 
 _LEVEL = 1  # a third smaller than the raw bytes as with level 6, in half the time
 

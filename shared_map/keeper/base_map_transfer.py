@@ -14,8 +14,8 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
-from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages import Nothing
+from swarm.wire.messages.map_data import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.topics import BASE_MAP, BASE_TILES
 
 log = logging.getLogger(__name__)

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import Statements, base_seq, mark_set, next_expiry_ns, statements, taken
-from swarm.wire.messages.marks import DIGEST_ROW, SEQ_STEP, MarkSet
-from swarm.wire.statements import FOREVER, TILE_AREA, MarkKind
+from swarm.wire.messages.map_data import DIGEST_ROW, FOREVER, SEQ_STEP, TILE_AREA, MarkKind, MarkSet
 
 
 class CompactionPlan:

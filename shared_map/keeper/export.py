@@ -18,8 +18,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile, grid_cells, tile_cells, tile_corners
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 
 FORMAT = "swarm-map/1"
 NOTHING_SAID_BAND = 255

@@ -13,9 +13,9 @@ from swarm.config.agents import agent_of, plan_agents
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, StoreError
 from swarm.liveness import Peer
-from swarm.order_book import OrderBook, judged
 from swarm.places import cell_of
-from swarm.wire.messages.base import Nothing
+from swarm.runtime.order_book import OrderBook, judged
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Order, Orders
 from swarm.wire.topics import GIVE_ORDER, ORDERS
 

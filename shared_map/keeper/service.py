@@ -23,13 +23,13 @@ from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.config.classes import class_numbers
 from swarm.errors import StoreError
-from swarm.order_book import described
 from swarm.runtime.membership import Member
+from swarm.runtime.order_book import described
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.orders import Order, ZoneOrder, Zones
+from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.targets import Sighted
 from swarm.wire.topics import SIGHTED, STATS, ZONES
 
 log = logging.getLogger(__name__)

@@ -24,9 +24,9 @@ from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
 from swarm.recording.outside import Outside
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.marks import SEQ_STEP, MarkSet
+from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order
-from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.planning import Sighted
 
 log = logging.getLogger(__name__)
 

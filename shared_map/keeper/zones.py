@@ -34,9 +34,8 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.places import corners_of
 from swarm.wire.fields import column
-from swarm.wire.messages.marks import DIGEST_ROW, SEQ_STEP, MarkSet
+from swarm.wire.messages.map_data import DIGEST_ROW, FOREVER, SEQ_STEP, STAMP_LIMIT_NS, MarkKind, MarkSet
 from swarm.wire.messages.orders import MOST_ZONES, Corners, Zone, ZoneOrder
-from swarm.wire.statements import FOREVER, STAMP_LIMIT_NS, MarkKind
 
 MOST_CELLS = 1 << 17
 """Of one zone: what every replica takes in at once, within the quota of one author."""

@@ -20,7 +20,7 @@ from shared_map.arrays import Bytes, Floats
 from shared_map.learning.middle import Middle, rounded
 from shared_map.learning.words import KEYS, MOST, MOST_CELLS, ONE, Said
 from shared_map.terrain.layers import TerrainClass, slope_deg
-from swarm.wire.messages.marks import owner_of
+from swarm.wire.messages.map_data import owner_of
 
 SLOPE_BINS = 6
 """0-5, 5-10 ... 20-25 degrees, and all that is steeper."""

@@ -10,7 +10,7 @@ from shared_map.arrays import Floats
 from shared_map.learning.factors import SLOPE_BINS, by_process, estimate, factors_of, name_of
 from shared_map.learning.words import ONE, Said, told
 from shared_map.terrain.layers import TerrainClass
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 
 class LearnedKind(NamedTuple):

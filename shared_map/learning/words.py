@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.wire.fields import column
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 KEYS = 256
 """More kinds of ground than any terrain has; their number is a byte."""

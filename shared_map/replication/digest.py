@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.wire.messages.marks import DIGEST_ROW, MarkSet
+from swarm.wire.messages.map_data import DIGEST_ROW, MarkSet
 
 _FEW = 64
 """Rows up to which tuples are compared faster than arrays: digests of late changes come several times a second."""

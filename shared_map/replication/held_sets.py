@@ -13,7 +13,7 @@ from shared_map.replication.marks import fault, is_tombstone, is_zone, supersede
 from shared_map.replication.tombstones import Tombstones
 from swarm.config.classes import MOST_CLASSES
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.wire.messages.marks import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
+from swarm.wire.messages.map_data import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
 
 
 class HeldSets:

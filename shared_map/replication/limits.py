@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.marks import MarkSet, owner_of
-from swarm.wire.statements import TILE_AREA
+from swarm.wire.messages.map_data import TILE_AREA, MarkSet, owner_of
 
 MAX_SETS = 1 << 18
 """Sets in all, empty ones included: every tile of a 16,384 x 16,384 map once. About half a kilobyte each."""

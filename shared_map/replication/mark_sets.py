@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from swarm.wire.fields import column, pack_column
-from swarm.wire.messages.marks import MarkSet, MarkSets
+from swarm.wire.messages.map_data import MarkSet, MarkSets
 
 MAX_BULK_BYTES = 1 << 18
 """A message is cut off at about this size: while the reader merges one, the next is packed and sent."""

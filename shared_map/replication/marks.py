@@ -16,8 +16,7 @@ from swarm.config.classes import MOST_CLASSES
 from swarm.config.values import RESERVED_GROUP
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column, pack_column
-from swarm.wire.messages.marks import SEQ_STEP, MarkSet
-from swarm.wire.statements import FOREVER, STAMP_LIMIT_NS, TILE_AREA, MarkKind
+from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet
 
 _ZONES = f"{RESERVED_GROUP}."
 NO_STATEMENT = -1

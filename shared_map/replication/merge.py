@@ -19,8 +19,7 @@ from shared_map.replication.marks import NO_STATEMENT, NO_STATEMENTS, Statements
 from shared_map.replication.tiles import grid_cells, tile_corners
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import FOREVER, TILE_AREA, MarkKind
+from swarm.wire.messages.map_data import FOREVER, TILE_AREA, MarkKind, MarkSet
 
 
 class TileChange(NamedTuple):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Newest
-from swarm.wire.messages.marks import Digest
+from swarm.wire.messages.map_data import Digest
 
 _GRACE_NS = NS_PER_S // 10
 """A digest may overtake the sets that it names: what is missing is asked for only this long after it came."""

@@ -36,8 +36,7 @@ from shared_map.replication.tiles import beyond_tile, tile_cells
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet
 
 
 class CostSink(Protocol):
@@ -352,7 +351,7 @@ class MapReplica:
         cells       int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
         kinds       uint8 (cells,)    MarkKind, or one for all
         paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds
-                    of marks (`swarm.wire.statements`)
+                    of marks (`swarm.wire.messages.map_data`)
         lifetime_s  the statements expire so long after their stamps, by the reader's clock; None: never
 
         Raises RuntimeError if the replica has no author.

@@ -19,8 +19,8 @@ from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_clas
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest, owner_of
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import Digest, MarkSet, MarkSets, MarksRequest, owner_of
 from swarm.wire.topics import DIGEST, MARKS
 
 log = logging.getLogger(__name__)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 REMEMBERED_NS = 600 * NS_PER_S
 """A set which arrives later than this after its tombstone is held again. No digest of a keeper names it, so it is

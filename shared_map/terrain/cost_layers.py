@@ -15,7 +15,7 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin, find_plugin
 from swarm.plugins.guard import Guard, Nonsense
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 
 @dataclass(frozen=True, slots=True, eq=False)

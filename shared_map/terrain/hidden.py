@@ -17,7 +17,7 @@ from shared_map.terrain.synthetic.noise import fractal_noise
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import CostConfig, HiddenConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 RUBBLE_FACTOR = np.float32(3.0)
 CONNECTED_SHARE = 0.85

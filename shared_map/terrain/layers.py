@@ -35,7 +35,7 @@ from shared_map.terrain.row_bands import in_bands
 from shared_map.terrain.slope_rules import along_slope_factor, factor_bounds, slope_factor
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 LETHAL = np.float32(np.inf)
 

@@ -37,7 +37,7 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
     from shared_map.importers.sources import Source

@@ -17,7 +17,7 @@ from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 from swarm.places import corners_of, extent_of
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
     from shared_map.importers.zones.zone_files import Burnt, FileFacts

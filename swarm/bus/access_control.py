@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from swarm.errors import ConfigError
-from swarm.ranks import job_of
+from swarm.liveness import job_of
 from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import check_id
 from swarm.wire.topics import ALIVE_KEY, TOPICS

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 from swarm.liveness import Peer
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.topics import Topic
 
 TIMEOUT_PARAMETER = "timeout_s"

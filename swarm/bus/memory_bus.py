@@ -31,9 +31,9 @@ from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.authentication import Authenticator, check_code, code_of
+from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.readable import may_be_json, packed_json
 from swarm.wire.topics import Topic
 

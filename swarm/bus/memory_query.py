@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from swarm.bus.bus import AskEnded, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
-from swarm.wire.authentication import check_code, code_of
+from swarm.wire.access import check_code, code_of
 from swarm.wire.codec import decode_either, encode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.topics import Topic
 
 if TYPE_CHECKING:

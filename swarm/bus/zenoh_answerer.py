@@ -9,7 +9,7 @@ from typing import Protocol
 import zenoh
 
 from swarm.bus.bus import USUAL_TIMEOUT_S
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 
 
 class Reply(Protocol):

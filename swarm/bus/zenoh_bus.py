@@ -50,9 +50,9 @@ from swarm.bus.zenoh_threads import (
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.authentication import Authenticator, code_of
+from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.readable import encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 

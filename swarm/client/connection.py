@@ -21,10 +21,9 @@ from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
 from swarm.wire.fields import check_id
-from swarm.wire.messages.base import WIRE_VERSION
-from swarm.wire.messages.planning import GROUND
+from swarm.wire.messages import WIRE_VERSION
+from swarm.wire.messages.planning import GROUND, POSE_LEASE_S
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.messages.targets import POSE_LEASE_S
 from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
@@ -260,7 +259,7 @@ def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tu
     """The run of a namespace, as a process with a grid describes it, and by how many ns the clocks of its processes
     are ahead of ours. Raises BusError, RunMismatchError."""
     from swarm.bus.bus import AskEnded, Replied
-    from swarm.wire.messages.base import Nothing
+    from swarm.wire.messages import Nothing
     from swarm.wire.topics import RUN
 
     while True:

@@ -11,12 +11,10 @@ from swarm.client.stream import Stream
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec, walk
 from swarm.runtime.tracking import Trackings
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.map_data import MarkKind, MarkSet, MarksRequest
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.vehicles import NO_TARGET, Body, Fleet, Followed, VehicleState
 from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import msgspec
 
 from swarm.client.session import Session
 from swarm.errors import ConfigError
-from swarm.orders import Acknowledged, Operator
+from swarm.runtime.operator import Acknowledged, Operator
 from swarm.wire.codec import field_fault, schema_of_type
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Zone, ZoneOrder
 
 M = TypeVar("M", bound=Message)

@@ -10,8 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.wire.messages.marks import SEQ_STEP, Digest, MarkSet, MarksRequest
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, Digest, MarkKind, MarkSet, MarksRequest
 
 
 class _Statement(NamedTuple):

@@ -16,7 +16,7 @@ from swarm.client.frame import Frame, number
 from swarm.clock import NS_PER_S, Clock
 from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
 from swarm.wire.codec import M, decode, encode
-from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import RUN, Topic
 

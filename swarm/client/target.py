@@ -10,7 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.runtime.tracking import Tracking, Verdict
 from swarm.wire.fields import LONGEST_LEASE_S, check_id
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.topics import POSE
 
 _REPEAT_NS = NS_PER_S * 2 // 5

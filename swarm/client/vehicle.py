@@ -20,10 +20,9 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import ConfigError
 from swarm.wire.fields import check_id
-from swarm.wire.messages.bodies import LONGEST_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
-from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
-from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
 from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE, ROUTE
 
 _ASK_AGAIN_NS = NS_PER_S
@@ -61,8 +60,10 @@ class Vehicle:
         if agent_of(id) != id:
             raise session.refused(f"id {id!r} has a '-', by which the swarm names vehicles of its own agents")
         radius_m, lease_s = session.number("radius_m", radius_m), session.number("lease_s", lease_s)
-        if not 0 < lease_s <= LONGEST_LEASE_S:
-            raise session.refused(f"lease_s is {lease_s!r}, expected more than 0 and at most {LONGEST_LEASE_S:g}")
+        if not 0 < lease_s <= LONGEST_BODY_LEASE_S:
+            raise session.refused(
+                f"lease_s is {lease_s!r}, expected more than 0 and at most {LONGEST_BODY_LEASE_S:g}"
+            )
         if not 0 <= radius_m <= MOST_RADIUS_M:
             raise session.refused(f"radius_m is {radius_m!r}, expected 0 ... {MOST_RADIUS_M:g} metres")
         self.id = id

@@ -22,8 +22,8 @@ from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
 from swarm.config.values import MOST_TARGETS, RESERVED_GROUP
 from swarm.errors import ConfigError
+from swarm.liveness import split_rank
 from swarm.places import read_place
-from swarm.ranks import split_rank
 
 
 def load_scenario(path: Path) -> Scenario:

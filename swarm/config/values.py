@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta
 
-from swarm.ranks import HIGHEST_RANK
+from swarm.liveness import HIGHEST_RANK
 
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
@@ -40,7 +40,7 @@ Preset = Literal["hiker", "wheeled", "tracked", "quadruped"]
 Slope = Annotated[float, Meta(gt=-90, lt=90)]
 SlopeFactor = Annotated[float, Meta(ge=0.01, le=100)]
 SpeedOnGround = Annotated[float, Meta(ge=0.01, le=340)]
-"""m/s; what a map can tell of a cell (`swarm.wire.statements.PACE_LEAST` and `PACE_MOST`)."""
+"""m/s; what a map can tell of a cell (`swarm.wire.messages.map_data.PACE_LEAST` and `PACE_MOST`)."""
 
 Walk = Literal["still", "random", "waypoints", "evade", "external"]
 

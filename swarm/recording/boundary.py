@@ -17,7 +17,7 @@ from swarm.liveness import Peer
 from swarm.recording.outside import Outside, content_of, unpack
 from swarm.runtime.process import Service
 from swarm.wire.codec import decode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.topics import Topic
 
 T = TypeVar("T")

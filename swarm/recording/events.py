@@ -33,7 +33,7 @@ from swarm.recording.records import (
     WasAsked,
 )
 from swarm.wire.codec import decode, decode_either, decode_many
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic
 
 _TOPICS = {topic.name: topic for topic in TOPICS}

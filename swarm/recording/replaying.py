@@ -32,7 +32,7 @@ from swarm.recording.records import (
 )
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.process import Service
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 
 T = TypeVar("T")
 MAKING = "making the service"

@@ -6,7 +6,7 @@ import logging
 
 from swarm.bus.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.ranks import job_of, ranked_id
+from swarm.liveness import job_of, ranked_id
 from swarm.runtime.leadership import BEAT_NS, Leadership
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup

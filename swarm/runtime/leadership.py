@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.ranks import split_rank
+from swarm.liveness import split_rank
 from swarm.wire.messages.processes import Beat
 
 BEAT_NS = NS_PER_S // 10

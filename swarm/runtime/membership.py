@@ -14,7 +14,7 @@ from swarm.liveness import Peer
 from swarm.runtime.alarms import Alarms
 from swarm.runtime.stats import MESSAGES_PER_S, READY, RESTARTS, Counters, carried
 from swarm.wire.fields import MOST_TEXT
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
 from swarm.wire.versions import are_neighbours

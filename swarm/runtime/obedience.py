@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.order_book import OrderBook
+from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import Obey, Obeyed, Orders
 from swarm.wire.topics import OBEYED, ORDERS
 

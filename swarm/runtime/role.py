@@ -11,7 +11,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS
-from swarm.wire.messages.base import WIRE_VERSION
+from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo, Stats
 
 

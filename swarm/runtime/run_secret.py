@@ -9,7 +9,7 @@ from pathlib import Path
 
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import ConfigError
-from swarm.wire.authentication import Authenticator
+from swarm.wire.access import Authenticator
 
 _SECRET_BYTES = 32
 

@@ -29,7 +29,7 @@ import msgspec
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS
-from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 SAME_NS = 3 * NS_PER_S // 4
 """Receivers measure when a tracker began as exactly as they look, which is at their ticks."""

@@ -1,12 +1,24 @@
-"""Who may do what with a topic: a column of the table of topics.
+"""Who may do what with a topic, which is a column of the table of topics; and codes that show who said something.
 
 A router grants by these rules, so they are complete: what no topic grants, nobody may do. A router itself passes on
 everybody's messages, may therefore do everything, and is named nowhere.
+
+On a topic where a false message would harm, a message counts only with a code that the processes of one run alone
+can make (decision 32): a keyed BLAKE2b (RFC 7693) of the key, of what was asked if it is an answer, and of the
+payload. It travels beside the payload, as Zenoh's attachment, so who has no secret may still read.
 """
 
 from __future__ import annotations
 
+import hmac
 from dataclasses import dataclass
+from hashlib import blake2b
+from typing import TYPE_CHECKING
+
+from swarm.errors import ProtocolError
+
+if TYPE_CHECKING:
+    from swarm.wire.topics import Topic
 
 MEMBERS = "keeper planner agent targets tracker rover monitor"
 """The roles of the processes of a run. Two are external: a `tracker` publishes the pose of one real target, a
@@ -67,3 +79,48 @@ def _grants(text: str) -> tuple[Grant, ...]:
             raise ValueError(f"no role {role!r}; the roles are {', '.join(ROLES)}")
         grants.append(Grant(role, tuple(fields.split(",")) if fields else ()))
     return tuple(grants)
+
+
+_CODE_BYTES = 16
+
+
+class Authenticator:
+    """Makes and checks the codes of one run.
+
+    secret  what the processes of the run share and nobody else knows
+    run_id  of the run: what was said in another one does not count
+    """
+
+    def __init__(self, secret: bytes, run_id: str) -> None:
+        self._key = blake2b(run_id.encode(), key=secret, digest_size=32).digest()
+
+    def code(self, key: str, payload: bytes, asked: bytes = b"") -> bytes:
+        """The code of a payload under a key.
+
+        asked  the payload of the question, where this is an answer to one
+        """
+        lengths = f"{len(key)},{len(asked)},".encode()
+        return blake2b(lengths + key.encode() + asked + payload, key=self._key, digest_size=_CODE_BYTES).digest()
+
+
+def code_of(
+    authenticator: Authenticator | None, topic: Topic, key: str, payload: bytes, asked: bytes = b""
+) -> bytes | None:
+    """What to send beside a payload: its code, on a trusted topic; None where no secret is shared."""
+    return authenticator.code(key, payload, asked) if authenticator is not None and topic.trusted else None
+
+
+def check_code(
+    authenticator: Authenticator | None,
+    code: bytes | None,
+    topic: Topic,
+    key: str,
+    payload: bytes,
+    asked: bytes = b"",
+) -> None:
+    """Raise ProtocolError on what no process of the run has said, on a trusted topic."""
+    right = code_of(authenticator, topic, key, payload, asked)
+    if right is None or (code is not None and hmac.compare_digest(code, right)):
+        return
+    what = "no code" if code is None else "a false code"
+    raise ProtocolError(f"it carries {what}, so no process of this run has said it")

@@ -16,10 +16,9 @@ import msgpack
 import msgspec
 
 from swarm.errors import ProtocolError
-from swarm.lazy_numpy import np, numpy_loaded
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import faulty_sets
+from swarm.wire.fields import np, numpy_loaded
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import MarkSet, faulty_sets
 from swarm.wire.versions import STEPS, as_read, as_written, read_schemas
 from swarm.wire.versions import schema_of_type as schema_of_type
 

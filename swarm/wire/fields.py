@@ -23,11 +23,37 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from swarm.errors import ConfigError
 from swarm.grid import MOST_PLOTS
-from swarm.lazy_numpy import np, numpy_loaded
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
+else:
+
+    class _NumPy:
+        """Stands for NumPy until a name of it is looked up, so that a robot's process neither waits for NumPy nor
+        needs it installed. Each name that was looked up is kept."""
+
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("__"):
+                raise AttributeError(name)
+            try:
+                import numpy
+            except ModuleNotFoundError as error:
+                raise ConfigError("this needs NumPy: pip install 'terrain-swarm[all]'") from error
+            value = getattr(numpy, name)
+            setattr(self, name, value)
+            return value
+
+    np = _NumPy()
+
+
+def numpy_loaded() -> bool:
+    """True if anything in this process has imported NumPy, as all roles of a swarm do. If not, as in
+    `swarm.client`, columns are read as lists, which is slower for many values."""
+    return sys.modules.get("numpy") is not None
+
 
 assert sys.byteorder == "little", "columns travel as little-endian bytes"
 

@@ -24,7 +24,7 @@ from swarm.errors import ProtocolError
 from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.codec import M, field_fault, schema_of_type
 from swarm.wire.fields import CODES, OR_INFINITE, Column, Directions, name_of, taken_apart
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.planning import RouteReply
 
 COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")

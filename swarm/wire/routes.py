@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from msgspec import Meta
 
 from swarm.grid import STEP_COL, STEP_ROW
-from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import (
     Bounded,
     Cell,
@@ -27,6 +26,8 @@ from swarm.wire.fields import (
     Length,
     check_column,
     column,
+    np,
+    numpy_loaded,
     pack_column,
 )
 

@@ -12,11 +12,16 @@ from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
 from swarm.wire.codec import prime
-from swarm.wire.messages.base import Message, Nothing
-from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.guests import Removed, RemoveVehicles
-from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages import Message, Nothing
+from swarm.wire.messages.map_data import (
+    BaseMap,
+    BaseMapRequest,
+    BaseMapTile,
+    Digest,
+    MarkSet,
+    MarkSets,
+    MarksRequest,
+)
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     Believed,
@@ -26,11 +31,12 @@ from swarm.wire.messages.planning import (
     PushedRoute,
     RouteReply,
     RouteRequest,
+    Sighted,
+    TargetPose,
 )
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
-from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.messages.vehicles import Chasers, Fleet, Followed, SharedCosts
+from swarm.wire.messages.vehicles import Body, Chasers, Fleet, Followed, Removed, RemoveVehicles, SharedCosts
 
 
 class Priority(Enum):
@@ -53,7 +59,7 @@ class Topic:
     request    for a queryable: what is asked; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it
     published  whether values are put, not only answered
-    trusted    only with a code of the run's secret does a message on it count (`swarm.wire.authentication`)
+    trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
     newest     each value carries the whole state of its key, so a reader may skip to the newest
     echoed     whether a process that puts and subscribes hears what it has put itself
     buffer     samples that wait for a slow reader; the oldest are dropped first

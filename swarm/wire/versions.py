@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from swarm.errors import ProtocolError
-from swarm.wire.messages.base import WIRE_VERSION, Message
+from swarm.wire.messages import WIRE_VERSION, Message
 
 Fields = dict[str, Any]
 """Of a message, as MessagePack has them, without `schema`."""

@@ -26,13 +26,19 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import OR_INFINITE, Bounded, Characters, Column, pack_column, taken_apart
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap
-from swarm.wire.messages.marks import DIGEST_ROW, MarkSet, MarkSets
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import (
+    BASE_DIGEST_BYTES,
+    DIGEST_ROW,
+    PACE_LEAST,
+    PACE_MOST,
+    BaseMap,
+    MarkSet,
+    MarkSets,
+)
 from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.messages.vehicles import NO_TARGET, Followed, SharedCosts
 from swarm.wire.routes import Route, RouteBatch, Routes
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
 from swarm.wire.topics import Topic
 
 NAMES = (

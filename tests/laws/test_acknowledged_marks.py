@@ -20,8 +20,7 @@ from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.marks import base_seq
 from swarm.config.scenario import MapConfig, Scenario
-from swarm.wire.messages.marks import DIGEST_ROW, MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import DIGEST_ROW, MarkKind, MarkSet
 
 CELLS = (0, 1, 40)
 """Two of one tile, one of the next."""

@@ -18,8 +18,8 @@ from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.plots import Plots
-from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.traffic import Granted
+from swarm.wire.messages.vehicles import Body
 from vehicle_agent.agent import Agent
 from vehicle_agent.bodies import REACTION_S, Bodies
 from vehicle_agent.discs import Capsule

@@ -14,8 +14,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS
-from swarm.wire.messages.marks import SEQ_STEP, MarkSet
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, MarkKind, MarkSet
 
 ROWS, COLS = 40, 70
 AUTHORS = ("all.a1.1", "all.a2.1", "blue.b1.1", "operator.z1", "operator.z2")

@@ -16,8 +16,7 @@ from shared_map.keeper.store import KeeperStore
 from shared_map.replication.digest_interest import DigestInterest
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.wire.messages.marks import Digest
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import Digest, MarkKind
 from swarm.wire.topics import DIGEST, MARKS
 
 TERRAIN = terrain_of_pace(np.ones((512, 768), np.float32))

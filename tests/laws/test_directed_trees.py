@@ -36,7 +36,7 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import SlopeRule
 from swarm.grid import GridSpec, Window
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 SLOPES: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
 

@@ -18,11 +18,10 @@ from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import CostRequest, PushedRoute
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages import Message, schema_of
+from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.messages.planning import CostRequest, PushedRoute, TargetPose
+from swarm.wire.messages.vehicles import Body
 from swarm.wire.readable import MAX_JSON_BYTES, encode_readable, may_be_json, packed_json
 from swarm.wire.topics import TOPICS
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from swarm.clock import NS_PER_S
-from swarm.ranks import job_of, ranked_id, split_rank
+from swarm.liveness import job_of, ranked_id, split_rank
 from swarm.runtime.leadership import BEAT_NS, LEASE_NS, SETTLED_NS, Leadership
 from swarm.wire.messages.processes import Beat
 

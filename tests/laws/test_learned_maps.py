@@ -17,8 +17,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSet
 
 SIDE = 40
 """More than a tile."""

@@ -13,7 +13,7 @@ from launch_scripts.simulation.worlds import seeded
 from swarm.bus.bus import Event, Heard
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.traffic import Granted, Shut, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, STANDING, STORED, TABLE
 from vehicle_agent.service import AgentService

@@ -16,7 +16,7 @@ from support.swarm_model import LossyLinks, SwarmModel, SyncService
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 STEP_S = 0.1
 Services = Sequence[SyncService | KeeperService]

@@ -19,8 +19,7 @@ from shared_map.replication.marks import fault
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, decode_many, encode
-from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarkSet, MarkSets, MarksRequest
 from swarm.wire.topics import DIGEST, MARKS
 
 MUTATIONS = int(os.environ.get("MAP_MUTATIONS", "20000"))

@@ -22,10 +22,9 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import walk
 from swarm.runtime.stats import Counters
-from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest, TargetPose
 from swarm.wire.routes import Route, RouteStatus
-from swarm.wire.statements import MarkKind
 
 SIDE = 24
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, held_winners, mark_sets, naive_winners, replica_of
 
 from shared_map.replication.digest import fingerprint
-from swarm.wire.messages.marks import MarkSet, MarksRequest
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet, MarksRequest
 
 
 @given(st.lists(mark_sets(), max_size=15), st.data())

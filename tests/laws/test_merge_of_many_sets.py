@@ -16,8 +16,7 @@ from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.marks import MarkSet, MarkSets, MarksRequest
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet, MarkSets, MarksRequest
 
 LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
 

@@ -23,11 +23,10 @@ from support.wire_strategies import EXAMPLES, MESSAGES, types_of_the_wire
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, encode
 from swarm.wire.fields import Column, pack_column, taken_apart
-from swarm.wire.messages.base import Message, Nothing, schema_of
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
+from swarm.wire.messages import Message, Nothing, schema_of
+from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.traffic import Standing, Table
 from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.routes import Route, Routes, RouteStatus

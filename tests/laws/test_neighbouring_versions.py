@@ -19,7 +19,7 @@ from support.wire_specimens import KINDS, lines, read
 import swarm.wire.versions as versions
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.base import WIRE_VERSION, Message, Nothing, schema_of
+from swarm.wire.messages import WIRE_VERSION, Message, Nothing, schema_of
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.versions import STEPS, Step, are_neighbours, schema_of_type
 

@@ -30,13 +30,13 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.authentication import Authenticator
+from swarm.wire.access import Authenticator
 from swarm.wire.codec import decode
 from swarm.wire.fields import unbounded
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
-from swarm.wire.statements import MarkKind
 from swarm.wire.topics import GIVE_ORDER, MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED, ZONES
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService

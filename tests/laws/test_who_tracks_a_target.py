@@ -14,7 +14,7 @@ from support.effort import few
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.tracking import LONGEST_AGE_NS, MOST_LIVES, SAME_NS, Tracking, Trackings, Verdict
-from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 GRID = GridSpec(25, 40, 10.0)
 HOUR_NS = 3600 * NS_PER_S

@@ -25,7 +25,7 @@ from support.machines import Machines, machines, why_not
 from support.onlooker import Onlooker
 from support.processes import eventually
 
-from swarm.ranks import job_of, split_rank
+from swarm.liveness import job_of, split_rank
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

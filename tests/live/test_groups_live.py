@@ -19,7 +19,7 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import MapConfig, NetworkConfig
 from swarm.runtime.inbox import Inbox
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 pytestmark = pytest.mark.network
 

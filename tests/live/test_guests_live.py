@@ -22,7 +22,7 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.guest_session import GuestSession
 from swarm.right_of_way.life_file import LifeFile
 from swarm.runtime.run_secret import authenticator_of
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.routes import RouteStatus

@@ -31,8 +31,7 @@ from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import DIGEST_ROW, SEQ_STEP, Digest
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import DIGEST_ROW, SEQ_STEP, Digest, MarkKind
 from swarm.wire.topics import DIGEST, MARKS
 
 SIDE = 256

@@ -15,7 +15,7 @@ from support.processes import eventually, session_of
 
 from launch_scripts.replay.run import replay_run
 from swarm.bus.zenoh_bus import ZenohBus
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, ROUTE, RUN, TOPICS

@@ -14,7 +14,7 @@ import pytest
 from support.live_swarm import LiveSwarm, swarm
 from support.processes import eventually
 
-from swarm.wire.messages.base import schema_of
+from swarm.wire.messages import schema_of
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

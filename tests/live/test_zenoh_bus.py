@@ -29,14 +29,14 @@ from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError
 from swarm.liveness import Peer
-from swarm.orders import Operator
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.operator import Operator
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
-from swarm.wire.authentication import Authenticator
+from swarm.wire.access import Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.messages.traffic import Claim

@@ -24,9 +24,8 @@ from swarm.config.scenario import MapConfig, NetworkConfig, TlsConfig
 from swarm.errors import BusError
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.marks import SEQ_STEP, Digest
+from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind
 from swarm.wire.messages.processes import Stats
-from swarm.wire.statements import MarkKind
 from swarm.wire.topics import DIGEST, MARKS, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.zenohd]

@@ -12,9 +12,8 @@ from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
 from swarm.right_of_way.guest_service import GuestService
 from swarm.right_of_way.life_file import MemoryLives
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.orders import ZoneOrder
+from swarm.wire.messages.vehicles import Body, Removed, RemoveVehicles
 from swarm.wire.topics import BODY, LEAVE
 from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService

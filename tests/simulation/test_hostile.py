@@ -17,7 +17,7 @@ from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import seeded
 from swarm.bus.bus import Event
 from swarm.wire.codec import encode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import TOPICS, Topic
 

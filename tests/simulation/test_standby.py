@@ -15,8 +15,7 @@ from launch_scripts.simulation.worlds import SMALL, seeded
 from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.config.scenario import Scenario, StandbyConfig
-from swarm.wire.messages.planning import RouteReply, RouteRequest
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import POSE, ROUTE
 

@@ -19,9 +19,16 @@ from swarm.bus.bus import Event, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import TargetConfig
 from swarm.runtime.tracking import Tracking
-from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, RouteReply, RouteRequest
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlannerStatus,
+    RouteReply,
+    RouteRequest,
+    Sighted,
+    TargetPose,
+)
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import COST, POSE, ROUTE, SIGHTED, STATUS

@@ -19,12 +19,10 @@ from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.liveness import Peer
 from swarm.wire.fields import column, pack_column
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
-from swarm.wire.statements import MarkKind
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.promise_store import MemoryPromiseStore

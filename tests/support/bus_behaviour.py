@@ -12,8 +12,8 @@ from shared_map.replication.mark_sets import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
 from swarm.wire.codec import encode
-from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.marks import MarksRequest
+from swarm.wire.messages import Nothing
+from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Stored
 from swarm.wire.readable import encode_readable
 from swarm.wire.topics import MARKS, NOTE, RUN, STORED, TRUE_POSE

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from swarm.bus.bus import Asked, AskEnded, Bus, Event
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note, RunInfo
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.topics import Topic
 
 

@@ -17,13 +17,11 @@ from swarm.grid import STEP_COL, STEP_ROW, TILE_CELLS, walk
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, GAPS_TO, Counters
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
-from swarm.wire.statements import MarkKind
 
 Heard = tuple[int, Message | Peer]
 

@@ -22,9 +22,8 @@ from swarm.config.agents import added_agent
 from swarm.config.scenario import RoverConfig
 from swarm.right_of_way.guest_service import GuestService
 from swarm.right_of_way.life_file import MemoryLives
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.guests import RemoveVehicles
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
+from swarm.wire.messages.vehicles import Body, RemoveVehicles
 from swarm.wire.topics import BODY, LEAVE
 from vehicle_agent.service import AgentService
 

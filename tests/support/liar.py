@@ -11,7 +11,7 @@ from chaos.lies import Lies
 from swarm.bus.bus import Asked, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryBus
 from swarm.wire.codec import encode
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic
 
 _KEPT = 20

@@ -19,7 +19,7 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import load_scenario
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages import Message, Nothing
 from swarm.wire.topics import RUN, Topic
 
 SWARM = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]

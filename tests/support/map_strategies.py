@@ -14,8 +14,7 @@ from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Bus, Event, Heard
 from swarm.config.classes import MOST_CLASSES
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import SEQ_STEP, Digest, MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind, MarkSet
 from swarm.wire.topics import DIGEST
 
 settings.register_profile(

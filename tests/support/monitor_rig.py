@@ -21,13 +21,11 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.liveness import Peer
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import Believed, PlannerStatus
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.messages.planning import Believed, PlannerStatus, Sighted, TargetPose
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.messages.vehicles import Body, Fleet, Followed
 from swarm.wire.topics import BELIEVED, BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
 
 SILENT = MonitorConfig(live=False)

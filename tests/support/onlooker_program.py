@@ -23,7 +23,7 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import load_scenario
 from swarm.config.scenario import TlsConfig
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.marks import DIGEST_ROW, Digest
+from swarm.wire.messages.map_data import DIGEST_ROW, Digest
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Beat
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState

@@ -9,8 +9,8 @@ from support.bus_world import Box, World, answering, asked, marks, run_info
 
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.wire.codec import encode
-from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.marks import MarksRequest
+from swarm.wire.messages import Nothing
+from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Claim, Table
 from swarm.wire.topics import MARKS, RUN, TABLE
 

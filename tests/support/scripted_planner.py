@@ -22,11 +22,10 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.planning import PlannerStatus, RouteReply, RouteRequest
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.planning import PlannerStatus, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
-from swarm.wire.statements import MarkKind
 
 ROWS, COLS = 20, 30
 GRID = GridSpec(ROWS, COLS, 10.0)

@@ -10,27 +10,29 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from msgspec.json import encode
 from support.wire_strategies import EXAMPLES
 
 from shared_map.keeper.store import KeeperStore
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.orders import Order, Orders
-from swarm.wire.messages.targets import Sighted
-from swarm.wire.messages.traffic import Table
 from vehicle_agent.promise_store import FilePromiseStore
 from vehicle_agent.traffic.right_of_way import OwnRecord
 
 _GRID = GridSpec(64, 96, 30.0)
 
 
+def _examples(name: str) -> list[Any]:
+    """The examples of a type of messages."""
+    return [each for each in EXAMPLES if type(each).__name__ == name]
+
+
 def write(folder: Path) -> None:
     """Leave a keeper's store and an agent's promises."""
-    [marks], [sighted] = ([each for each in EXAMPLES if isinstance(each, kind)] for kind in (MarkSet, Sighted))
-    [table] = [each for each in EXAMPLES if isinstance(each, Table)]
-    orders: list[Order] = [order for each in EXAMPLES if isinstance(each, Orders) for order in each.orders]
+    # By name, as the modules of messages differ between versions.
+    [marks], [sighted], [table] = map(_examples, ("MarkSet", "Sighted", "Table"))
+    orders = [order for each in _examples("Orders") for order in each.orders]
     with KeeperStore(folder / "map.sqlite") as store:
         store.bind("terrain", _GRID)
         store.save([marks])

@@ -23,7 +23,7 @@ from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
-from swarm.wire.authentication import Authenticator
+from swarm.wire.access import Authenticator
 from swarm.wire.topics import Topic
 
 START_NS = 1_000 * NS_PER_S

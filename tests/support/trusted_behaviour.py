@@ -8,7 +8,7 @@ from __future__ import annotations
 from support.bus_world import Box, answering, asked, pose
 
 from swarm.bus.bus import Asked, AskEnded, Heard, Replied
-from swarm.wire.authentication import Authenticator
+from swarm.wire.access import Authenticator
 from swarm.wire.messages.traffic import Claim, Stored, Table
 from swarm.wire.topics import POSE, STORED, TABLE
 

@@ -11,13 +11,16 @@ that the build knows of the type and the message as it writes it again, or with 
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
 
 from hypothesis import HealthCheck, Phase, given, settings
 from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.base import Message
+
+if TYPE_CHECKING:  # where it stands differs between versions
+    from swarm.wire.messages import Message
 
 LONGEST_BYTES = 2000
 """Of a specimen."""

@@ -10,11 +10,19 @@ from hypothesis import strategies as st
 
 from shared_map.replication.mark_sets import packed
 from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, pack_column
-from swarm.wire.messages.base import Message, Nothing
-from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
-from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
-from swarm.wire.messages.guests import Removed, RemoveVehicles
-from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages import Message, Nothing
+from swarm.wire.messages.map_data import (
+    DIGEST_ROW,
+    TILE_AREA,
+    BaseMap,
+    BaseMapRequest,
+    BaseMapTile,
+    Digest,
+    MarkKind,
+    MarkSet,
+    MarkSets,
+    MarksRequest,
+)
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, Zone, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     Believed,
@@ -24,9 +32,10 @@ from swarm.wire.messages.planning import (
     PushedRoute,
     RouteReply,
     RouteRequest,
+    Sighted,
+    TargetPose,
 )
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
-from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import (
     Claim,
     Grant,
@@ -40,15 +49,18 @@ from swarm.wire.messages.traffic import (
     Table,
 )
 from swarm.wire.messages.vehicles import (
+    LONGEST_BODY_LEASE_S,
     NO_TARGET,
+    Body,
     Chasers,
     Fleet,
     Followed,
+    Removed,
+    RemoveVehicles,
     SharedCosts,
     VehicleState,
 )
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
-from swarm.wire.statements import TILE_AREA, MarkKind
 
 naturals = st.integers(0, (1 << 62) - 1)
 counts = st.integers(0, (1 << 53) - 1)
@@ -267,7 +279,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     Body: st.builds(
         Body, id=ids, group=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, x_m=metres, y_m=metres,
         heading_rad=st.none() | st.floats(-12.5, 12.5), speed_m_per_s=st.floats(0, 1e6), radius_m=st.floats(0, 1e9),
-        lease_s=st.floats(0, LONGEST_LEASE_S),
+        lease_s=st.floats(0, LONGEST_BODY_LEASE_S),
     ),
     Sighted: st.builds(
         Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
-from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind
 
 _TOLERANCE = np.float32(0.01)
 """Paces that differ by less than this share count as equal."""

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from swarm.bus.bus import Bus
     from swarm.bus.zenoh_bus import ZenohBus
     from swarm.config.scenario import NetworkConfig
-    from swarm.wire.messages.guests import Removed
     from swarm.wire.messages.processes import RunInfo
+    from swarm.wire.messages.vehicles import Removed
 
 _WITHIN_S = 5.0
 _AGAIN_S = 0.2
@@ -156,7 +156,7 @@ def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
     from swarm.bus.bus import AskEnded, Replied
     from swarm.errors import BusError
     from swarm.runtime.inbox import Inbox
-    from swarm.wire.messages.guests import Removed, RemoveVehicles
+    from swarm.wire.messages.vehicles import Removed, RemoveVehicles
     from swarm.wire.topics import LEAVE
 
     inbox = Inbox()

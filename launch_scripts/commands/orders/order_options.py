@@ -10,9 +10,9 @@ import typer
 if TYPE_CHECKING:
     from launch_scripts.commands.query import Where
     from launch_scripts.commands.shared_options import Tls
-    from swarm.orders import Acknowledged
     from swarm.places import Place
-    from swarm.wire.messages.base import Message
+    from swarm.runtime.operator import Acknowledged
+    from swarm.wire.messages import Message
     from swarm.wire.messages.orders import GiveOrder
 
 M = TypeVar("M", bound="Message")
@@ -45,8 +45,8 @@ def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool, at: Pla
 
     from launch_scripts.commands.run_frame import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.orders import Operator
     from swarm.places import cell_of, fields_of, written
+    from swarm.runtime.operator import Operator
 
     silent = False
     printed: list[dict[str, Any]] = []

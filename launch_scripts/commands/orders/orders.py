@@ -85,7 +85,7 @@ def set_(
         typer.Argument(
             metavar="KEY",
             help="A key of the scenario, such as time_scale.",
-            autocompletion=complete.words("swarm.order_book", "SETTINGS"),
+            autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"),
         ),
     ],
     where: Where,
@@ -102,7 +102,7 @@ def set_(
     """
     from swarm.config.explain import choice
     from swarm.errors import ConfigError
-    from swarm.order_book import SETTINGS
+    from swarm.runtime.order_book import SETTINGS
     from swarm.wire.messages.orders import GiveOrder
 
     if as_scenario == (value is not None):
@@ -123,8 +123,8 @@ def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     import msgspec
 
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.order_book import OrderBook
-    from swarm.orders import Operator
+    from swarm.runtime.operator import Operator
+    from swarm.runtime.order_book import OrderBook
 
     with open_bus(where.network(tls)) as bus:
         book = Operator(bus).orders()

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from shared_map.terrain.places import MapFrame
-    from swarm.orders import Acknowledged
     from swarm.places import Place
+    from swarm.runtime.operator import Acknowledged
     from swarm.wire.messages.orders import Zone, ZoneOrder, Zones
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -123,7 +123,7 @@ def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """
     from launch_scripts.commands.run_frame import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.orders import Operator
+    from swarm.runtime.operator import Operator
 
     with open_bus(where.network(tls)) as bus:
         zones = Operator(bus).zones()
@@ -137,8 +137,8 @@ def _give(order: ZoneOrder, where: Where, tls: Tls, as_json: bool, corners: Sequ
 
     from launch_scripts.commands.run_frame import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.orders import Operator
     from swarm.places import corners_of
+    from swarm.runtime.operator import Operator
 
     with open_bus(where.network(tls)) as bus:
         frame = frame_of_run(bus, where)
@@ -157,7 +157,7 @@ def _give_file(
     from launch_scripts.commands.run_frame import frame_of_run
     from shared_map.importers.zones.zone_outlines import outlines_of
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.orders import Acknowledged, Operator
+    from swarm.runtime.operator import Acknowledged, Operator
     from swarm.wire.messages.orders import MOST_CORNERS, ZoneOrder
 
     with open_bus(where.network(tls)) as bus:

@@ -17,7 +17,7 @@ from shared_map.replication.tiles import beyond_tile
 from swarm.bus.bus import AskEnded, Replied
 from swarm.errors import BusError
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.map_data import MarkSet, MarksRequest
 from swarm.wire.topics import MARKS
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Re
 from swarm.clock import Clock
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.processes import RunInfo, Stats
 from swarm.wire.topics import RUN
 

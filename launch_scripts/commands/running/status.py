@@ -24,7 +24,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat, RunInfo, Stats
 from swarm.wire.messages.vehicles import Fleet

@@ -13,7 +13,7 @@ import msgspec
 from launch_scripts.deploy.host_scenario import host_scenario
 from launch_scripts.deploy.plan import Plan, PlannedHost, PlannedProcess
 from swarm.config.scenario import Scenario
-from swarm.ranks import split_rank
+from swarm.liveness import split_rank
 
 USER = 10001
 """User and group of the image, by number: somebody whom no machine knows."""

@@ -22,7 +22,7 @@ from launch_scripts.gateways.ros2.types import RosTypes
 from launch_scripts.gateways.ros2.vehicle_topics import BARE, ToWgs84, VehicleTopics
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 _STEP_HZ = 10.0
 """What has no rate of its own is looked at so often."""

@@ -22,8 +22,7 @@ from shared_map.replication.tiles import grid_cells, tile_corners
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec, Window
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 QUICK_S_PER_M = 0.1
 """What the quickest ground is taken for where the terrain is not known: 10 m/s."""

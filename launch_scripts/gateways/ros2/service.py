@@ -32,7 +32,7 @@ from swarm.client.frame import Frame
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ConfigError
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from swarm.config.ground import ZoneConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 log = logging.getLogger(__name__)
 

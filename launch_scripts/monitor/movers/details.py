@@ -10,8 +10,7 @@ from launch_scripts.observe.facts import TARGET_FACTS
 from launch_scripts.observe.state import TargetLine
 from launch_scripts.observe.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.messages.vehicles import Body, VehicleState
 
 MOST_LABELS = 40
 """With more labels nothing can be read."""

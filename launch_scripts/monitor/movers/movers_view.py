@@ -25,11 +25,9 @@ from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.config.scenario import Scenario
 from swarm.runtime.stats import Counters
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.planning import Believed
-from swarm.wire.messages.targets import Sighted
-from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.messages import Message
+from swarm.wire.messages.planning import Believed, Sighted
+from swarm.wire.messages.vehicles import Body, Fleet, Followed
 from vehicle_agent.bodies import Bodies
 
 _UNSEEN = 2

@@ -10,8 +10,8 @@ import numpy as np
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.observe.vehicle_columns import VehicleColumns
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.planning import Sighted
+from swarm.wire.messages.vehicles import Body
 
 Places = Mapping[str, tuple[float, float]]
 """Id -> (east, south) in metres from the grid's north-west corner."""

@@ -20,8 +20,8 @@ from launch_scripts.monitor.movers.points import (
 )
 from launch_scripts.monitor.movers.strips import Trails, feet, poles, rings
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.planning import Sighted
+from swarm.wire.messages.vehicles import Body
 
 
 class TargetsView:

@@ -14,7 +14,7 @@ from launch_scripts.observe.alarms import Alarm
 from launch_scripts.report.geo.track_file import Track
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
-from swarm.wire.statements import STAMP_LIMIT_NS
+from swarm.wire.messages.map_data import STAMP_LIMIT_NS
 
 
 class _Note(msgspec.Struct):

@@ -26,7 +26,7 @@ from launch_scripts.report.geo.geo_shapes import turns_of
 from launch_scripts.report.geo.track_file import GivenRoute, RunTracks, Track
 from shared_map.terrain.places import middles_of
 from swarm.clock import NS_PER_S
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 CAPTURE: Colour = (1.0, 0.85, 0.1, 1.0)
 _SHOWN_NS = 5 * NS_PER_S

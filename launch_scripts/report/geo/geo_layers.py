@@ -21,7 +21,7 @@ from launch_scripts.report.geo.track_file import RunTracks, Track
 from shared_map.terrain.places import MapFrame, middles_of
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 Value = str | int | float | np.datetime64 | None
 FieldKind = Literal["text", "int", "real", "time"]

@@ -18,8 +18,8 @@ from launch_scripts.observe.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
 from swarm.wire.messages.vehicles import Followed
-from swarm.wire.statements import STAMP_LIMIT_NS, MarkKind
 
 _MARKS: dict[str, Any] = {"cells": np.int64, "kinds": np.uint8, "paces": np.float32, "stamps_ns": np.int64}
 """Columns of marks."""

@@ -30,7 +30,7 @@ from launch_scripts.report.pictures.plots import halo
 from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from shared_map.terrain.places import MapFrame
 from swarm.grid import GridSpec
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 _SHOWN_LABELS = 30
 _MARK_PIXELS = 1 << 20

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import MOST_M_PER_S, MOST_RADIUS_M, Body
+from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body
 from vehicle_agent.bodies import MOST_BODIES, REACTION_S, capsule_of
 
 IN_TIME_NS = NS_PER_S // 5

@@ -20,8 +20,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.vehicles import Body, Fleet
 
 _SKEW_NS = NS_PER_S // 200
 """Shorter overlaps are no collision: the clocks of two processes may differ by as much."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from launch_scripts.simulation.world.walks import TrueTerrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import RoverConfig, Scenario, ids_of
-from swarm.wire.messages.bodies import MOST_M_PER_S, Body
+from swarm.wire.messages.vehicles import MOST_M_PER_S, Body
 
 LEASE_S = 2.0
 TURN_S = 0.6

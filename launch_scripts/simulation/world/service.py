@@ -13,18 +13,15 @@ from shared_map.terrain.prepared import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.liveness import Roster
-from swarm.ranks import job_of
+from swarm.liveness import Roster, job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
-from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
-from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, TargetPose
+from swarm.wire.messages.vehicles import Body, Fleet
 from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
 TICK_HZ = 10.0

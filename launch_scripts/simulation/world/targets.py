@@ -33,14 +33,13 @@ from swarm.config.classes import aloft_classes
 from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
-from swarm.order_book import OrderBook
 from swarm.places import cell_of, written
 from swarm.plugins.find import find_plugin
+from swarm.runtime.order_book import OrderBook
 from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.planning import TargetPose
+from swarm.wire.messages.vehicles import NO_TARGET, Body, Fleet, VehicleState
 from vehicle_agent.target_bodies import TargetBodies
 
 LISTEN_NS = NS_PER_S

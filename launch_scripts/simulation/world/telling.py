@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import TargetPose
 
 _MOVED_CELLS = 0.25
 _AGAIN_NS = NS_PER_S // 2

@@ -23,9 +23,8 @@ from swarm.wire.fields import (
     Word,
     check_id,
 )
-from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.messages.marks import DigestRows
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages import Message, schema_of
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, DigestRows
 
 MOST_CORNERS = 256
 """Of a zone's polygon."""

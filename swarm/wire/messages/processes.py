@@ -27,7 +27,7 @@ from swarm.wire.fields import (
     WebPort,
     Word,
 )
-from swarm.wire.messages.base import Message, schema_of
+from swarm.wire.messages import Message, schema_of
 
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):

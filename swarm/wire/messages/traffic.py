@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from swarm.grid import MOST_PLOT_REGIONS, REGION_CELLS
 from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Part, Plot, VehicleId
-from swarm.wire.messages.base import Message, schema_of
+from swarm.wire.messages import Message, schema_of
 
 Stamp = tuple[Natural, Natural]
 """(epoch, seq): which table of a plot. Later ones compare greater."""

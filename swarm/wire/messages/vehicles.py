@@ -1,4 +1,4 @@
-"""Messages about vehicles: positions, whom they chase, followed routes."""
+"""Messages about vehicles: positions, whom they chase, followed routes, who leaves; and about outside obstacles."""
 
 from __future__ import annotations
 
@@ -13,27 +13,22 @@ from swarm.wire.fields import (
     SMALL,
     Cell,
     Column,
+    Count,
     Directions,
+    Distance,
     FiniteCost,
     Id,
+    Incarnation,
     Legs,
+    Metres,
     Natural,
     Region,
     StampNs,
     VehicleId,
     check_column,
 )
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
-from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
+from swarm.wire.messages import Message, schema_of
 from swarm.wire.routes import check_legs
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 
 
 class VehicleState(enum.IntEnum):
@@ -162,3 +157,59 @@ class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
 
     def relate(self) -> None:
         check_legs([len(self.directions)], self.legs)
+
+
+LONGEST_BODY_LEASE_S = 10.0
+MOST_RADIUS_M = 100.0
+MOST_M_PER_S = 340.0
+"""What drives quicker than sound is no vehicle, as of marks. Whoever hears more of a body names it and goes on."""
+Heading = Annotated[float, Meta(ge=-2 * math.tau, le=2 * math.tau)]
+Speed = Annotated[float, Meta(ge=0, le=1e6)]
+
+
+class Body(Message, frozen=True, kw_only=True, tag=schema_of("body")):
+    """Where something is that vehicles must not drive into: a disc on the map. The newest replaces the older.
+
+    group          whose it is, for those who watch
+    incarnation    when its sender started, in ns: two senders under one id are told apart, the later counts
+    seq            grows with each message of an incarnation
+    stamp_ns       when it was there, by the sender's clock; nothing is decided by it
+    x_m, y_m       in the terrain's frame, as of a `TargetPose`
+    heading_rad    clockwise from north; None if it may go any way
+    speed_m_per_s  by the wall clock
+    radius_m       around the place
+    lease_s        the body is forgotten so long after this message was heard; 0 takes it away at once
+    """
+
+    id: VehicleId
+    group: Id = "all"
+    incarnation: Incarnation
+    seq: Natural
+    stamp_ns: StampNs = 0
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Heading | None = None
+    speed_m_per_s: Speed = 0.0
+    radius_m: Distance
+    lease_s: Annotated[float, Meta(ge=0, le=LONGEST_BODY_LEASE_S)] = 1.0
+
+
+class RemoveVehicles(Message, frozen=True, kw_only=True, tag=schema_of("remove-vehicles")):
+    """An operator asks an agent to let vehicles leave; all that it hosts if none is named. To ask again is
+    harmless."""
+
+    vehicles: Annotated[list[VehicleId], SMALL] = []
+
+
+class Removed(Message, frozen=True, kw_only=True, tag=schema_of("removed")):
+    """What has become of such a request.
+
+    left     the vehicles asked for that are gone from the agent
+    unknown  those that it does not host, and has not let leave
+    held     of those that left: how many hold cells that are not known to be free yet
+    """
+
+    agent: Id
+    left: Annotated[list[VehicleId], SMALL]
+    unknown: Annotated[list[VehicleId], SMALL] = []
+    held: Count = 0

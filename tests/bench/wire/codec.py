@@ -26,7 +26,7 @@ from bench.tables import number, table, times
 from swarm.config.load import load_scenario
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_PAYLOAD_BYTES, decode, encode, schema_of_type
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.planning import CostRequest
 from swarm.wire.topics import TOPICS
 

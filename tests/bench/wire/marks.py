@@ -30,7 +30,7 @@ from swarm.config.scenario import MapConfig
 from swarm.errors import SwarmError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.codec import encode
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.topics import MARKS
 
 _AUTHOR = "near.1"

@@ -34,7 +34,7 @@ from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 SIDES = ("east", "west")
 ADDRESSES = {"east": "10.213.77.1", "west": "10.213.77.2"}

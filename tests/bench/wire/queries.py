@@ -25,8 +25,7 @@ from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.planning import RouteReply, RouteRequest
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import FLEET, POSE, ROUTE

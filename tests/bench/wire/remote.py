@@ -33,8 +33,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import encode
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 NAMESPACE = "bench"
 RAW = "raw/bench"

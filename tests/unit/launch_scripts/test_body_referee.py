@@ -10,8 +10,7 @@ from support.target_reports import fleet
 
 from launch_scripts.simulation.world.referee import BodyHit, Referee
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.vehicles import Body, Fleet
 
 GRID = GridSpec(10, 10, 10.0)
 MS = 1_000_000

@@ -15,7 +15,7 @@ from chaos.tally import Ended, Outcome, Sample, Tally
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.base import Message
+from swarm.wire.messages import Message
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.topics import POSE, TOPICS
 

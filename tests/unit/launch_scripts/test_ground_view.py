@@ -48,9 +48,8 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.statements import MarkKind
 
 ALL = Window(0, 0, 40, 50)
 

@@ -22,7 +22,7 @@ from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.runtime.stats import Counters
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.processes import Stats
 
 FLAT, STEEP = 0, 5

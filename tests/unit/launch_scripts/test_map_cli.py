@@ -19,8 +19,7 @@ from shared_map.keeper.store import KeeperStore
 from shared_map.learning.words import Said
 from shared_map.replication.replica import MapReplica
 from swarm.errors import StoreError
-from swarm.wire.messages.marks import SEQ_STEP, MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 SETS = [

@@ -17,7 +17,7 @@ from swarm.bus.bus import Heard
 from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
 from swarm.client.session import Session
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import Body as BodyMessage
+from swarm.wire.messages.vehicles import Body as BodyMessage
 from swarm.wire.topics import BODY
 
 common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")

@@ -35,9 +35,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.processes import Note
-from swarm.wire.statements import MarkKind
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 BEGAN_NS = 1_700_000_000 * NS_PER_S

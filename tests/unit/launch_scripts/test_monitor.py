@@ -46,11 +46,9 @@ from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
 from swarm.liveness import Peer
 from swarm.wire.fields import pack_column
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.planning import Believed, PlannerStatus
+from swarm.wire.messages.planning import Believed, PlannerStatus, Sighted
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.targets import Sighted
-from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.messages.vehicles import Body, Fleet, Followed
 from swarm.wire.topics import FOLLOWED, STATS, TOPICS
 
 

@@ -17,7 +17,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
 from swarm.wire.topics import RUN
 
 

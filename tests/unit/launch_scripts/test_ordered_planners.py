@@ -9,7 +9,7 @@ from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, Ordered
 from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError
-from swarm.order_book import OrderBook
+from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.orders import Order
 
 SCENARIO = parse_scenario('[[targets]]\nname = "t"\ncount = 2\n[standbys]\nplanner = 1')

@@ -25,13 +25,11 @@ from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET, pack_column
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages import Message
+from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
-from swarm.wire.statements import MarkKind
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
 

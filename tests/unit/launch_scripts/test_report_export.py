@@ -35,7 +35,7 @@ from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import GridSpec, walk
 from swarm.liveness import Peer
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 BEGAN_NS = 1_700_000_000 * NS_PER_S

@@ -44,8 +44,7 @@ from swarm.client.own_marks import OwnMarks
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 
 GRID = GridSpec(40, 70, 10.0, 300_000.0, 5_200_000.0, "EPSG:32632")
 TYPES = types_of(Distribution.JAZZY)

@@ -33,7 +33,7 @@ from launch_scripts.gateways.ros2.types import Distribution, types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import MOST_M_PER_S
+from swarm.wire.messages.vehicles import MOST_M_PER_S
 
 TYPES = types_of(Distribution.JAZZY)
 GRID = GridSpec(12, 16, 10.0, 5000.0, 70_000.0)

@@ -17,7 +17,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import REACTION_S, capsule_of
 
 GRID = GridSpec(30, 30, 10.0)

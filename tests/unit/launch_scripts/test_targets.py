@@ -32,8 +32,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
 from swarm.errors import ConfigError
 from swarm.wire.codec import decode, encode
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note, Stats
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.topics import FLEET, NOTE, POSE, STATS
 

@@ -19,8 +19,7 @@ from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
-from swarm.liveness import Peer
-from swarm.ranks import split_rank
+from swarm.liveness import Peer, split_rank
 from swarm.wire.messages.orders import Order, Orders
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Alarm, Note, Stats

@@ -31,12 +31,11 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import TILE_CELLS, walk
 from swarm.wire.fields import column
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostRequest, RouteRequest
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import CostRequest, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import RouteStatus
-from swarm.wire.statements import MarkKind
 from swarm.wire.topics import CHASERS, COST, POSE, ROUTE
 
 _TEXT = """

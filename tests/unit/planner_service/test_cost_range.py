@@ -13,7 +13,7 @@ from planner_service.tree import cost_range
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.wire.statements import PACE_LEAST
+from swarm.wire.messages.map_data import PACE_LEAST
 
 GRID = GridSpec(256, 256, 10.0)
 

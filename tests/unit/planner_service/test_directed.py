@@ -25,8 +25,7 @@ from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.plots import Plots
-from swarm.wire.messages.planning import RouteReply
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes

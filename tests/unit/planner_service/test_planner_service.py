@@ -33,8 +33,8 @@ from swarm.wire.messages.planning import (
     PushedRoute,
     RouteReply,
     RouteRequest,
+    TargetPose,
 )
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import CHASERS, COST, POSE, ROUTE, Topic
 

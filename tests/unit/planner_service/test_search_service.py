@@ -18,8 +18,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest
-from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest, Sighted
 from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import BELIEVED, ROUTE, SIGHTED
 

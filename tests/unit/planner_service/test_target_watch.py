@@ -14,7 +14,7 @@ from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 GRID = GridSpec(20, 30, 10.0)
 START_NS = 1_800_000_000 * NS_PER_S

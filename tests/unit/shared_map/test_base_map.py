@@ -20,8 +20,8 @@ from swarm.bus.bus import AskEnded, Bus, Event, Replied
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ProtocolError, TerrainError
-from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages import Nothing
+from swarm.wire.messages.map_data import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.topics import BASE_MAP, BASE_TILES
 
 SCENARIO = Scenario(

@@ -29,8 +29,7 @@ from shared_map.replication.tombstones import REMEMBERED_NS, Tombstones
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
-from swarm.wire.messages.marks import SEQ_STEP, MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 

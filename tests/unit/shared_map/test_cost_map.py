@@ -13,7 +13,7 @@ from shared_map.terrain.layers import inflate, inflation_halves, spread
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 
 ROWS, COLS = 40, 70
 

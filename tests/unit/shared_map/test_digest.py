@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared_map.replication.digest import Ledger, fingerprint
-from swarm.wire.messages.marks import DIGEST_ROW
+from swarm.wire.messages.map_data import DIGEST_ROW
 
 rows = st.dictionaries(
     st.tuples(st.sampled_from("abc"), st.integers(0, 6)), st.tuples(st.integers(1, 3), st.integers(0, 3))

@@ -14,8 +14,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.topics import MARKS
 
 GRID = GridSpec(96, 96, 10.0)

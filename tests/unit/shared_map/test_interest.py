@@ -24,8 +24,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.marks import MarkSet, MarksRequest
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet, MarksRequest
 from vehicle_agent.service import AgentService
 
 TERRAIN = terrain_of_pace(np.full((300, 520), 0.1, np.float32), 10.0)

@@ -19,8 +19,7 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.errors import StoreError
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 LETHAL = MarkKind.LETHAL
 CLASSES = ["walker", "truck", "drone", "mule"]

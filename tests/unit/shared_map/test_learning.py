@@ -17,8 +17,7 @@ from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.classes import MOST_CLASSES
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 SAID = st.builds(Said, st.integers(1, MOST_CELLS), st.integers(-MOST, MOST), st.integers(0, MOST * MOST // ONE))
 WORDS = st.dictionaries(st.integers(0, 255), SAID, max_size=4)

@@ -13,9 +13,8 @@ from shared_map.replication.limits import _MAX_WAITING, Capacity, Quota
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.processes import Note
-from swarm.wire.statements import MarkKind
 from swarm.wire.topics import NOTE
 
 _EMPTY = {name: getattr(set_of("a", 0, 1, {}), name) for name in MarkSet.__struct_fields__}

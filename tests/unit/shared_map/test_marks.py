@@ -13,8 +13,7 @@ from shared_map.replication import merge as merge_module
 from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, supersedes
 from shared_map.replication.merge import TileChange, new_winners, winners
 from shared_map.replication.tiles import grid_cells, region_tiles, tile_cells, tile_corners
-from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import STAMP_LIMIT_NS, MarkKind
+from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 

@@ -12,8 +12,7 @@ from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set, sta
 from shared_map.replication.replica import MapReplica, PublishSet
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
-from swarm.wire.messages.marks import SEQ_STEP, MarkSet, MarksRequest
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, MarkKind, MarkSet, MarksRequest
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 NOW = 1_000 * NS_PER_S

@@ -16,7 +16,7 @@ from swarm.bus.bus import Heard
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS
-from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Vehicle

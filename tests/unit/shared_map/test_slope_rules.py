@@ -29,7 +29,7 @@ from swarm.config.ground import CostConfig
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
+from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 POINTS = ((-30.0, 3.0), (0.0, 1.0), (20.0, 4.0))
 """Of the rule `table`."""

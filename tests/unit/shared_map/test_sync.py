@@ -27,8 +27,7 @@ from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarksRequest
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarksRequest
 from swarm.wire.topics import DIGEST, MARKS, NOTE
 
 LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR

@@ -23,9 +23,9 @@ from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
-from swarm.order_book import OrderBook
+from swarm.runtime.order_book import OrderBook
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Order, Zone, ZoneOrder, Zones
-from swarm.wire.statements import MarkKind
 from swarm.wire.topics import ZONES
 
 ROWS, COLS = 40, 70

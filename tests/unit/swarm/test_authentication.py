@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.errors import ConfigError, ProtocolError
 from swarm.runtime.run_secret import authenticator_of
-from swarm.wire.authentication import Authenticator, check_code, code_of
+from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.topics import POSE, TABLE
 
 SHORT = st.text(max_size=4)

@@ -30,13 +30,12 @@ from swarm.client.observer import marked
 from swarm.client.own_marks import OwnMarks
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.base import WIRE_VERSION
-from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages import WIRE_VERSION
+from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 from swarm.wire.messages.processes import Note, RunInfo
+from swarm.wire.messages.vehicles import Body
 from swarm.wire.routes import Route as WireRoute
 from swarm.wire.routes import RouteStatus
-from swarm.wire.statements import FOREVER, MarkKind
 from swarm.wire.topics import BODY, NOTE, POSE, RUN
 
 LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE

@@ -14,7 +14,7 @@ from support.effort import few
 from support.wire_strategies import EXAMPLES, routes
 
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.marks import MarkSets
+from swarm.wire.messages.map_data import MarkSets
 from swarm.wire.routes import RouteBatch, Routes
 
 ROOT = Path(__file__).parents[3]
@@ -89,7 +89,7 @@ def test_bulk_marks_without_numpy_are_refused_in_a_sentence() -> None:
     [bulk] = [each for each in EXAMPLES if isinstance(each, MarkSets)]
     assert decode(encode(bulk), MarkSets) == bulk
     code = BLOCKED + (
-        "from swarm.wire.codec import decode; from swarm.wire.messages.marks import MarkSets\n"
+        "from swarm.wire.codec import decode; from swarm.wire.messages.map_data import MarkSets\n"
         "from swarm.errors import ProtocolError\n"
         f"try: decode(bytes.fromhex('{encode(bulk).hex()}'), MarkSets)\n"
         "except ProtocolError as error: print(error)\n"

@@ -20,9 +20,9 @@ from swarm.bus.bus import (
 )
 from swarm.liveness import Peer
 from swarm.runtime.inbox import CAPACITY, Inbox
-from swarm.wire.messages.base import Nothing
+from swarm.wire.messages import Nothing
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.topics import COST, NOTE, ROUTE, RUN, TRUE_POSE, Topic
 
 

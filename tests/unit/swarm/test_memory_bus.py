@@ -18,7 +18,7 @@ from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
 from swarm.liveness import Peer
 from swarm.wire.codec import decode
-from swarm.wire.messages.base import Nothing, schema_of
+from swarm.wire.messages import Nothing, schema_of
 from swarm.wire.topics import NOTE, POSE, RUN
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
-from swarm.order_book import MAX_AHEAD_NS, MOST_ORDERS, SETTINGS, OrderBook, described, judged
+from swarm.runtime.order_book import MAX_AHEAD_NS, MOST_ORDERS, SETTINGS, OrderBook, described, judged
 from swarm.wire.messages.orders import GiveOrder, Order
 
 SCENARIO = parse_scenario("""

@@ -19,8 +19,8 @@ from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, tick_phase
 from swarm.runtime.stats import Counters
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.topics import NOTE, TRUE_POSE
 
 

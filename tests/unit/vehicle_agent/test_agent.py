@@ -21,8 +21,7 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.plots import Plots
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import RouteReply
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteBatch

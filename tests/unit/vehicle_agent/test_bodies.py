@@ -17,7 +17,7 @@ from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import MOST_BODIES, Bodies
 from vehicle_agent.driving.vehicle import GivenRoute, Vehicle
 from vehicle_agent.traffic.detours import Detours

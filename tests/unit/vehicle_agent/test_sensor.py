@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm.grid import GridSpec
-from swarm.wire.statements import MarkKind
+from swarm.wire.messages.map_data import MarkKind
 from vehicle_agent.sensing.sensor import Sight, TruthSensor, compare
 
 GRID = GridSpec(9, 9, 10.0)

@@ -10,7 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.planning import TargetPose
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.target_bodies import TargetBodies
 

@@ -13,8 +13,8 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.right_of_way.plots import Plots
-from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.traffic import Granted
+from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.vehicle import GivenRoute, Vehicle
 from vehicle_agent.traffic.steering import Steering

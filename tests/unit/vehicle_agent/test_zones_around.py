@@ -8,9 +8,8 @@ from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
 from shared_map.keeper.store import KeeperStore
 from swarm.bus.bus import Event, Replied
-from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.orders import ZoneOrder, Zones
-from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.messages.vehicles import Body, VehicleState
 from swarm.wire.topics import BODY, ZONES
 
 

@@ -22,7 +22,7 @@ from launch_scripts.gateways.ros2.node import Node
 from swarm.client import Swarm
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.orders import Acknowledged
+from swarm.runtime.operator import Acknowledged
 
 log = logging.getLogger(__name__)
 

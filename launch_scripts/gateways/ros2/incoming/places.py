@@ -11,7 +11,7 @@ from typing import Any
 
 from launch_scripts.gateways.ros2.frames import TERRAIN_FRAME, RosMap, heading_of, heading_of_quaternion, yaw_of
 from launch_scripts.gateways.ros2.incoming.settings import ROBOT, Robots
-from swarm.wire.messages.bodies import MOST_M_PER_S
+from swarm.wire.messages.vehicles import MOST_M_PER_S
 
 _STANDS_M_PER_S = 0.05
 """What is slower does not drive anywhere: odometry of a robot that stands is seldom 0."""

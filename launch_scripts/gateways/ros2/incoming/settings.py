@@ -11,8 +11,8 @@ from msgspec import Meta
 from launch_scripts.gateways.ros2.names import ros_name
 from swarm.config.values import Metres, Name, Positive, Section
 from swarm.errors import ConfigError
-from swarm.wire.messages.bodies import LONGEST_LEASE_S, MOST_RADIUS_M
 from swarm.wire.messages.planning import GROUND
+from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_RADIUS_M
 
 ROBOT, TARGET = "{robot}", "{target}"
 MOST_HZ = 50.0
@@ -55,7 +55,7 @@ class Robots(Section, frozen=True, kw_only=True):
     offset_m: tuple[Metres, Metres] = (0.0, 0.0)
     turn_rad: Annotated[float, Meta(ge=-10, le=10)] = 0.0
     radius_m: Annotated[float, Meta(ge=0, le=MOST_RADIUS_M)] = 1.0
-    lease_s: Annotated[float, Meta(gt=0, le=LONGEST_LEASE_S)] = 2.0
+    lease_s: Annotated[float, Meta(gt=0, le=LONGEST_BODY_LEASE_S)] = 2.0
     hz: Annotated[float, Meta(gt=0, le=MOST_HZ)] = 10.0
     group: Name = "all"
     vehicle_class: Name = GROUND

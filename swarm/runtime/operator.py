@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
 from swarm.errors import BusError, ConfigError
-from swarm.liveness import Roster
-from swarm.ranks import job_of
+from swarm.liveness import Roster, job_of
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic

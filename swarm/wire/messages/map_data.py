@@ -1,0 +1,323 @@
+"""The shared map on the wire: statements about cells with the rules of their columns, sets and digests of them, and
+the terrain from a keeper."""
+
+from __future__ import annotations
+
+import enum
+import struct
+from typing import TYPE_CHECKING, Annotated
+
+from msgspec import Meta
+
+from swarm.grid import TILE_CELLS, GridSpec
+from swarm.wire.fields import (
+    Column,
+    GridSide,
+    Id,
+    LongText,
+    Metres,
+    Natural,
+    Region,
+    Resolution,
+    Tile,
+    Word,
+    check_column,
+    column,
+    np,
+    numpy_loaded,
+    width_of,
+)
+from swarm.wire.messages import Message, schema_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+TILE_AREA = TILE_CELLS * TILE_CELLS
+
+STAMP_LIMIT_NS = 1 << 62
+"""Marks stamped from here on (year 2116) are rejected by all processes, so that there is always a newer stamp."""
+
+PACE_LEAST: float = struct.unpack("<f", struct.pack("<f", 1 / 340))[0]
+"""s/m; what drives quicker than sound is no vehicle. Float32, as marks are."""
+PACE_MOST = 100.0
+"""s/m, a cell of 10 m in 17 minutes: slower ground is better told as lethal. Both bound what one wrong mark can do
+to lower bounds and to the number of buckets of every planner."""
+
+FOREVER = (1 << 63) - 1
+"""`until_ns` of a mark that does not expire."""
+
+
+class MarkKind(enum.IntEnum):
+    """What a mark states about a cell."""
+
+    PACE = 0
+    """It can be driven at this pace, in s/m."""
+    LETHAL = 1
+    """It must not be entered."""
+    CLEAR = 2
+    """It is as the prior map has it: undoes older marks."""
+
+
+LAST_KIND = int(max(MarkKind))
+_FEW = 100
+"""Up to this many statements, which most sets have, lists are checked several times faster than arrays."""
+
+
+def check_lengths(
+    count: int, cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes, untils_ns: bytes = b""
+) -> None:
+    """Raise ValueError unless these are columns of `count` statements; `untils_ns` may be empty."""
+    if (
+        len(kinds) == count
+        and len(cells) == 2 * count
+        and len(paces) == 4 * count
+        and len(stamps_ns) == 8 * count
+        and len(untils_ns) in (0, 8 * count)
+    ):
+        return
+    check_column("cells", cells, 2, count)
+    check_column("kinds", kinds, 1, count)
+    check_column("paces", paces, 4, count)
+    check_column("stamps_ns", stamps_ns, 8, count)
+    if untils_ns:
+        check_column("untils_ns", untils_ns, 8, count)
+
+
+def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes) -> None:
+    """Raise ValueError with the rule that the columns of one set break. It has one or more statements."""
+    if max(kinds) > LAST_KIND:
+        raise ValueError(f"kind {max(kinds)} is not in 0..{LAST_KIND}")
+    if len(kinds) > _FEW and numpy_loaded():
+        array = column(cells, "<u2")
+        rising = bool((array[1:] > array[:-1]).all())
+        last = int(array[-1])
+        times = column(stamps_ns, "<i8")
+        oldest_ns, newest_ns = int(times.min()), int(times.max())
+        told = column(paces, "<f4")[column(kinds, "<u1") == MarkKind.PACE]
+        possible = bool(((told >= PACE_LEAST) & (told <= PACE_MOST)).all())
+    else:
+        listed = memoryview(cells).cast("H").tolist()
+        rising = sorted(set(listed)) == listed
+        last = listed[-1]
+        stamps = memoryview(stamps_ns).cast("q").tolist()
+        oldest_ns, newest_ns = min(stamps), max(stamps)
+        said = zip(memoryview(paces).cast("f").tolist(), kinds, strict=True)
+        possible = all(kind != MarkKind.PACE or PACE_LEAST <= pace <= PACE_MOST for pace, kind in said)
+    if not rising or last >= TILE_AREA:
+        raise ValueError(f"cells must increase strictly below {TILE_AREA}")
+    if not possible:
+        raise ValueError(f"the pace of a PACE mark must be in {PACE_LEAST:.4g} ... {PACE_MOST:g} s/m")
+    if oldest_ns < 0 or newest_ns >= STAMP_LIMIT_NS:
+        raise ValueError("stamps_ns must not be negative, and below 2**62")
+
+
+def faulty_sets(
+    counts: NDArray[np.int64], cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes
+) -> NDArray[np.int64]:
+    """Numbers of the sets that break a rule of `check_statements`, in order.
+
+    counts  int64 (sets,)  statements of each set; the columns hold those of all sets, one set after the other
+    """
+    cell, kind = column(cells, "<u2"), column(kinds, "<u1")
+    pace, stamp_ns = column(paces, "<f4"), column(stamps_ns, "<i8")
+    wrong = (cell >= TILE_AREA) | (kind > LAST_KIND) | (stamp_ns < 0) | (stamp_ns >= STAMP_LIMIT_NS)
+    wrong |= (kind == MarkKind.PACE) & ~((pace >= PACE_LEAST) & (pace <= PACE_MOST))
+    fallen = np.zeros(len(cell), bool)
+    fallen[1:] = cell[1:] <= cell[:-1]
+    starts = np.cumsum(counts) - counts
+    fallen[starts[counts > 0]] = False
+    wrong |= fallen
+    if not wrong.any():
+        return np.empty(0, np.int64)
+    return np.unique(np.repeat(np.arange(len(counts)), counts)[wrong])
+
+
+SEQ_STEP = 1 << 16
+"""An author's own numbers are multiples of this."""
+_ROW = (("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8"))
+DIGEST_ROW = list(_ROW)
+"""As NumPy wants it."""
+DIGEST_ROW_BYTES = width_of(_ROW)
+MOST_TILES = 1 << 18
+"""Named in one message: every tile of a map of 16,384 x 16,384 cells."""
+DigestRows = Annotated[bytes, Meta(max_length=DIGEST_ROW_BYTES * MOST_TILES), Column(_ROW)]
+_AUTHORS = Meta(max_length=1 << 16)
+_Cells = Annotated[bytes, Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
+_Kinds = Annotated[bytes, Column("<u1", least=0, most=LAST_KIND, checked=False)]
+_Paces = Annotated[bytes, Column("<f4", per="kinds", least=PACE_LEAST, most=PACE_MOST, checked=False)]
+_Stamps = Annotated[bytes, Column("<i8", per="kinds", least=0, most=STAMP_LIMIT_NS - 1, checked=False)]
+
+
+def owner_of(author: str) -> str:
+    """The process that an author is a life of. Its certificate lets it write under any number of lives, so limits
+    and votes are those of processes."""
+    return author.rpartition(".")[0] or author
+
+
+class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
+    """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
+
+    An author counts `seq` in steps of 65536. The numbers between are for keepers, which compact the sets of dead
+    authors: drop from them what others overrule. Such a set without statements is a tombstone: readers forget the
+    tile of that author.
+
+    tile       of a grid of N tiles: 0 ... N - 1 for all vehicles; N tells what its author has learned; tile
+               n (N + 1) + t is tile t for the n-th of the scenario's classes alone
+
+    cells      uint16  index inside the tile, row-major over 32 x 32, strictly increasing
+    kinds      uint8   MarkKind
+    paces      float32 s/m for PACE, ignored otherwise
+    stamps_ns  int64   hybrid logical time of each statement
+    untils_ns  int64   when each statement ends by itself, FOREVER if it does not; empty if none does
+
+    A set is checked when it is decoded (`check`), not when it is made: the statements of many sets are checked at
+    once, by the rules of `swarm.wire.messages.map_data`.
+    """
+
+    author: Id
+    group: Id
+    tile: Tile
+    epoch: Natural
+    seq: Natural
+    cells: _Cells
+    kinds: Annotated[_Kinds, Meta(max_length=TILE_AREA)]
+    paces: _Paces
+    stamps_ns: _Stamps
+    untils_ns: Annotated[bytes, Meta(max_length=8 * TILE_AREA), Column("<i8")] = b""
+
+    def __post_init__(self) -> None:
+        pass
+
+    def check(self) -> None:
+        self.check_head()
+        if self.kinds:
+            check_statements(self.cells, self.kinds, self.paces, self.stamps_ns)
+
+    def check_head(self) -> None:
+        """All but the rules of the statements themselves, which are cheaper to check of many sets at once."""
+        self.check_bounds()
+        check_lengths(len(self.kinds), self.cells, self.kinds, self.paces, self.stamps_ns, self.untils_ns)
+
+
+class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark-sets")):
+    """Many sets of one author and group, as one reply carries them: columns over the sets, then the statements of
+    all sets, one set after the other.
+
+    tiles      uint32  of each set; none twice
+    epochs     uint64
+    seqs       uint64
+    counts     uint16  statements of each set
+    ending     uint8   1 where a set has `untils_ns`
+    cells      uint16, kinds uint8, paces float32, stamps_ns int64: as in MarkSet
+    untils_ns  int64   of the statements of the sets that have them
+    """
+
+    author: Id
+    group: Id
+    tiles: Annotated[bytes, Column("<u4", per="ending", least=0, most=(1 << 22) - 1)]
+    epochs: Annotated[bytes, Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
+    seqs: Annotated[bytes, Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
+    counts: Annotated[bytes, Column("<u2", per="ending", least=0, most=TILE_AREA)]
+    ending: Annotated[bytes, Meta(max_length=MOST_TILES), Column("<u1", least=0, most=1)]
+    cells: _Cells
+    kinds: Annotated[_Kinds, Meta(max_length=1 << 20)]
+    paces: _Paces
+    stamps_ns: _Stamps
+    untils_ns: Annotated[bytes, Meta(max_length=8 << 20), Column("<i8")] = b""
+
+    def __post_init__(self) -> None:
+        pass
+
+    def check(self) -> None:
+        self.check_bounds()
+
+    def relate(self) -> None:
+        if not numpy_loaded():
+            raise ValueError("many sets at once are read with NumPy only: ask without `bulk`")
+        sets = len(self.ending)
+        counts = column(self.counts, "<u2").astype(np.int64)
+        ending = column(self.ending, "<u1")
+        check_lengths(int(counts.sum()), self.cells, self.kinds, self.paces, self.stamps_ns)
+        check_column("untils_ns", self.untils_ns, 8, int(counts[ending == 1].sum()))
+        if len(np.unique(column(self.tiles, "<u4"))) < sets:
+            raise ValueError("tiles names a tile twice")
+        faulty = faulty_sets(counts, self.cells, self.kinds, self.paces, self.stamps_ns)
+        if len(faulty):
+            raise ValueError(f"set {int(faulty[0])} of {sets} breaks a rule of its statements")
+
+
+class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
+    """Which sets a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
+    rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
+
+    whole  false: only tiles that changed lately, told between the whole digests
+    seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
+    """
+
+    author: Id
+    role: Word
+    held: Annotated[dict[Id, DigestRows], _AUTHORS]
+    whole: bool = True
+    seq: Natural = 0
+
+
+class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-request")):
+    """Asks authors and the keeper for sets: of these authors and tiles, or of all where a list is empty.
+
+    bulk  answers may be MarkSets, under a key with `-` for region and tile
+    """
+
+    authors: Annotated[list[Id], _AUTHORS] = []
+    tiles: Annotated[list[Tile], Meta(max_length=MOST_TILES)] = []
+    bulk: bool = False
+
+
+BASE_DIGEST_BYTES = 8
+MOST_REGIONS = 1 << 16
+"""Of the largest grid."""
+_DIGESTS = Meta(max_length=BASE_DIGEST_BYTES * MOST_REGIONS)
+_LAYERS = Meta(max_length=100)
+
+
+class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
+    """What a keeper has of the run's terrain, for machines without its files.
+
+    digests  layer -> 8 bytes per region (256 x 256 cells): BLAKE2b of its bytes, in order of region
+    notes    sentences about where the terrain came from
+    """
+
+    keeper: Id
+    terrain: Word
+    rows: GridSide
+    cols: GridSide
+    resolution_m: Resolution
+    west_m: Metres
+    north_m: Metres
+    crs: LongText
+    digests: Annotated[dict[Word, Annotated[bytes, _DIGESTS]], _LAYERS]
+    notes: Annotated[list[LongText], Meta(max_length=1000)] = []
+
+    def relate(self) -> None:
+        regions = self.grid.regions
+        for layer, digests in self.digests.items():
+            check_column(f"digests of {layer[:40]}", digests, BASE_DIGEST_BYTES, regions)
+
+    @property
+    def grid(self) -> GridSpec:
+        return GridSpec(self.rows, self.cols, self.resolution_m, self.west_m, self.north_m, self.crs)
+
+
+class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map-request")):
+    """Asks a keeper for these layers of these regions."""
+
+    layers: Annotated[list[Word], _LAYERS] = []
+    regions: Annotated[list[Region], Meta(max_length=MOST_REGIONS)] = []
+
+
+class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
+    """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
+    row, then the next. Similar bytes side by side compress better."""
+
+    layer: Word
+    region: Region
+    data: Annotated[bytes, Meta(max_length=4 << 20)]
