@@ -108,10 +108,10 @@ def mavlink(
 
     swarm mavlink serial:/dev/ttyACM0:57600 --target t0 --drive guided --class drone --altitude 60
     """
-    from launch_scripts.gateways.mavlink.adapter import Wishes
+    from launch_scripts.gateways.mavlink.guidance import Wishes
     from launch_scripts.gateways.mavlink.link import read_address
-    from launch_scripts.gateways.mavlink.run import Body, read_key, run
-    from launch_scripts.gateways.mavlink.wire import pymavlink
+    from launch_scripts.gateways.mavlink.mavlink_codec import pymavlink
+    from launch_scripts.gateways.mavlink.service import Body, read_key, run
     from swarm.client import Swarm, connect
     from swarm.config.agents import agent_of
     from swarm.errors import ConfigError

@@ -21,19 +21,18 @@ from support.mavlink_world import (
     World,
 )
 
-from launch_scripts.gateways.mavlink.adapter import Wishes
-from launch_scripts.gateways.mavlink.autopilots import ARDUPILOT, PX4, kind_of
-from launch_scripts.gateways.mavlink.messages import (
+from launch_scripts.gateways.mavlink.adapter import Action, Follow, Report, Unfollow
+from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, kind_of
+from launch_scripts.gateways.mavlink.guidance import MOST_TRIES, RETRY_NS, Way, Wishes
+from launch_scripts.gateways.mavlink.mavlink_codec import (
     ARM_DISARM,
     DO_SET_MODE,
     MISSION_START,
     NAV_TAKEOFF,
     SET_MESSAGE_INTERVAL,
-    Action,
     Beat,
     Command,
     CommandAnswered,
-    Follow,
     Heartbeat,
     Incoming,
     ItemAsked,
@@ -43,14 +42,9 @@ from launch_scripts.gateways.mavlink.messages import (
     MissionCurrent,
     MissionItem,
     Position,
-    Report,
     Setpoint,
-    Unfollow,
     Warned,
-    Way,
 )
-from launch_scripts.gateways.mavlink.upload import MOST_TRIES, RETRY_NS
-from launch_scripts.gateways.mavlink.wheel import Wheel
 from swarm.clock import NS_PER_S
 
 OF_THE_WHEEL = (ARM_DISARM, DO_SET_MODE, MISSION_START, NAV_TAKEOFF)
@@ -229,7 +223,7 @@ def test_whoever_takes_the_wheel_from_us_keeps_it(
     if guided and mode is None:
         return
     hold = None if made.modes is None else made.modes.hold
-    wheel = Wheel(made, mode, starts=not guided, takeoff_m=None)
+    wheel = Arming(made, mode, starts=not guided, takeoff_m=None)
     drove = held = taken_away = False
     now_s = 0.0
     for armed, at, wish, for_s, height_m in looks:

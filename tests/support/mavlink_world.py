@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from launch_scripts.gateways.mavlink.adapter import Adapter, Wishes
-from launch_scripts.gateways.mavlink.autopilots import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.messages import (
+from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Tell
+from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
+from launch_scripts.gateways.mavlink.guidance import Way, Wishes
+from launch_scripts.gateways.mavlink.mavlink_codec import (
     ARM_DISARM,
     DO_SET_MODE,
     MISSION_START,
-    Action,
     Beat,
     Command,
     CommandAnswered,
@@ -20,8 +20,6 @@ from launch_scripts.gateways.mavlink.messages import (
     MissionCount,
     MissionItem,
     Position,
-    Tell,
-    Way,
 )
 from swarm.client import Frame
 from swarm.clock import NS_PER_S

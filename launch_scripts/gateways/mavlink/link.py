@@ -1,4 +1,4 @@
-"""The link to a vehicle: bytes in and out of UDP, TCP or a serial port, never waiting.
+"""The link to a vehicle: bytes in and out of UDP, TCP or a serial port, hardly ever waiting.
 
 pymavlink has connections of its own. They answer whoever has sent them anything, keep what strangers name, and wait
 for seconds where a peer is gone.
@@ -7,7 +7,6 @@ for seconds where a peer is gone.
 from __future__ import annotations
 
 import contextlib
-import errno
 import re
 import select
 import socket
@@ -19,15 +18,19 @@ from typing import Any, Protocol
 from swarm.errors import BusError, ConfigError
 
 _MOST_BYTES = 65536
-_CONNECT_AGAIN_S = 1.0
+_OPEN_AGAIN_S = 1.0
+_PATIENCE_S = 0.3
+"""A TCP peer which has not answered by then is tried again later: nothing else is done meanwhile."""
 _BAUD = 57600
 _EXAMPLES = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
 @dataclass(frozen=True)
 class Address:
-    """kind  udpin, udpout, tcp or serial
-    name  a host, or a device
+    """The address of a vehicle.
+
+    kind    udpin, udpout, tcp or serial
+    name    a host, or a device
     number  port, or bauds
     """
 
@@ -57,7 +60,7 @@ class Link(Protocol):
     """Each piece that it brings holds whole messages."""
 
     def read(self, within_s: float) -> bytes | None:
-        """What has come, after waiting for it for so long; None if nothing has."""
+        """Returns what has come, after waiting for it for so long; None if nothing has."""
 
     def answer_last(self) -> None:
         """What was read last is the vehicle's: what is written goes where it came from."""
@@ -70,8 +73,20 @@ class Link(Protocol):
 def open_link(address: Address) -> Link:
     """Raises ConfigError or BusError."""
     if address.kind == "serial":
-        return SerialLink(address)
-    return TcpLink(address) if address.kind == "tcp" else UdpLink(address)
+        link = StreamLink(_serial_opener(address), lambda port: port.read(port.in_waiting or 1), _write)
+        try:
+            link.open()
+        except (OSError, ValueError) as error:
+            raise BusError(f"cannot open {address}: {error}") from error
+        return link
+    kind = socket.SOCK_STREAM if address.kind == "tcp" else socket.SOCK_DGRAM
+    try:
+        family, _, _, _, peer = socket.getaddrinfo(address.name, address.number, type=kind)[0]
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(f"LINK: there is no host {address.name[:80]!r}") from error
+    if address.kind == "tcp":
+        return StreamLink(lambda: _connected(family, peer), lambda connection: connection.recv(_MOST_BYTES), _send)
+    return UdpLink(address, family, peer)
 
 
 class UdpLink:
@@ -79,8 +94,7 @@ class UdpLink:
 
     whole = True
 
-    def __init__(self, address: Address) -> None:
-        family, peer = _resolved(address, socket.SOCK_DGRAM)
+    def __init__(self, address: Address, family: int, peer: Any) -> None:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._last: Any = None
@@ -93,13 +107,11 @@ class UdpLink:
                 raise BusError(f"cannot listen at {address}: {error.strerror or error}") from error
 
     def read(self, within_s: float) -> bytes | None:
-        if not select.select([self._socket], [], [], within_s)[0]:
-            return None
-        try:
-            data, self._last = self._socket.recvfrom(_MOST_BYTES)
-        except OSError:  # nobody was there for what we have sent
-            return None
-        return data
+        if select.select([self._socket], [], [], within_s)[0]:
+            with contextlib.suppress(OSError):  # nobody was there for what we have sent
+                data, self._last = self._socket.recvfrom(_MOST_BYTES)
+                return data
+        return None
 
     def answer_last(self) -> None:
         self._peer = self._last
@@ -113,136 +125,85 @@ class UdpLink:
         self._socket.close()
 
 
-class TcpLink:
-    """Connects, and once a second again while nobody is there."""
+class StreamLink:
+    """A TCP connection or a serial port, opened again once a second while it is gone. All three raise OSError.
+
+    made  opens it
+    take  returns what has come on it; nothing if it was closed
+    give  sends bytes on it
+    """
 
     whole = False
 
-    def __init__(self, address: Address) -> None:
-        self._family, self._peer = _resolved(address, socket.SOCK_STREAM)
-        self._socket: socket.socket | None = None
-        self._connected = False
+    def __init__(
+        self, made: Callable[[], Any], take: Callable[[Any], bytes], give: Callable[[Any, bytes], None]
+    ) -> None:
+        self._made, self._take, self._give = made, take, give
+        self._stream: Any = None
         self._due_s = 0.0
 
-    def read(self, within_s: float) -> bytes | None:
-        if not self._is_up(within_s) or self._socket is None:
-            return None
-        if not select.select([self._socket], [], [], within_s)[0]:
-            return None
-        try:
-            data = self._socket.recv(_MOST_BYTES)
-        except BlockingIOError:
-            return None
-        except OSError:
-            data = b""
-        if not data:
-            self.close()
-        return data or None
-
-    def answer_last(self) -> None:
-        pass
-
-    def write(self, data: bytes) -> None:
-        if self._socket is None or not self._connected:
-            return
-        try:
-            if self._socket.send(data) < len(data):
-                self.close()  # a peer that reads nothing; half a message would spoil what follows
-        except BlockingIOError:
-            pass
-        except OSError:
-            self.close()
-
-    def close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-        self._socket, self._connected = None, False
-
-    def _is_up(self, within_s: float) -> bool:
-        """Whether it is connected; goes on connecting, and waits while it is not."""
-        if self._connected:
-            return True
-        now_s = time.monotonic()
-        if self._socket is None:
-            if now_s < self._due_s:
-                time.sleep(within_s)
-                return False
-            self._due_s = now_s + _CONNECT_AGAIN_S
-            self._socket = socket.socket(self._family, socket.SOCK_STREAM)
-            self._socket.setblocking(False)
-            if self._socket.connect_ex(self._peer) not in (0, errno.EINPROGRESS):
-                self.close()
-                return False
-        if not select.select([], [self._socket], [], within_s)[1]:
-            if now_s > self._due_s + 5 * _CONNECT_AGAIN_S:
-                self.close()
-            return False
-        if self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            self.close()
-            return False
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._connected = True
-        return True
-
-
-class SerialLink:
-    """A serial port, opened again once a second while it is gone."""
-
-    whole = False
-
-    def __init__(self, address: Address) -> None:
-        try:
-            import serial
-        except ModuleNotFoundError as error:
-            raise ConfigError("a serial link needs pyserial: pip install 'terrain-swarm[mavlink]'") from error
-        port: Any = serial.Serial
-        self._open: Callable[[], Any] = lambda: port(address.name, address.number, timeout=0.02, write_timeout=0.05)
-        self._due_s = 0.0
-        try:
-            self._port: Any = self._open()
-        except (OSError, ValueError) as error:
-            raise BusError(f"cannot open {address}: {error}") from error
+    def open(self) -> None:
+        self._due_s = time.monotonic() + _OPEN_AGAIN_S
+        self._stream = self._made()
 
     def read(self, within_s: float) -> bytes | None:
-        if self._port is None and not self._opened():
+        if self._stream is None and time.monotonic() >= self._due_s:
+            with contextlib.suppress(OSError, ValueError):
+                self.open()
+        if self._stream is None:
             time.sleep(within_s)
-            return None
-        try:
-            data: bytes = self._port.read(1)  # waits for it
-            data += self._port.read(self._port.in_waiting)
-        except OSError:
+        elif select.select([self._stream], [], [], within_s)[0]:
+            with contextlib.suppress(OSError):
+                if data := self._take(self._stream):
+                    return data
             self.close()
-            return None
-        return data or None
+        return None
 
     def answer_last(self) -> None:
         pass
 
     def write(self, data: bytes) -> None:
-        if self._port is not None:
+        if self._stream is not None:
             try:
-                self._port.write(data)
+                self._give(self._stream, data)
+            except BlockingIOError:
+                pass
             except OSError:
                 self.close()
 
     def close(self) -> None:
-        if self._port is not None:
+        if self._stream is not None:
             with contextlib.suppress(OSError):
-                self._port.close()
-        self._port = None
-
-    def _opened(self) -> bool:
-        if time.monotonic() < self._due_s:
-            return False
-        self._due_s = time.monotonic() + _CONNECT_AGAIN_S
-        with contextlib.suppress(OSError, ValueError):
-            self._port = self._open()
-        return self._port is not None
+                self._stream.close()
+        self._stream = None
 
 
-def _resolved(address: Address, kind: int) -> tuple[int, Any]:
+def _serial_opener(address: Address) -> Callable[[], Any]:
     try:
-        found = socket.getaddrinfo(address.name, address.number, type=kind)
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(f"LINK: there is no host {address.name[:80]!r}") from error
-    return found[0][0], found[0][4]
+        import serial
+    except ModuleNotFoundError as error:
+        raise ConfigError("a serial link needs pyserial: pip install 'terrain-swarm[mavlink]'") from error
+    port: Any = serial.Serial
+    return lambda: port(address.name, address.number, timeout=0.02, write_timeout=0.05)
+
+
+def _write(port: Any, data: bytes) -> None:
+    port.write(data)
+
+
+def _connected(family: int, peer: Any) -> socket.socket:
+    made = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        made.settimeout(_PATIENCE_S)
+        made.connect(peer)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        made.setblocking(False)
+    except OSError:
+        made.close()
+        raise
+    return made
+
+
+def _send(connection: socket.socket, data: bytes) -> None:
+    if connection.send(data) < len(data):
+        raise OSError("its peer reads nothing, and half a message would spoil what follows")

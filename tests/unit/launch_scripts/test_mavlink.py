@@ -23,9 +23,10 @@ from support.mavlink_world import (
     World,
 )
 
-from launch_scripts.gateways.mavlink.adapter import Wishes
-from launch_scripts.gateways.mavlink.autopilots import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.messages import (
+from launch_scripts.gateways.mavlink.adapter import Follow, Report, Unfollow, Withdraw
+from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
+from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Upload, Way, Wishes, is_end_of, rest, turns
+from launch_scripts.gateways.mavlink.mavlink_codec import (
     ABOVE_HOME,
     ABOVE_TERRAIN,
     ARM_DISARM,
@@ -37,7 +38,6 @@ from launch_scripts.gateways.mavlink.messages import (
     SET_MESSAGE_INTERVAL,
     Beat,
     Command,
-    Follow,
     ItemAsked,
     MissionAnswered,
     MissionCancelled,
@@ -45,15 +45,9 @@ from launch_scripts.gateways.mavlink.messages import (
     MissionCurrent,
     MissionItem,
     Position,
-    Report,
     Setpoint,
-    Unfollow,
     Warned,
-    Way,
-    Withdraw,
 )
-from launch_scripts.gateways.mavlink.upload import State, Upload
-from launch_scripts.gateways.mavlink.waypoints import MOST_POINTS, is_end_of, rest, turns
 
 MISSION, GUIDED = Wishes("t0"), Wishes("t0", "guided")
 OFFBOARD, AUTO_MISSION, AUTO_HOLD = 6 << 16, 4 << 16 | 4 << 24, 4 << 16 | 3 << 24
@@ -303,22 +297,22 @@ def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
     upload = Upload(items)
     assert upload.tick(0) == MissionCount(3)
     for seq in (2, 0, 0, 1):
-        upload.hear_asked(seq)
+        upload.hear(ItemAsked(seq))
         assert upload.tick(0) == items[seq]
-    upload.hear_asked(9)
-    upload.hear_answered(0)
-    assert upload.state is State.UNDER_WAY, "it has not had the last item since"
-    upload.hear_asked(2)
-    upload.hear_answered(0)
-    assert upload.state is State.ACCEPTED
+    upload.hear(ItemAsked(9))
+    upload.hear(MissionAnswered(0))
+    assert not upload.accepted, "it has not had the last item since"
+    upload.hear(ItemAsked(2))
+    upload.hear(MissionAnswered(0))
+    assert upload.accepted
 
 
 def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
     upload = Upload([MissionItem(0, NAV_WAYPOINT, ABOVE_HOME, 1.0, 2.0, 0.0)])
     for _ in range(100):
-        upload.hear_asked(0)
+        upload.hear(ItemAsked(0))
         upload.tick(0)
-    assert upload.state is State.FAILED
+    assert upload.why
 
 
 # --- the wheel ---------------------------------------------------------------------------------------------------

@@ -10,9 +10,9 @@ from support.client_rig import run_info
 from support.mavlink_world import FRAME, GRID, START, TO_THE_EAST
 from support.swarm_model import SwarmModel
 
-from launch_scripts.gateways.mavlink.adapter import Wishes
-from launch_scripts.gateways.mavlink.run import Body, Shell, check_ground
-from launch_scripts.gateways.mavlink.wire import AUTOPILOT, Wire
+from launch_scripts.gateways.mavlink.guidance import Wishes
+from launch_scripts.gateways.mavlink.mavlink_codec import AUTOPILOT, Wire
+from launch_scripts.gateways.mavlink.service import Body, Shell, check_ground
 from swarm.bus.bus import Heard
 from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
 from swarm.client.session import Session
@@ -131,8 +131,8 @@ def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error
     rig.turns(0.1)
     driver = rig.shell._adapter._driver
     assert driver is not None
-    assert driver._wheel is not None
-    driver._wheel.drive(rig.shell._adapter._beat, 0.0, rig.now_ns)  # type: ignore[arg-type]
+    assert driver._arming is not None
+    driver._arming.drive(rig.shell._adapter._beat, 0.0, rig.now_ns)  # type: ignore[arg-type]
     rig.session.ended = RunMismatchError("run a is over, and run b is in its namespace: connect again")
     rig.vehicle_says(12, 10, mission, base=1 | 128)
     with pytest.raises(RunMismatchError):

@@ -17,11 +17,14 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.gateways.mavlink.link import Link, open_link, read_address
-from launch_scripts.gateways.mavlink.messages import (
+from launch_scripts.gateways.mavlink.mavlink_codec import (
     ABOVE_HOME,
     ABOVE_TERRAIN,
     ARM_DISARM,
+    AUTOPILOT,
+    COMPID,
     NAV_WAYPOINT,
+    SYSID,
     Beat,
     Command,
     CommandAnswered,
@@ -35,9 +38,9 @@ from launch_scripts.gateways.mavlink.messages import (
     Position,
     Setpoint,
     Warned,
+    Wire,
 )
-from launch_scripts.gateways.mavlink.run import read_key
-from launch_scripts.gateways.mavlink.wire import AUTOPILOT, COMPID, SYSID, Wire
+from launch_scripts.gateways.mavlink.service import read_key
 from swarm.errors import BusError, ConfigError
 
 common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")

@@ -1,50 +1,157 @@
-"""Bytes of a link become checked messages of one vehicle, and messages become bytes.
+"""MAVLink's messages as checked values, and the bytes of a link from and to them.
 
-Whatever comes is hostile until it has passed here. Other vehicles and ground stations on the link are not heard.
+Whatever comes is hostile until it has passed `Wire.read`. Other vehicles and ground stations on the link are not
+heard. Numbers are those of MAVLink's common.xml.
 """
 
 from __future__ import annotations
 
 import io
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from launch_scripts.gateways.mavlink.messages import (
-    Beat,
-    Command,
-    CommandAnswered,
-    Heartbeat,
-    Incoming,
-    ItemAsked,
-    MissionAnswered,
-    MissionCancelled,
-    MissionCount,
-    MissionCurrent,
-    MissionItem,
-    Outgoing,
-    Position,
-    Setpoint,
-    Warned,
-)
+from msgspec import Struct
+
 from swarm.errors import ConfigError
 
 SYSID, COMPID = 245, 191
-"""Ours: a system that is no vehicle, its onboard computer."""
+"""Ours: a system which is no vehicle, and its onboard computer."""
 AUTOPILOT = 1
 """MAV_COMP_ID_AUTOPILOT1."""
+NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_TAKEOFF = 16, 17, 22
+DO_SET_MODE, MISSION_START, ARM_DISARM, SET_MESSAGE_INTERVAL = 176, 300, 400, 511
+GLOBAL_POSITION_INT = 33
+ABOVE_HOME, ABOVE_TERRAIN = 6, 11
+"""Frames of latitudes and longitudes times 1e7: GLOBAL_RELATIVE_ALT_INT and GLOBAL_TERRAIN_ALT_INT."""
+ACCEPTED, IN_PROGRESS = 0, 5
 _INVALID_AUTOPILOT = 8
 _ONBOARD_CONTROLLER, _ACTIVE = 18, 4
 _ARMED = 128
 _WARNING = 4
 _CANCELLED = 15
 _POSITION_ONLY, _PLACE_ONLY = 0x0DF8, 0x0DFC
-"""Type masks of a setpoint: what is ignored; the second ignores the height, too."""
+"""Type masks of a setpoint: what is ignored. The second ignores the height, too."""
 _NOT_KNOWN = 65535
 _SIGNING_EPOCH_S = 1_420_070_400
 """2015-01-01, from which signatures count in units of 10 us."""
 _LONGEST_REST = 512
-"""Bytes of an unfinished message; a whole one has 280."""
+"""The bytes that are kept of an unfinished message. A whole one has 280."""
+
+
+# --- heard of the vehicle -----------------------------------------------------------------------------------------
+
+
+class Beat(Struct, frozen=True):
+    """HEARTBEAT: MAV_AUTOPILOT, MAV_TYPE, whether motors are armed, and the autopilot's own number of its mode."""
+
+    autopilot: int
+    type: int
+    armed: bool
+    mode: int
+
+
+class Position(Struct, frozen=True):
+    """GLOBAL_POSITION_INT, with a place on Earth.
+
+    height_m     above home
+    heading_rad  clockwise from north; None if the vehicle does not know it
+    """
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    speed_m_per_s: float
+    heading_rad: float | None
+
+
+class ItemAsked(Struct, frozen=True):
+    """MISSION_REQUEST_INT or MISSION_REQUEST, to us."""
+
+    seq: int
+
+
+class MissionAnswered(Struct, frozen=True):
+    """MISSION_ACK, to us: MAV_MISSION_RESULT."""
+
+    result: int
+
+
+class CommandAnswered(Struct, frozen=True):
+    """COMMAND_ACK: MAV_CMD and MAV_RESULT."""
+
+    command: int
+    result: int
+
+
+class Warned(Struct, frozen=True):
+    """STATUSTEXT of a warning or worse, without the signs which a terminal would obey."""
+
+    text: str
+
+
+Incoming = Beat | Position | ItemAsked | MissionAnswered | CommandAnswered | Warned
+
+
+# --- said to the vehicle ------------------------------------------------------------------------------------------
+
+
+class Heartbeat(Struct, frozen=True):
+    """Ours, of an onboard controller."""
+
+
+class Command(Struct, frozen=True):
+    """COMMAND_LONG with its first parameters; the others are 0."""
+
+    command: int
+    params: tuple[float, ...] = ()
+
+
+class MissionCount(Struct, frozen=True):
+    """MISSION_COUNT, with which an upload begins."""
+
+    items: int
+
+
+class MissionItem(Struct, frozen=True):
+    """MISSION_ITEM_INT.
+
+    frame  `ABOVE_HOME` or `ABOVE_TERRAIN`, which `height_m` is
+    """
+
+    seq: int
+    command: int
+    frame: int
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    current: bool = False
+
+
+class MissionCurrent(Struct, frozen=True):
+    """MISSION_SET_CURRENT."""
+
+    seq: int
+
+
+class MissionCancelled(Struct, frozen=True):
+    """MISSION_ACK with which we end an upload before the vehicle has it all."""
+
+
+class Setpoint(Struct, frozen=True):
+    """SET_POSITION_TARGET_GLOBAL_INT of a position alone.
+
+    height_m  None: the vehicle stays on its ground
+    """
+
+    frame: int
+    lat_deg: float
+    lon_deg: float
+    height_m: float | None
+
+
+Outgoing = Heartbeat | Command | MissionCount | MissionItem | MissionCurrent | MissionCancelled | Setpoint
 
 
 def pymavlink() -> Any:
@@ -63,10 +170,13 @@ class Wire:
     key     32 bytes: what is said is signed, and what is not signed by it is not heard; None: no signatures
     now_s   Unix time, from which signatures count up
 
-    counts  of messages refused: unreadable, of others, without sense
+    counts  of messages refused: unreadable, of_others, senseless
     """
 
     def __init__(self, sysid: int | None, key: bytes | None, now_s: float) -> None:
+        self.vehicle = sysid
+        """The system number of the vehicle, once it is known."""
+        self.counts: Counter[str] = Counter()
         self._common = pymavlink()
         self._sent = io.BytesIO()
         self._mav = _parser(self._common)(self._sent, srcSystem=SYSID, srcComponent=COMPID)
@@ -75,18 +185,9 @@ class Wire:
             signing = self._mav.signing
             signing.secret_key, signing.link_id, signing.sign_outgoing = key, 0, True
             signing.timestamp = int((now_s - _SIGNING_EPOCH_S) * 1e5)
-        self._sysid = sysid
-        self.counts = {"unreadable": 0, "of_others": 0, "senseless": 0}
-
-    @property
-    def vehicle(self) -> int | None:
-        """The number of the vehicle, once it is known."""
-        return self._sysid
-
-    # --- in -------------------------------------------------------------------------------------------------------
 
     def read(self, data: bytes, *, whole: bool) -> list[Incoming]:
-        """The vehicle's messages in what a link has brought.
+        """Returns the vehicle's messages in what a link has brought.
 
         whole  no message goes on in what comes next, as in a datagram
         """
@@ -95,48 +196,38 @@ class Wire:
         except Exception:  # of a parser that meets any bytes
             self.counts["unreadable"] += 1
             found, whole = [], True
-        self._trim(whole)
-        heard = (self._checked(each) for each in found)
-        return [each for each in heard if each is not None]
-
-    def _trim(self, whole: bool) -> None:
-        """Forget what was read, which pymavlink does only where a message ends with the bytes that came."""
+        # pymavlink forgets what it has read only where a message ends with the bytes that came.
         left = self._mav.buf[self._mav.buf_index :]
         self._mav.buf = bytearray() if whole or len(left) > _LONGEST_REST else left
         self._mav.buf_index = 0
+        return [heard for each in found if (heard := self._checked(each)) is not None]
 
     def _checked(self, message: Any) -> Incoming | None:
         kind = message.get_type()
         if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
             self.counts["unreadable"] += 1
-            return None
-        if not self._is_vehicles(message, kind):
+        elif not self._is_vehicles(message, kind):
             self.counts["of_others"] += 1
-            return None
-        read = _READ.get(kind)
-        if read is None:
-            return None
-        try:
-            return read(message)
-        except ValueError:
-            self.counts["senseless"] += 1
-            return None
+        elif kind in _READ:
+            try:
+                return _READ[kind](message)
+            except ValueError:
+                self.counts["senseless"] += 1
+        return None
 
     def _is_vehicles(self, message: Any, kind: str) -> bool:
         sysid = message.get_srcSystem()
         if message.get_srcComponent() != AUTOPILOT or sysid in (0, SYSID):
             return False
-        if self._sysid is None and kind == "HEARTBEAT" and message.autopilot != _INVALID_AUTOPILOT:
-            self._sysid = sysid
-        return bool(sysid == self._sysid)
-
-    # --- out ------------------------------------------------------------------------------------------------------
+        if self.vehicle is None and kind == "HEARTBEAT" and message.autopilot != _INVALID_AUTOPILOT:
+            self.vehicle = sysid
+        return bool(sysid == self.vehicle)
 
     def write(self, message: Outgoing) -> bytes:
-        """A message to the vehicle, as bytes; none while no vehicle is known, but for a heartbeat."""
-        if self._sysid is None and not isinstance(message, Heartbeat):
+        """Returns a message to the vehicle as bytes; none while no vehicle is known, except for a heartbeat."""
+        if self.vehicle is None and not isinstance(message, Heartbeat):
             return b""
-        self._mav.send(self._packed(message, self._sysid or 0))
+        self._mav.send(self._packed(message, self.vehicle or 0))
         data = self._sent.getvalue()
         self._sent.seek(0)
         self._sent.truncate()
@@ -146,9 +237,7 @@ class Wire:
         common = self._common
         match message:
             case Heartbeat():
-                return common.MAVLink_heartbeat_message(
-                    _ONBOARD_CONTROLLER, _INVALID_AUTOPILOT, 0, 0, _ACTIVE, mavlink_version=3
-                )
+                return common.MAVLink_heartbeat_message(_ONBOARD_CONTROLLER, _INVALID_AUTOPILOT, 0, 0, _ACTIVE, 3)
             case Command(command=command, params=params):
                 given = (*map(float, params), *[0.0] * (7 - len(params)))
                 return common.MAVLink_command_long_message(to, AUTOPILOT, command, 0, *given)
@@ -157,8 +246,7 @@ class Wire:
             case MissionItem():
                 return common.MAVLink_mission_item_int_message(
                     to, AUTOPILOT, message.seq, message.frame, message.command, int(message.current), 1,
-                    0.0, 0.0, 0.0, math.nan, _degrees7(message.lat_deg), _degrees7(message.lon_deg),
-                    message.height_m, 0,
+                    0.0, 0.0, 0.0, math.nan, *_degrees7(message), message.height_m, 0,
                 )  # fmt: skip
             case MissionCurrent(seq=seq):
                 return common.MAVLink_mission_set_current_message(to, AUTOPILOT, seq)
@@ -167,7 +255,7 @@ class Wire:
             case Setpoint(height_m=height_m):
                 return common.MAVLink_set_position_target_global_int_message(
                     0, to, AUTOPILOT, message.frame, _PLACE_ONLY if height_m is None else _POSITION_ONLY,
-                    _degrees7(message.lat_deg), _degrees7(message.lon_deg), height_m or 0.0, *[0.0] * 8,
+                    *_degrees7(message), height_m or 0.0, *[0.0] * 8,
                 )  # fmt: skip
 
 
@@ -185,57 +273,57 @@ def _parser(common: Any) -> Any:
     return Parser
 
 
-def _degrees7(degrees: float) -> int:
-    return round(degrees * 1e7)
+def _degrees7(place: MissionItem | Setpoint) -> tuple[int, int]:
+    return round(place.lat_deg * 1e7), round(place.lon_deg * 1e7)
 
 
 # --- what each message must be, or ValueError ---------------------------------------------------------------------
 
 
 def _beat(message: Any) -> Beat:
-    if message.autopilot == _INVALID_AUTOPILOT:
-        raise ValueError("no autopilot")
+    _check(message.autopilot != _INVALID_AUTOPILOT)
     return Beat(message.autopilot, message.type, bool(message.base_mode & _ARMED), message.custom_mode)
 
 
 def _position(message: Any) -> Position:
     lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
     # Without a fix autopilots say 0, 0.
-    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180) or (message.lat == 0 and message.lon == 0):
-        raise ValueError("no place on Earth")
+    _check(abs(lat_deg) <= 90 and abs(lon_deg) <= 180 and (message.lat, message.lon) != (0, 0))
     heading_rad = None if message.hdg == _NOT_KNOWN else math.radians(message.hdg / 100 % 360)
     speed_m_per_s = math.hypot(message.vx, message.vy) / 100
     return Position(lat_deg, lon_deg, message.relative_alt / 1e3, speed_m_per_s, heading_rad)
 
 
 def _item_asked(message: Any) -> ItemAsked:
-    _check_to_us(message)
+    _check_mission(message)
     return ItemAsked(message.seq)
 
 
 def _mission_answered(message: Any) -> MissionAnswered:
-    _check_to_us(message)
+    _check_mission(message)
     return MissionAnswered(message.type)
 
 
-def _check_to_us(message: Any) -> None:
+def _check_mission(message: Any) -> None:
     """Another station may upload a mission on the same link, and fences and rally points are none of ours."""
-    if message.target_system != SYSID or message.target_component != COMPID or message.mission_type != 0:
-        raise ValueError("not to us")
+    _check((message.target_system, message.target_component, message.mission_type) == (SYSID, COMPID, 0))
 
 
 def _command_answered(message: Any) -> CommandAnswered:
-    if message.target_system not in (0, SYSID):
-        raise ValueError("not to us")
+    _check(message.target_system in (0, SYSID))
     return CommandAnswered(message.command, message.result)
 
 
 def _warned(message: Any) -> Warned:
     text = message.text if isinstance(message.text, str) else message.text.decode("ascii", "replace")
     shown = "".join(letter for letter in text if " " <= letter <= "~").strip()
-    if message.severity > _WARNING or not shown:
-        raise ValueError("nothing to tell")
+    _check(message.severity <= _WARNING and bool(shown))
     return Warned(shown)
+
+
+def _check(good: bool) -> None:
+    if not good:
+        raise ValueError("makes no sense, or is not to us")
 
 
 _READ: dict[str, Callable[[Any], Incoming]] = {

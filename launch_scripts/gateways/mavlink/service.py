@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from launch_scripts.gateways.mavlink.adapter import Adapter, Wishes
+from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Follow, Report, Tell, Unfollow, Withdraw
+from launch_scripts.gateways.mavlink.guidance import Way, Wishes
 from launch_scripts.gateways.mavlink.link import Address, Link, open_link
-from launch_scripts.gateways.mavlink.messages import Action, Follow, Report, Tell, Unfollow, Way, Withdraw
-from launch_scripts.gateways.mavlink.wire import Wire, pymavlink
+from launch_scripts.gateways.mavlink.mavlink_codec import Wire, pymavlink
 from launch_scripts.stop_requests import stop_requests
 from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
 
@@ -98,19 +98,15 @@ class Shell:
         tell: Callable[[str], None],
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._swarm = swarm
-        self._now_ns = now_ns
-        self._link = link
-        self._wire = wire
-        self._body = body
-        self._tell = tell
+        self._swarm, self._link, self._wire, self._body = swarm, link, wire, body
+        self._tell, self._now_ns = tell, now_ns
         self._adapter = Adapter(swarm.frame, wishes)
         self._vehicle: Vehicle | None = None
         self._routes: Stream[Route] | None = None
         swarm.on_problem(tell)
 
     def turn(self) -> None:
-        """Read what has come, and do what is due."""
+        """Reads what has come, and does what is due."""
         within_s = _TURN_S
         for _ in range(_MOST_READ):
             data = self._link.read(within_s)
@@ -125,47 +121,44 @@ class Shell:
         else:
             time.sleep(_TURN_S / 4)
         self._adapter.hear_swarm(self._swarm.connected)
-        if (way := self._newest_way()) is not None:
-            self._adapter.hear_way(way)
+        self._hear_routes()
         failure: SwarmError | None = None
         for action in self._adapter.tick(self._now_ns()):
             try:
-                self._do(action)
+                self._perform(action)
             except SwarmError as error:  # what is said to the vehicle is said all the same
                 failure = error
         if failure is not None:
             raise failure
 
     def stop(self) -> None:
-        """Let the vehicle stop, as far as that is ours, and take it away."""
+        """Lets the vehicle stop, as far as that is ours. The connection's end takes it away."""
         last = self._adapter.stop(self._now_ns())
         for _ in range(_LAST_WORDS):
             for action in last:
-                self._do(action)
+                self._perform(action)
             time.sleep(_TURN_S)
 
-    def _newest_way(self) -> Way | None:
+    def _hear_routes(self) -> None:
         newest = None
         while self._routes is not None and (route := self._routes.next(0.0)) is not None:
             newest = route
-        if newest is None:
-            return None
-        leads = newest.ok or newest.searching
-        return Way(newest.points_m if leads else (), newest.status)
+        if newest is not None:
+            leads = newest.ok or newest.searching
+            self._adapter.hear_way(Way(newest.points_m if leads else (), newest.status))
 
-    def _do(self, action: Action) -> None:
+    def _perform(self, action: Action) -> None:
         match action:
             case Tell(sentence=sentence):
                 self._tell(sentence)
-            case Report():
+            case Report(x_m=x_m, y_m=y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s):
                 if self._vehicle is None:
-                    self._vehicle = self._join()
-                self._vehicle.at(
-                    action.x_m,
-                    action.y_m,
-                    heading_rad=action.heading_rad,
-                    speed_m_per_s=action.speed_m_per_s,
-                )
+                    body = self._body
+                    self._vehicle = self._swarm.vehicle(
+                        body.id or f"mav{self._wire.vehicle}",
+                        group=body.group, radius_m=body.radius_m, vehicle_class=body.vehicle_class,
+                    )  # fmt: skip
+                self._vehicle.at(x_m, y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s)
             case Withdraw():
                 if self._vehicle is not None:
                     self._vehicle.leave()
@@ -179,12 +172,3 @@ class Shell:
                 self._routes = None
             case _:
                 self._link.write(self._wire.write(action))
-
-    def _join(self) -> Vehicle:
-        body = self._body
-        return self._swarm.vehicle(
-            body.id or f"mav{self._wire.vehicle}",
-            group=body.group,
-            radius_m=body.radius_m,
-            vehicle_class=body.vehicle_class,
-        )

@@ -1,0 +1,391 @@
+"""The guidance of a vehicle along the swarm's routes, by missions or setpoints, with or without the wheel.
+
+A `Driver` is chosen once by `driver_of`. It takes the newest route and the vehicle's place, and returns messages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from launch_scripts.gateways.mavlink.arming import Arming, Kind
+from launch_scripts.gateways.mavlink.mavlink_codec import (
+    ABOVE_HOME,
+    ABOVE_TERRAIN,
+    ACCEPTED,
+    NAV_LOITER_UNLIM,
+    NAV_TAKEOFF,
+    NAV_WAYPOINT,
+    Beat,
+    CommandAnswered,
+    Incoming,
+    ItemAsked,
+    MissionAnswered,
+    MissionCancelled,
+    MissionCount,
+    MissionCurrent,
+    MissionItem,
+    Outgoing,
+    Position,
+    Setpoint,
+)
+from swarm.client import Frame
+from swarm.client.frame import Point
+from swarm.client.route import along, between
+from swarm.clock import NS_PER_S
+
+MOST_POINTS = 60
+"""Of one mission: what lies behind is uploaded when half of it is driven. Uploads take a round trip an item."""
+_STRAIGHT = 1e-9
+_NEXT_NS = 3 * NS_PER_S
+"""From one mission to the next: a target that moves changes its routes several times a second."""
+_AFTER_FAILURE_NS = 5 * NS_PER_S
+_ON_GROUND_M = 2.0
+RETRY_NS = NS_PER_S * 3 // 2
+MOST_TRIES = 5
+"""The protocol demands both: a word is said again after 1.5 s without an answer, five times in all."""
+_MOST_ASKED = 8
+"""A vehicle may ask so often for each item, on average: a broken one does not keep us at one mission for ever."""
+_STREAM_NS = NS_PER_S // 10
+"""PX4 leaves offboard below two setpoints a second."""
+_STREAMED_FIRST_NS = NS_PER_S
+"""PX4 takes offboard only if it has had setpoints for a second."""
+_REPEAT_NS = NS_PER_S
+"""ArduPilot drives to the last setpoint; it is said again, as any message may be lost."""
+_HOLDS = 3
+"""Times that a vehicle is told to stay where it is."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What is wanted of the vehicle.
+
+    target      it follows routes to it; None: it is avoided, and no more
+    drive       how it is driven there
+    arm         it may be armed, and its mode changed
+    altitude_m  of one that flies
+    above       what the altitude is above
+    lost_s      after so long without a heartbeat or a position the link counts as lost
+    """
+
+    target: str | None = None
+    drive: Literal["mission", "guided"] = "mission"
+    arm: bool = False
+    altitude_m: float | None = None
+    above: Literal["home", "terrain"] = "home"
+    lost_s: float = 5.0
+
+
+@dataclass(frozen=True)
+class Way:
+    """A route of the swarm.
+
+    points_m  (x_m, y_m) in the terrain's frame, in driving order; empty: it leads nowhere
+    status    the planner's word, such as "ok" or "unreachable"
+    """
+
+    points_m: tuple[Point, ...]
+    status: str
+
+
+def flies(kind: Kind, altitude_m: float | None) -> bool:
+    """Whether a vehicle does: one whose type says nothing, if somebody says how high."""
+    return altitude_m is not None if kind.flies is None else kind.flies
+
+
+def driver_of(kind: Kind, frame: Frame, wishes: Wishes) -> Driver | str:
+    """Returns what drives a kind of vehicle as it is wished, or why it cannot be driven: a sentence."""
+    height_m = wishes.altitude_m if flies(kind, wishes.altitude_m) else None
+    if flies(kind, wishes.altitude_m):
+        if height_m is None:
+            return "it flies, and nobody says how high: give --altitude M, as the swarm tells no heights"
+        if wishes.above == "terrain" and not kind.terrain:
+            return f"{kind.name} takes no heights above terrain: give --above home"
+    guided = wishes.drive == "guided"
+    if guided and (kind.modes is None or kind.modes.guided is None):
+        return f"{kind.name} has no guided mode here; give --drive mission"
+    arming = None
+    if wishes.arm:
+        mode = None if kind.modes is None else kind.modes.guided if guided else kind.modes.mission
+        # PX4 climbs to the height of its setpoints.
+        takeoff_m = height_m if guided and not kind.streams else None
+        arming = Arming(kind, mode, starts=kind.starts and not guided, takeoff_m=takeoff_m)
+    above = ABOVE_TERRAIN if height_m is not None and wishes.above == "terrain" else ABOVE_HOME
+    return (Setpoints if guided else Missions)(kind, frame, above, height_m, arming)
+
+
+class Driver:
+    """Drives one vehicle that is there. Without a way that leads somewhere the vehicle holds, as far as that is
+    ours: by setpoints it gets one where it is, or none any more; with the wheel its mode becomes hold. A mission
+    without the wheel is driven to its end.
+
+    above     of MAVLink: the frame of `height_m`
+    height_m  None: the vehicle stays on its ground
+    arming    None: arming and modes are somebody else's
+    """
+
+    def __init__(self, kind: Kind, frame: Frame, above: int, height_m: float | None, arming: Arming | None) -> None:
+        self._kind, self._frame, self._above, self._height_m = kind, frame, above, height_m
+        self._arming = arming
+        self._gave_up = False
+        """It was told that the wheel commands nothing any more."""
+
+    def hear(self, message: Incoming) -> list[str]:
+        """Takes in an answer of the vehicle. Returns sentences about it."""
+        return self._arming.hear(message) if self._arming and isinstance(message, CommandAnswered) else []
+
+    def forget(self) -> None:
+        """The link is lost: nobody knows what the vehicle has."""
+        raise NotImplementedError
+
+    def lead(self, way: Way, position: Position, place: Point, now_ns: int) -> Sequence[Outgoing | str]:
+        """Returns what is to be said now so that the vehicle follows a way, with sentences for people."""
+        raise NotImplementedError
+
+    def stay(self, position: Position, now_ns: int) -> Sequence[Outgoing]:
+        """Returns what is to be said now as there is no way any more."""
+        raise NotImplementedError
+
+    def ready(self, now_ns: int) -> bool:
+        """Whether the vehicle may be brought into the mode in which it drives for us."""
+        raise NotImplementedError
+
+    def tick(
+        self, way: Way | None, beat: Beat, position: Position, place: Point, now_ns: int
+    ) -> list[Outgoing | str]:
+        """Returns what is to be said now, with sentences for people.
+
+        way    the newest; None: the swarm is not heard, or there was none yet
+        place  of the position, in the terrain's frame
+        """
+        if way is None or not way.points_m:
+            said = self.hold(beat, position, now_ns)
+        else:
+            said = list(self.lead(way, position, place, now_ns))
+            if self._arming is not None and self.ready(now_ns):
+                command = self._arming.drive(beat, position.height_m, now_ns)
+                said += [] if command is None else [command]
+        if self._arming is not None and self._arming.why and not self._gave_up:
+            self._gave_up = True
+            said.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
+        return said
+
+    def hold(self, beat: Beat, position: Position, now_ns: int, *, last: bool = False) -> list[Outgoing | str]:
+        """Returns what is to be said now so that it stays where it is, as far as that is ours.
+
+        last  nothing is said after it
+        """
+        command = self._arming.hold(beat, now_ns, last=last) if self._arming is not None else None
+        return [*self.stay(position, now_ns), *([] if command is None else [command])]
+
+
+# --- missions -----------------------------------------------------------------------------------------------------
+
+
+class Upload:
+    """One mission on its way to a vehicle: MISSION_COUNT until it asks, then the items that it asks for, until it
+    answers.
+
+    accepted  the vehicle has it all
+    why       it has failed: half a sentence; empty while it has not
+    """
+
+    def __init__(self, items: Sequence[MissionItem]) -> None:
+        self.items = items
+        self.accepted = False
+        self.why = ""
+        self._said: MissionCount | MissionItem = MissionCount(len(items))
+        """What is said next, or was last."""
+        self._due_ns: int | None = None
+        """When it is said (again); None: at once."""
+        self._tries = self._asked = 0
+
+    def hear(self, message: Incoming) -> None:
+        """Takes in that the vehicle asks for an item, or answers to all."""
+        if self.accepted or self.why:
+            return
+        match message:
+            case ItemAsked(seq=seq):
+                self._asked += 1
+                if not 0 <= seq < len(self.items):
+                    return  # of a mission before; it asks again
+                if self._asked > _MOST_ASKED * len(self.items):
+                    self.why = f"asked {self._asked} times for {len(self.items)} items"
+                self._said, self._due_ns, self._tries = self.items[seq], None, 0
+            case MissionAnswered(result=result) if result != ACCEPTED:
+                self.why = f"refused it with MAV_MISSION_RESULT {result}"
+            case MissionAnswered():
+                # One of a mission before, while the last item of this one was not asked for, says nothing of it.
+                self.accepted = isinstance(self._said, MissionItem) and self._said.seq == len(self.items) - 1
+
+    def tick(self, now_ns: int) -> MissionCount | MissionItem | None:
+        """Returns what is to be said now."""
+        if self.accepted or self.why or (self._due_ns is not None and now_ns < self._due_ns):
+            return None
+        if self._tries == MOST_TRIES:
+            self.why = f"did not answer {MOST_TRIES} times"
+            return None
+        self._tries += 1
+        self._due_ns = now_ns + RETRY_NS
+        return self._said
+
+
+class Missions(Driver):
+    """Uploads the rest of a way as a mission, one at a time, whenever that is not what the vehicle has already."""
+
+    _upload: Upload | None = None
+    _seen: Way | None = None
+    """The way that was uploaded, or whose end it is."""
+    _sent: Sequence[Point] = ()
+    """Points of the newest upload."""
+    _cut = False
+    """The way goes on behind them."""
+    _accepted = False
+    """The vehicle has a mission that leads along a way."""
+    _due_ns = 0
+
+    def hear(self, message: Incoming) -> list[str]:
+        if self._upload is not None:
+            self._upload.hear(message)
+        return super().hear(message)
+
+    def forget(self) -> None:
+        self._upload, self._seen, self._accepted = None, None, False
+
+    def ready(self, now_ns: int) -> bool:
+        return self._accepted
+
+    def stay(self, position: Position, now_ns: int) -> Sequence[Outgoing]:
+        under_way = self._upload is not None
+        self.forget()
+        return [MissionCancelled()] if under_way else []
+
+    def lead(self, way: Way, position: Position, place: Point, now_ns: int) -> Sequence[Outgoing | str]:
+        if self._upload is None and now_ns >= self._due_ns and self._is_news(way, place):
+            left = rest(way.points_m, place, self._frame.grid.resolution_m)
+            known = self._seen is not way and self._accepted and not self._cut and is_end_of(left, self._sent)
+            self._seen = way
+            if not known:
+                self._sent, self._cut = left[:MOST_POINTS], len(left) > MOST_POINTS
+                self._due_ns = now_ns + _NEXT_NS
+                self._upload = Upload(self._items(position))
+        upload = self._upload
+        if upload is None:
+            return []
+        said = upload.tick(now_ns)
+        if not upload.accepted and not upload.why:
+            return [] if said is None else [said]
+        self._upload = None
+        if upload.accepted:
+            self._accepted = True
+            return [MissionCurrent(self._kind.first_item)]
+        self._seen = None
+        self._due_ns = now_ns + _AFTER_FAILURE_NS
+        return [f"a mission of {len(upload.items)} items has failed: the vehicle {upload.why}"]
+
+    def _is_news(self, way: Way, place: Point) -> bool:
+        if way is not self._seen:
+            return True
+        return self._cut and math.dist(place, self._sent[-1]) < math.dist(place, self._sent[0])
+
+    def _items(self, position: Position) -> list[MissionItem]:
+        here, first = (position.lat_deg, position.lon_deg), self._kind.first_item
+        items = [(NAV_WAYPOINT, here)] * first
+        items += [(NAV_WAYPOINT, self._frame.to_wgs84(*point)) for point in self._sent]
+        if self._height_m is not None:
+            # A plane flies home at the end of a mission, if nothing tells it to stay.
+            items[-1] = NAV_LOITER_UNLIM, items[-1][1]
+            if position.height_m < _ON_GROUND_M:
+                items.insert(first, (NAV_TAKEOFF, here))
+        return [
+            MissionItem(seq, command, self._above, *degrees, self._height_m or 0.0, current=seq == first)
+            for seq, (command, degrees) in enumerate(items)
+        ]
+
+
+# --- setpoints ----------------------------------------------------------------------------------------------------
+
+
+class Setpoints(Driver):
+    """Puts a setpoint at the next turn of the way, streamed where the autopilot wants a stream. Without a way the
+    stream ends (PX4 leaves offboard by its own fail-safe), or the vehicle gets a setpoint where it is."""
+
+    _began_ns: int | None = None
+    """When the stream began; None while there is none."""
+    _due_ns = 0
+    _goal: Point | None = None
+    _holds_left = 0
+    _hold_at = (0.0, 0.0)
+    """(latitude, longitude)"""
+
+    def forget(self) -> None:
+        self._goal, self._began_ns, self._holds_left = None, None, 0
+
+    def ready(self, now_ns: int) -> bool:
+        streamed = self._began_ns is not None and now_ns - self._began_ns >= _STREAMED_FIRST_NS
+        return not self._kind.streams or streamed
+
+    def lead(self, way: Way, position: Position, place: Point, now_ns: int) -> Sequence[Outgoing | str]:
+        near_m = self._frame.grid.resolution_m / 2
+        left = rest(way.points_m, place, near_m)
+        # The first lies half a cell ahead on the line; the vehicle drives straight to the turn behind it.
+        goal = next((point for point in left[1:] if math.dist(point, place) > near_m), left[-1])
+        if goal == self._goal and now_ns < self._due_ns:
+            return []
+        self._goal = goal
+        self._began_ns = now_ns if self._began_ns is None else self._began_ns
+        self._due_ns = now_ns + (_STREAM_NS if self._kind.streams else _REPEAT_NS)
+        self._holds_left = 0 if self._kind.streams else _HOLDS
+        return [Setpoint(self._above, *self._frame.to_wgs84(*goal), self._height_m)]
+
+    def stay(self, position: Position, now_ns: int) -> Sequence[Outgoing]:
+        if self._goal is not None:
+            self._goal, self._began_ns, self._due_ns = None, None, 0
+            self._hold_at = (position.lat_deg, position.lon_deg)
+        if not self._holds_left or now_ns < self._due_ns:
+            return []
+        self._holds_left -= 1
+        self._due_ns = now_ns + _REPEAT_NS
+        return [Setpoint(self._above, *self._hold_at, self._height_m)]
+
+
+# --- the few points of a route that an autopilot gets -------------------------------------------------------------
+
+
+def turns(points: Sequence[Point]) -> list[Point]:
+    """Returns the points in which a line turns, with its ends, each once: they lead over the same ground."""
+    kept: list[Point] = []
+    for point in points:
+        if kept and math.dist(kept[-1], point) == 0:
+            continue
+        if len(kept) > 1 and _straight(kept[-2], kept[-1], point):
+            kept.pop()
+        kept.append(point)
+    return kept
+
+
+def rest(points: Sequence[Point], place: Point, lead_m: float) -> list[Point]:
+    """Returns what is left of a line for whoever is at a place: the point of it that lies `lead_m` after the
+    nearest, and the turns behind that. Its end at least, unless the line is empty."""
+    if len(points) < 2:
+        return list(points)
+    at, share = along(points, place, lead_m)
+    if at + 2 == len(points) and share == 1.0:
+        return [points[-1]]
+    return turns([between(points[at], points[at + 1], share), *points[at + 1 :]])
+
+
+def is_end_of(points: Sequence[Point], whole: Sequence[Point]) -> bool:
+    """Whether points, but for the first, are the end of others: who drives those drives these."""
+    behind = points[1:] or points
+    return len(behind) <= len(whole) and all(
+        math.dist(a, b) < 0.01 for a, b in zip(reversed(behind), reversed(whole), strict=False)
+    )
+
+
+def _straight(a: Point, b: Point, c: Point) -> bool:
+    ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1]
+    long = math.hypot(ux, uy) * math.hypot(vx, vy)
+    return abs(ux * vy - uy * vx) <= _STRAIGHT * long and ux * vx + uy * vy > 0
