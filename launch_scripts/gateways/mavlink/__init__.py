@@ -1,7 +1,7 @@
 """A vehicle that speaks MAVLink as a vehicle of the swarm: one process for each link (decision 76).
 
-Bytes of a link (`link`) become checked messages (`mavlink_codec`). The core (`adapter`) takes them, the routes of
-the swarm and the time, and returns what is due: calls of the swarm's client, and messages to the vehicle. `guidance`
+Bytes of a link (`link`) become checked messages (`mavlink_codec`). The core (`adapter`) takes them, the swarm's
+routes and the time, and returns what is due: calls of the swarm's client, and messages to the vehicle. `guidance`
 leads the vehicle along a route, `arming` says when it may be armed. The shell (`service`) performs.
 
 The room promises: no vehicle is armed and no mode is set without `--arm`. Whoever takes the wheel keeps it. One
