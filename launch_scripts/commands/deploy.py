@@ -130,7 +130,7 @@ def zenohd(
     import msgspec
 
     from launch_scripts.deploy.revocations import with_revocations
-    from launch_scripts.deploy.zenohd import zenohd_config
+    from launch_scripts.deploy.service_files import zenohd_config
     from launch_scripts.launcher.options import find_scenario, own_certificate, with_network
     from launch_scripts.process_table import admitting_all
     from swarm.config.load import check_endpoint

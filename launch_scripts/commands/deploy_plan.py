@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,7 +14,7 @@ from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioAr
 from swarm.config.input_files import shown
 from swarm.errors import ConfigError
 
-KitName = Literal["systemd", "compose", "kubernetes"]
+KitName = Literal["systemd", "compose"]
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
 
@@ -33,7 +32,7 @@ def plan(
         ),
     ] = None,
     kit: Annotated[
-        KitName, typer.Option(help="What starts the processes: systemd, compose (containers) or kubernetes.")
+        KitName, typer.Option(help="What starts the processes: systemd, or compose (containers).")
     ] = "systemd",
     image: Annotated[
         str, typer.Option(help="Image of the roles, NAME:TAG, for containers; if not given, that of this version.")
@@ -50,8 +49,6 @@ def plan(
     swarm deploy plan my.toml --hosts hosts.toml --out kits
 
     then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
-
-    swarm deploy plan my.toml --hosts hosts.toml --out kits --kit kubernetes && kubectl apply -f kits/kubernetes
 
     Every process runs once; keepers, and planners and their standbys, on machines of their own. A second plan into
     the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
@@ -80,24 +77,13 @@ def plan(
     check_start(chosen, joins=True, has_ground=True)
     written = [] if out is None else _write(made, out, kit, image, days, wheel)
     if as_json:
-        from launch_scripts.deploy.shown_plan import as_json as fields
+        from launch_scripts.deploy.plan import as_json as fields
 
         typer.echo(json.dumps({**fields(made), "archives": list(map(str, written))}, indent=2))
         return
     _show(made, kit)
-    if kit == "kubernetes":
-        from launch_scripts.deploy.containers.cluster import RECIPE
-
-        for folder in written:
-            if (folder / RECIPE).exists():
-                which = image or "a second plan, with --image"
-                typer.echo(
-                    f"{folder / RECIPE}: adds the ground or plug-ins to the image of {which}; build that first"
-                )
-            typer.echo(f"{folder}: `kubectl apply -f {shlex.quote(str(folder))}`")
-    else:
-        for host, archive in zip(made.hosts, written, strict=True) if written else ():
-            typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
+    for host, archive in zip(made.hosts, written, strict=True) if written else ():
+        typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
     if out is not None:
         typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
 
@@ -110,26 +96,15 @@ def _check_image(image: str, kit: KitName) -> None:
 
 
 def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
-    from launch_scripts.deploy.containers.cluster import write_cluster
-    from launch_scripts.deploy.containers.compose import compose_files
     from launch_scripts.deploy.host_scenario import CERTIFICATES
     from launch_scripts.deploy.kits import write_kits
     from launch_scripts.deploy.revocations import revoked_in
-    from launch_scripts.deploy.systemd import systemd_files
+    from launch_scripts.deploy.service_files import compose_files, systemd_files
 
-    match kit:
-        case "systemd":
-            return write_kits(made, out, systemd_files, days, wheel)
-        case "compose":
-            return write_kits(
-                made,
-                out,
-                partial(compose_files, image=image, revoked=revoked_in(out / CERTIFICATES)),
-                days,
-                launcher=False,
-            )
-        case "kubernetes":
-            return [write_cluster(made, out, days, image)]
+    if kit == "systemd":
+        return write_kits(made, out, systemd_files, days, wheel)
+    compose = partial(compose_files, image=image, revoked=revoked_in(out / CERTIFICATES))
+    return write_kits(made, out, compose, days, launcher=False)
 
 
 def _of_file(sentence: str, path: Path) -> str:
@@ -142,7 +117,7 @@ def _show(made: Plan, kit: KitName) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from launch_scripts.deploy.shown_plan import COLUMNS, rows
+    from launch_scripts.deploy.plan import COLUMNS, rows
 
     # One column a machine: names of processes are many and short, machines few.
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")

@@ -16,10 +16,9 @@ import msgspec
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, issue, may_stay, private_file
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
 from launch_scripts.deploy.hosts import HostName
-from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost
+from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
-from launch_scripts.deploy.shown_plan import as_json
 from launch_scripts.observe.files import write_file
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.access_control import common_name
@@ -29,15 +28,9 @@ from swarm.errors import StoreError
 
 Render = Callable[[Plan, PlannedHost], Mapping[str, str]]
 """Name -> text of the files that start a machine's processes. Names without an ending are scripts."""
-_PRIVATE, _OPEN, _SCRIPT = 0o600, 0o644, 0o755
 PLAN = "plan.json"
 CONTENTS = "contents"
 """The file that names all others of an archive, a line each."""
-FORGET = f"""\
-# What an earlier archive has left in this folder goes: another plan has other keys, ground and plug-ins.
-find certs ground plugins wheels -type f ! -name revoked 2>/dev/null | while IFS= read -r path; do
-    grep -qxF -e "$path" {CONTENTS} || rm -f -- "$path"
-done"""
 
 
 class _ProcessBefore(msgspec.Struct):
@@ -53,8 +46,8 @@ class _HostBefore(msgspec.Struct):
 class _Before(msgspec.Struct):
     """What is read of an earlier plan."""
 
-    run_id: str
-    hosts: tuple[_HostBefore, ...]
+    run_id: str = ""
+    hosts: tuple[_HostBefore, ...] = ()
 
 
 def write_kits(
@@ -67,35 +60,28 @@ def write_kits(
     starts the processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be
     read or written.
     """
-    folder, revoked = out / CERTIFICATES, for_operators(out, days)
-    written = []
-    for host in plan.hosts:
-        scenario, ground = host_scenario(plan, host)
-        texts = {
-            "scenario.toml": scenario_text(scenario, Path()),
-            PLAN: _shown(plan),
-            **render(plan, host),
-        }
-        if revoked and host.of(ROUTER):
-            texts[f"{CERTIFICATES}/{REVOKED}"] = "".join(f"{name}\n" for name in revoked)
-        files = {**ground, **plugin_files(plan.scenario), **certificates_of(folder, host, days, revoked)}
-        if launcher:
-            files |= _files_of(_issued(folder, host.operator, (), days, revoked), OPERATOR)
-        if wheel is not None:
-            files[f"wheels/{wheel.name}"] = wheel
-        written.append(_archive(out, host.name, texts, files))
-    keep_plan(plan, out)
-    return written
-
-
-def for_operators(out: Path, days: int) -> tuple[str, ...]:
-    """Makes the authority and the certificate of operators in `out/certs`, if they lack. Returns the names that are
-    revoked there."""
     folder = out / CERTIFICATES
     revoked = revoked_in(folder)
     authority(folder)
     _issued(folder, OPERATOR, (), days, revoked)
-    return revoked
+    written = []
+    for host in plan.hosts:
+        scenario, ground = host_scenario(plan, host)
+        texts = {"scenario.toml": scenario_text(scenario, Path()), PLAN: _shown(plan), **render(plan, host)}
+        if revoked and host.of(ROUTER):
+            texts[f"{CERTIFICATES}/{REVOKED}"] = "".join(f"{name}\n" for name in revoked)
+        files = {**ground, **plugin_files(plan.scenario), f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
+        for process in host.processes:
+            reached = (host.address, router_name(host), *THIS_MACHINE) if process.role == ROUTER else ()
+            issued = _issued(folder, process.certificate, reached, days, revoked)
+            files |= _files_of(issued, process.certificate)
+        if launcher:
+            files |= _files_of(_issued(folder, host.operator, (), days, revoked), OPERATOR)
+        if wheel is not None:
+            files[f"wheels/{wheel.name}"] = wheel
+        written.append(_archive(out, host.name, texts, dict(_with_parts(files))))
+    keep_plan(plan, out)
+    return written
 
 
 def keep_plan(plan: Plan, out: Path) -> None:
@@ -109,13 +95,7 @@ def keep_plan(plan: Plan, out: Path) -> None:
             print(f"{archive}: removed, as the plan has no machine of this name", file=sys.stderr)
         write_file(out / PLAN, _shown(plan).encode())
     except OSError as error:
-        raise StoreError(
-            f"cannot write {out / PLAN}: {error.filename or out}: {error.strerror or error}"
-        ) from error
-
-
-def _shown(plan: Plan) -> str:
-    return json.dumps(as_json(plan), indent=1) + "\n"
+        raise _unwritable(out / PLAN, out, error) from error
 
 
 def keepers_before(out: Path, run_id: str) -> dict[str, str]:
@@ -127,28 +107,18 @@ def keepers_before(out: Path, run_id: str) -> dict[str, str]:
     return {process.id: host.name for host in before.hosts for process in host.processes if process.role == KEEPER}
 
 
+def _shown(plan: Plan) -> str:
+    return json.dumps(as_json(plan), indent=1) + "\n"
+
+
 def _before(out: Path) -> _Before:
     path = out / PLAN
     if not path.exists():
-        return _Before("", ())
+        return _Before()
     try:
         return msgspec.json.decode(read_bytes(path, FileKind.RUN), type=_Before)
     except msgspec.DecodeError as error:
         raise StoreError(f"{path} is no plan of `swarm deploy plan`: {error}; write to another folder") from error
-
-
-def certificates_of(folder: Path, host: PlannedHost, days: int, revoked: tuple[str, ...]) -> dict[str, Path]:
-    """Place in the archive -> file, of the certificates of a machine's processes. Those that lack are made."""
-    found = {f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
-    for process in host.processes:
-        reached = (host.address, router_name(host), *THIS_MACHINE) if process.role == ROUTER else ()
-        found |= _files_of(_issued(folder, process.certificate, reached, days, revoked), process.certificate)
-    return found
-
-
-def router_name(host: PlannedHost) -> str:
-    """Under which containers reach the router of a machine; it stands in that router's certificate."""
-    return f"router-{host.name}"
 
 
 def _files_of(certificate: Path, name: str) -> dict[str, Path]:
@@ -168,36 +138,39 @@ def _archive_of(out: Path, name: str) -> Path:
     return out / f"{name}.tar.gz"
 
 
-def _archive(out: Path, name: str, texts: Mapping[str, str], files: Mapping[str, Path]) -> Path:
+def _archive(out: Path, name: str, texts: dict[str, str], files: Mapping[str, Path]) -> Path:
     """Only its owner may read it: it holds private keys."""
     path = _archive_of(out, name)
+
+    def entry(place: str, size: int, mode: int) -> tarfile.TarInfo:
+        made = tarfile.TarInfo(f"swarm-{name}/{place}")
+        made.size, made.mode, made.mtime = size, mode, int(time.time())
+        return made
+
+    texts[CONTENTS] = "".join(f"{place}\n" for place in (*texts, *files))
     try:
         with private_file(path) as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
-            places = [*texts, *(place for place, _ in with_parts(files))]
-            for place, text in {**texts, CONTENTS: "".join(f"{place}\n" for place in places)}.items():
+            for place, text in texts.items():
+                is_script = "." not in place and "/" not in place and place != CONTENTS
                 data = text.encode()
-                mode = _SCRIPT if "." not in place and "/" not in place and place != CONTENTS else _OPEN
-                archive.addfile(_entry(name, place, len(data), mode), io.BytesIO(data))
-            for place, source in with_parts(files):
+                archive.addfile(entry(place, len(data), 0o755 if is_script else 0o644), io.BytesIO(data))
+            for place, source in files.items():
                 with source.open("rb") as content:
                     size = os.fstat(content.fileno()).st_size
-                    mode = _PRIVATE if place.endswith(".key") else _OPEN
-                    archive.addfile(_entry(name, place, size, mode), content)
+                    archive.addfile(entry(place, size, 0o600 if place.endswith(".key") else 0o644), content)
     except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.filename or out}: {error.strerror or error}") from error
+        raise _unwritable(path, out, error) from error
     return path
 
 
-def with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
+def _unwritable(path: Path, out: Path, error: OSError) -> StoreError:
+    return StoreError(f"cannot write {path}: {error.filename or out}: {error.strerror or error}")
+
+
+def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
     """With what belongs to a file by its name, as .shp, .dbf and .prj."""
     for place, source in files.items():
         yield place, source
         if place.startswith(f"{GROUND}/"):
             for part in parts_of(source):
                 yield str(Path(place).with_name(part.name)), part
-
-
-def _entry(host: str, place: str, size: int, mode: int) -> tarfile.TarInfo:
-    entry = tarfile.TarInfo(f"swarm-{host}/{place}")
-    entry.size, entry.mode, entry.mtime = size, mode, int(time.time())
-    return entry

@@ -1,9 +1,11 @@
-"""Which process runs on which machine: the plan that units, containers and manifests are written from."""
+"""Which process runs on which machine: the plan that units and containers are written from, and how it is shown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from types import MappingProxyType
+from typing import Any
 
 import msgspec
 
@@ -27,6 +29,8 @@ _CORES = {"keeper": 0.04, "monitor": 0.17, "targets": 0.09}
 _CORES_PER_VEHICLE = 0.00066
 """Of an agent; from the same table."""
 ROUTER, KEEPER = "router", "keeper"
+COLUMNS = ("machine", "address", *ROLES, "load", "terrain")
+"""Of `rows`."""
 
 
 class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
@@ -229,3 +233,50 @@ def _host(
         operator=f"operator.{host.name}",
         has_files=any(each.role in (KEEPER, "targets") for each in processes),
     )
+
+
+def router_name(host: PlannedHost) -> str:
+    """Under which containers reach the router of a machine; it stands in that router's certificate."""
+    return f"router-{host.name}"
+
+
+def as_json(plan: Plan) -> dict[str, Any]:
+    """What `swarm deploy plan --json` prints, and what lies in every archive as plan.json."""
+    return {
+        "scenario": plan.scenario.name,
+        "run_id": plan.run_id,
+        "namespace": plan.scenario.network.namespace,
+        "port": plan.port,
+        "survive": plan.survive,
+        "standbys": msgspec.to_builtins(plan.scenario.standbys),
+        "hosts": msgspec.to_builtins(plan.hosts),
+    }
+
+
+def rows(plan: Plan) -> list[tuple[str, ...]]:
+    """For each machine one text for each of `COLUMNS`."""
+    return [
+        (
+            host.name,
+            host.address,
+            *(", ".join(_shortened([each.id for each in host.of(role)])) for role in ROLES),
+            f"{host.load:.2f} of {host.cores:g}",
+            "files" if host.has_files else "from a keeper",
+        )
+        for host in plan.hosts
+    ]
+
+
+def _shortened(ids: list[str]) -> Iterator[str]:
+    """Ids with runs of three and more consecutive numbers as first and last: "a0 to a7"."""
+    starts = [0, *(n for n, (one, other) in enumerate(pairwise(ids), 1) if not _follows(one, other)), len(ids)]
+    for first, end in pairwise(starts):
+        run = ids[first:end]
+        yield from [f"{run[0]} to {run[-1]}"] if len(run) > 2 else run
+
+
+def _follows(one: str, other: str) -> bool:
+    """Whether two ids differ by a number at their end, which is one higher: a7, a8."""
+    stem = one.rstrip("0123456789")
+    number = one[len(stem) :]
+    return number.isdecimal() and other == f"{stem}{int(number) + 1}"

@@ -1,9 +1,7 @@
-"""`swarm deploy plan --kit compose` and `--kit kubernetes`: what is written stands for itself and is whole."""
+"""`swarm deploy plan --kit compose`: what is written stands for itself and is whole."""
 
 from __future__ import annotations
 
-import base64
-import errno
 import stat
 import subprocess
 import tarfile
@@ -13,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import yaml
 from rasterio.transform import from_origin
-from support.manifests import load_all, read_manifests
 from typer.testing import CliRunner, Result
 
 from launch_scripts.cli import command
 from launch_scripts.commands.deploy import app
 from launch_scripts.deploy.certificates import check_signed, hosts_of
-from launch_scripts.deploy.containers.container import containers_of, words_of
 from launch_scripts.deploy.hosts import parse_hosts
 from launch_scripts.deploy.plan import make_plan
+from launch_scripts.deploy.service_files import containers_of
 from launch_scripts.launcher.options import as_process
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
 
 SCENARIO = """
 name = "small"
@@ -77,12 +75,12 @@ def plan(folder: Path, *more: str) -> Result:
 def test_the_command_line_takes_the_words_of_every_container() -> None:
     scenario = parse_scenario('[[targets]]\ncount = 2\n[[groups]]\nname = "all"\nvehicles = 30')
     made = make_plan(scenario, parse_hosts(HOSTS), "small-1")
-    for each in containers_of(made.hosts):
-        role, *words = words_of(each, made.run_id, "0.0.0.0")
+    for each in (each for host in made.hosts for each in containers_of(made, host)):
+        role, *words = each.words
         context = command().make_context("swarm", [role, *words], resilient_parsing=True)
         taken = command().get_command(context, role).make_context(role, words).params
         assert taken["health_port"] == 9464
-        assert taken["signals_address"] == "0.0.0.0"
+        assert taken["signals_address"] == "127.0.0.1"
         assert taken["log_format"] == "json"
         assert taken["scenario"] == "/etc/swarm/scenario.toml"
 
@@ -94,7 +92,7 @@ def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_laun
         with tarfile.open(folder / "kits" / f"{host}.tar.gz") as archive:
             archive.extractall(folder, filter="data")
         kit = folder / f"swarm-{host}"
-        (compose,) = load_all((kit / "compose.yaml").read_text())
+        compose = yaml.safe_load((kit / "compose.yaml").read_text())
         for service in compose["services"].values():
             for volume in service["volumes"]:
                 assert volume["type"] != "bind" or (kit / volume["source"]).exists()
@@ -112,53 +110,6 @@ def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_laun
                 assert hosts_of(Path(tls.certificate)) >= {f"router-{host}"}
         assert stat.S_IMODE((kit / "install").stat().st_mode) == 0o755
         assert subprocess.run(["sh", "-n", kit / "install"], timeout=20).returncode == 0
-
-
-def test_manifests_come_with_their_keys_apart_and_a_recipe_that_adds_the_ground(folder: Path) -> None:
-    done = plan(folder, "--kit", "kubernetes", "--image", "registry/small:1")
-    assert done.exit_code == 0, done.output
-    kit = folder / "kits" / "kubernetes"
-    assert f"kubectl apply -f {kit}" in done.output.replace("\n", "")
-    assert stat.S_IMODE((kit / "secrets.yaml").stat().st_mode) == 0o600
-    manifests = read_manifests(*(path.read_text() for path in kit.glob("*.yaml")))
-    assert (folder / "kits" / "certs" / "operator.0.key").is_file()
-    images = {pod["spec"]["containers"][0]["image"] for pod in manifests.pods.values()}
-    assert images == {"registry/small:1", "registry/small:1-all"}
-    assert (kit / "ground" / "0" / "ground.tif").read_bytes() == (folder / "ground.tif").read_bytes()
-    assert "COPY ground /etc/swarm/ground" in (kit / "Containerfile").read_text()
-    for secret in manifests.of("Secret"):
-        files = {name: folder / name for name in secret["data"]}
-        for name, path in files.items():
-            path.write_bytes(base64.b64decode(secret["data"][name]))
-        (key,) = [path for name, path in files.items() if name.endswith(".key")]
-        check_signed(files["ca.pem"], key.with_suffix(".pem"), key)
-
-
-def test_manifests_of_a_second_plan_are_whole_and_leave_nothing_of_the_first(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kit = folder / "kits" / "kubernetes"
-    done = plan(folder, "--kit", "kubernetes")
-    assert done.exit_code == 0, done.output
-    assert "Containerfile: adds the ground" in done.output.replace("\n", "")
-    before = {path: path.read_bytes() for path in kit.rglob("*") if path.is_file()}
-
-    def full(_: Path, __: Path) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("shutil.copyfile", full)
-        done = plan(folder, "--kit", "kubernetes")
-    assert isinstance(done.exception, StoreError)
-    assert str(done.exception) == f"cannot write {kit}: {folder / 'kits'}: No space left on device"
-    assert before.keys() == {path for path in kit.rglob("*") if path.is_file()}
-    (kit / "own.yaml").write_text("")
-    scenario = folder / "small.toml"
-    scenario.write_text(scenario.read_text().replace("ground.tif", "synthetic"))
-    done = plan(folder, "--kit", "kubernetes")
-    assert done.exit_code == 0, done.output
-    assert "Containerfile" not in done.output
-    assert {path.name for path in kit.rglob("*") if path.is_file()} == {"own.yaml", "secrets.yaml", "swarm.yaml"}
 
 
 def test_a_wheel_is_refused_where_containers_have_an_image(folder: Path) -> None:

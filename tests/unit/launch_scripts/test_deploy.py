@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from launch_scripts.deploy.zenohd import zenohd_config
+from launch_scripts.deploy.service_files import zenohd_config
 from launch_scripts.process_table import certificate_name, certificate_names
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL

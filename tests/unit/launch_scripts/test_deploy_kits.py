@@ -20,7 +20,7 @@ from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
 from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
 from launch_scripts.deploy.plan import Plan, make_plan
 from launch_scripts.deploy.revocations import revoke
-from launch_scripts.deploy.systemd import UNIT, systemd_files, unit_text
+from launch_scripts.deploy.service_files import UNIT, systemd_files
 from launch_scripts.launcher.up_options import chosen_processes
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.errors import StoreError
@@ -287,7 +287,7 @@ def analyze(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]
         pytest.skip("there is no systemd-analyze (package systemd)")
     plan = planned()
     path = tmp_path / UNIT
-    path.write_text(unit_text(plan, plan.hosts[0]).replace("/opt/swarm/bin/swarm", sys.executable))
+    path.write_text(systemd_files(plan, plan.hosts[0])[UNIT].replace("/opt/swarm/bin/swarm", sys.executable))
     return subprocess.run(
         ["systemd-analyze", *arguments, str(path)], capture_output=True, text=True, check=False, timeout=60
     )
@@ -301,7 +301,7 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
 def test_systemd_finds_a_fault_that_is_made(tmp_path: Path) -> None:
     """So that the test above can fail."""
     plan = planned()
-    text = unit_text(plan, plan.hosts[0]).replace("Restart=on-failure", "Restart=sometimes")
+    text = systemd_files(plan, plan.hosts[0])[UNIT].replace("Restart=on-failure", "Restart=sometimes")
     if shutil.which("systemd-analyze") is None:
         pytest.skip("there is no systemd-analyze (package systemd)")
     path = tmp_path / UNIT

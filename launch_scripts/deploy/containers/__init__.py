@@ -1,1 +1,0 @@
-"""Processes of a plan in containers: a compose file for each machine, or manifests for Kubernetes."""
