@@ -210,7 +210,7 @@ def _up(
     take_over: bool = False,
 ) -> None:
     from launch_scripts.launcher.busy_line import busy_loading
-    from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
+    from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long. `entry` has done so where it could.
     named = {word.partition(".")[0] for word in only or ()}

@@ -19,7 +19,7 @@ def main() -> int:
     try:
         if sys.argv[1:2] and sys.argv[1] in _RUNS and not any(word.startswith(_SAYS_MORE) for word in sys.argv[2:]):
             # It takes longest of all that a start waits for, so it begins before the command itself is loaded.
-            from launch_scripts.launcher.preload import ROLES_AND_KERNELS, start_forkserver
+            from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, start_forkserver
 
             start_forkserver(ROLES_AND_KERNELS)
         from launch_scripts.cli import main as run

@@ -1,4 +1,9 @@
-"""Ends a process with the one that started it, even where that is killed."""
+"""Ends a process with the one that started it, even where that is killed.
+
+As a script it replaces itself by another program, and imports nothing of ours:
+
+    python parent_death.py PARENT_PID PROGRAM ARGUMENT...
+"""
 
 from __future__ import annotations
 
@@ -19,3 +24,17 @@ def end_with_parent(number: signal.Signals) -> None:
     parent = multiprocessing.parent_process()
     if parent is not None and not parent.is_alive():  # it ended before the kernel was told
         os.kill(os.getpid(), number)
+
+
+def main() -> None:
+    """Become the program that the arguments name, which ends when process PARENT_PID does."""
+    parent, program = int(sys.argv[1]), sys.argv[2:]
+    end_with_parent(signal.SIGKILL)
+    if _LIBC is not None and os.getppid() != parent:  # it ended before it could be watched
+        sys.exit(0)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+    os.execv(program[0], program)
+
+
+if __name__ == "__main__":
+    main()

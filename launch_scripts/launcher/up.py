@@ -11,22 +11,21 @@ from pathlib import Path
 
 from launch_scripts.check.ground import check_places
 from launch_scripts.check.settings import check_start
+from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.leave_report import ELSEWHERE, leave_report
 from launch_scripts.launcher.live_table import live_table, plain_line
 from launch_scripts.launcher.lives import next_life
-from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.options import as_process, make_run_dir
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.own_part import OwnPart
-from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.stop_signals import StopAsked
-from launch_scripts.launcher.take_over import TakeOver
+from launch_scripts.launcher.supervisor import Ending, LocalSwarm
+from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
-from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.observe import facts

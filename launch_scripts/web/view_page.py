@@ -22,7 +22,7 @@ from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from launch_scripts.web import die_with_parent
+from launch_scripts import parent_death
 from launch_scripts.web.loopback_guard import LOOPBACK, Audience, BoundedServer, refusal
 from launch_scripts.web.stream_gate import SEND_WITHIN_S, join_sockets
 from swarm.errors import StoreError
@@ -195,7 +195,7 @@ def _take_files() -> dict[str, _File]:
         [
             sys.executable,
             "-I",
-            str(Path(die_with_parent.__file__)),
+            str(Path(parent_death.__file__)),
             str(os.getpid()),
             *serve,
             "rerun+http://127.0.0.1:1/proxy",

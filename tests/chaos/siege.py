@@ -10,6 +10,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from support.process_usage import Usage, usage
+from support.up_process import UpProcess
+
 from chaos.blows import BLOWS, Blow, blows
 from chaos.hostile import KINDS, Hostile
 from chaos.lies import NAMES, Lies
@@ -17,8 +20,7 @@ from chaos.recovery import Recovery
 from chaos.stranger import Stranger
 from chaos.tally import Ended, Outcome, Sample, Tally, name_of
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
-from launch_scripts.launcher.run_processes import Usage, has_ended, processes, usage
-from launch_scripts.launcher.up_process import UpProcess
+from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
 from launch_scripts.simulation.world.referee import Collision, Referee
 from shared_map.class_grounds import class_truths

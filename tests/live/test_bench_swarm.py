@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import SWARM, swarm
-from support.processes import eventually
+from support.process_usage import cpu_s, eventually, in_session
+from support.up_process import UpProcess
 
-from launch_scripts.launcher.run_processes import cpu_s, in_session, processes
-from launch_scripts.launcher.up_process import UpProcess
+from launch_scripts.launcher.takeover import processes
 from swarm.errors import SwarmError
 
 pytestmark = pytest.mark.network

@@ -11,7 +11,7 @@ import pytest
 from support.live_swarm import SWARM, folders_of_runs, swarm, write_scenario
 from support.processes import eventually
 
-from launch_scripts.launcher.run_processes import processes
+from launch_scripts.launcher.takeover import processes
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

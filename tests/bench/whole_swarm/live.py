@@ -9,12 +9,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from support.process_usage import cpu_s, in_session, machine_cpu_s, pss_bytes
+from support.up_process import UpProcess
+
 from bench.whole_swarm.route_client import raw_answerer, route_client
 from bench.whole_swarm.size import Size, scenario_text
 from bench.whole_swarm.stats_window import StatsSpan, StatsWindow, histogram, ticks
 from bench.wire.remote import Far
-from launch_scripts.launcher.run_processes import cpu_s, in_session, machine_cpu_s, processes, pss_bytes
-from launch_scripts.launcher.up_process import UpProcess
+from launch_scripts.launcher.takeover import processes
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import processes_of
 from swarm.bus.bus import Heard

@@ -24,9 +24,9 @@ from launch_scripts.check import needs
 from launch_scripts.cli import main
 from launch_scripts.commands import query
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.launcher import preload
-from launch_scripts.launcher.local_swarm import LocalSwarm
-from launch_scripts.launcher.warm_up import WarmUp
+from launch_scripts.launcher import forkserver
+from launch_scripts.launcher.forkserver import WarmUp
+from launch_scripts.launcher.supervisor import LocalSwarm
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_names
 from swarm.config.load import load_scenario
@@ -162,7 +162,7 @@ def test_a_mistake_is_answered_with_what_to_do(
     request: pytest.FixtureRequest,
 ) -> None:
     monkeypatch.setattr(LocalSwarm, "start", _no_process)
-    monkeypatch.setattr(preload, "start_forkserver", lambda *args: None)
+    monkeypatch.setattr(forkserver, "start_forkserver", lambda *args: None)
     monkeypatch.setattr(WarmUp, "begin", lambda self: None)
     monkeypatch.setattr(query, "_CONNECT_S", 0.3)
     # Neither who else listens here nor how large this machine is has a part in it.

@@ -33,11 +33,11 @@ from support.monitor_rig import (
 )
 from support.target_reports import fleet
 
+from launch_scripts import parent_death
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
-from launch_scripts.web import die_with_parent
 from launch_scripts.web.loopback_guard import Audience
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
@@ -588,7 +588,7 @@ def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
 def test_a_tied_program_ends_with_its_parent_even_if_that_is_killed() -> None:
     parent_script = f"""
 import os, subprocess, sys, time
-child = subprocess.Popen([sys.executable, "-I", {die_with_parent.__file__!r}, str(os.getpid()), "/bin/sleep", "60"])
+child = subprocess.Popen([sys.executable, "-I", {parent_death.__file__!r}, str(os.getpid()), "/bin/sleep", "60"])
 print(child.pid, flush=True)
 time.sleep(60)
 """

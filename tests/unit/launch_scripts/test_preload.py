@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
 import pytest
 
 from launch_scripts import entry
-from launch_scripts.launcher import preload
+from launch_scripts.launcher import forkserver
 
 _ALL_ROLES = """
 import json, sys
 from shared_map.terrain import homes
 homes.largest_part = lambda passable: passable
-import launch_scripts.launcher.warm_kernels
+import launch_scripts.launcher.preloaded
 from launch_scripts.simulation import simulate
 simulate.build_truth = lambda scenario, terrain: terrain.pace_s_per_m
 # A live run has both of them prepared, and imports nothing to find them.
@@ -32,7 +33,10 @@ print(json.dumps([simulation.report(4.0)["vehicles_routed"], sorted(set(sys.modu
 
 
 def _python(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    loads = {**os.environ, forkserver.LOADS: forkserver.ROLES_AND_KERNELS}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=loads, capture_output=True, text=True, check=True
+    ).stdout
 
 
 def test_no_role_imports_for_itself_what_all_of_its_kind_need() -> None:
@@ -44,7 +48,7 @@ def test_no_role_imports_for_itself_what_all_of_its_kind_need() -> None:
 def test_what_one_process_or_none_needs_is_not_loaded_for_all() -> None:
     loaded = json.loads(
         _python(
-            "import json, sys\nimport launch_scripts.launcher.warm_kernels\n"
+            "import json, sys\nimport launch_scripts.launcher.preloaded\n"
             "print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
         )
     )
@@ -88,8 +92,8 @@ def test_a_command_that_starts_a_swarm_begins_with_what_takes_longest(
     words: list[str], starts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
-    monkeypatch.setattr(preload, "start_forkserver", lambda module: order.append(module))
+    monkeypatch.setattr(forkserver, "start_forkserver", lambda module: order.append(module))
     monkeypatch.setattr("launch_scripts.cli.main", lambda: order.append("cli") or 0)
     monkeypatch.setattr(sys, "argv", ["swarm", *words])
     assert entry.main() == 0
-    assert order == [*([preload.ROLES_AND_KERNELS] if starts else []), "cli"]
+    assert order == [*([forkserver.ROLES_AND_KERNELS] if starts else []), "cli"]

@@ -15,12 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from launch_scripts.launcher import take_over
-from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher import takeover
 from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.options import common_run_id
-from launch_scripts.launcher.run_processes import writing
-from launch_scripts.launcher.take_over import TakeOver
+from launch_scripts.launcher.supervisor import Running
+from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.observe.latest_state import Observed
 from launch_scripts.process_table import ProcessSpec
@@ -50,13 +49,13 @@ class Machine:
         self.predecessors = dict(PREDECESSORS)
         """Name -> pid of the newest life that the launcher before has started."""
         patch.setattr(
-            take_over,
+            takeover,
             "processes",
             lambda *_: {name: pid for name, pid in self.predecessors.items() if pid in self.alive},
         )
-        patch.setattr(take_over, "has_ended", lambda pid: pid not in self.alive)
-        patch.setattr(take_over, "writing", lambda _: [LAUNCHER, os.getpid()])
-        patch.setattr(take_over.os, "kill", lambda pid, number: self.asked.append((pid, number)))
+        patch.setattr(takeover, "has_ended", lambda pid: pid not in self.alive)
+        patch.setattr(takeover, "writing", lambda _: [LAUNCHER, os.getpid()])
+        patch.setattr(takeover.os, "kill", lambda pid, number: self.asked.append((pid, number)))
         self.running = [
             Running(ProcessSpec(role, id, "m:f")) for role, _, id in (name.partition("-") for name in PREDECESSORS)
         ]
@@ -204,7 +203,7 @@ def test_a_launcher_that_was_killed_is_followed_and_nobody_is_sent_a_signal(
 def test_of_two_that_take_over_at_once_the_later_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(take_over, "writing", lambda _: [os.getpid(), LAUNCHER, 101])
+    monkeypatch.setattr(takeover, "writing", lambda _: [os.getpid(), LAUNCHER, 101])
     with pytest.raises(ConfigError, match=r"2 launchers run in .*, pids 100, 101: wait until one has taken over"):
         TakeOver(tmp_path, [], [], print)
 
@@ -214,8 +213,8 @@ def test_where_there_is_nobody_to_follow_or_a_role_would_be_lost_it_is_refused_i
 ) -> None:
     with pytest.raises(ConfigError, match=r"--take-over: no launcher of this user runs in .*; start without it"):
         TakeOver(tmp_path, [], [], print)
-    monkeypatch.setattr(take_over, "writing", lambda _: [LAUNCHER])
-    monkeypatch.setattr(take_over, "processes", lambda *_: {"agent-a0": 6, "agent-a1": 7, "planner-added": 2})
+    monkeypatch.setattr(takeover, "writing", lambda _: [LAUNCHER])
+    monkeypatch.setattr(takeover, "processes", lambda *_: {"agent-a0": 6, "agent-a1": 7, "planner-added": 2})
     part = [Running(ProcessSpec("agent", "a0", "m:f"))]
     with pytest.raises(ConfigError, match="runs agent-a1 too, which this one would end and not start again"):
         TakeOver(tmp_path, part, ["t0"], print)

@@ -5,28 +5,28 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
+import math
 import multiprocessing
 import os
 import signal
-import sys
 import time
-import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from launch_scripts.launcher.child import EndedAsAsked, ExitReason, Reports, run_child
-from launch_scripts.launcher.hang_watch import STILL_S, HangWatch
+from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.log_file import LogFormat
-from launch_scripts.launcher.run_processes import threads_of
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
 from launch_scripts.web.health_verdict import Process
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.deadline import KILLED_BY
-from swarm.runtime.health import BOARD_BYTES, Board
+from swarm.runtime.health import BOARD_BYTES, Board, Phase
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -43,6 +43,13 @@ REFUSALS_ALLOWED = 5
 REFUSALS_WITHIN_S = 60.0
 FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
+
+
+STILL_S = 60.0
+"""A loop that has not ticked for so long does not come back. Much longer than `HUNG_S`, from which on probes are
+told: a machine that is far too busy is not helped by starts."""
+LOOK_EVERY_S = 1.0
+_MOST_PER_LOOK_S = 2.0
 
 
 @dataclass(slots=True)
@@ -383,7 +390,7 @@ class LocalSwarm:
         for running in leaving:
             process = running.process
             if process is not None and process.exitcode is None and process.pid is not None:
-                log.warning("%s has ended and does not leave: %s", running.spec.name, threads_of(process.pid))
+                log.warning("%s has ended and does not leave: %s", running.spec.name, _state_of(process.pid))
                 process.kill()
             self._forget(running)
 
@@ -424,12 +431,43 @@ def _ask(
             return
 
 
-@contextlib.contextmanager
-def without_main() -> Iterator[None]:
-    """Keeps multiprocessing from running the launcher's own script in each child."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
+def _state_of(pid: int) -> str:
+    """What keeps a process, as far as the kernel says."""
     try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
+        process = psutil.Process(pid)
+        return f"{process.status()}, {process.num_threads()} threads"
+    except psutil.Error:
+        return "gone"
+
+
+class HangWatch:
+    """Looks at the boards of processes.
+
+    Time counts while the watcher itself turns only: a launcher that was stopped with all of its processes, as by
+    Ctrl-Z, finds their boards old when it goes on, and none of them hangs.
+    """
+
+    def __init__(self) -> None:
+        self._looked_s = -math.inf
+        self._awake_s = 0.0
+        """The time that counts, at the last look."""
+        self._since: dict[str, tuple[int, float]] = {}
+        """Name -> the stamp that it has shown last, and `_awake_s` when that was new."""
+
+    def look(self, seen: Callable[[], Iterable[Process]], now_s: float) -> list[str]:
+        """Names of processes whose loop has stood still for `STILL_S`; none between two looks.
+
+        seen   how each process is; not asked between two looks
+        now_s  on the monotonic clock
+        """
+        passed_s = now_s - self._looked_s
+        if passed_s < LOOK_EVERY_S:
+            return []
+        self._looked_s = now_s
+        self._awake_s += min(passed_s, _MOST_PER_LOOK_S)
+        before, self._since = self._since, {}
+        for name, vitals, ended in seen():
+            if ended is None and vitals is not None and vitals.phase is Phase.RUNS:
+                stamp_ns, since_s = before.get(name, (0, 0.0))
+                self._since[name] = (vitals.stamp_ns, since_s if stamp_ns == vitals.stamp_ns else self._awake_s)
+        return [name for name, (_, since_s) in self._since.items() if self._awake_s - since_s >= STILL_S]

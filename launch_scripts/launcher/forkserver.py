@@ -1,35 +1,77 @@
-"""What a run's processes share is loaded once, by a forkserver, and kernels that no process has compiled yet are
-compiled beside it."""
+"""The forkserver, which loads what a run's processes share once, and the kernels, which are compiled beside it.
+
+Imports little, so that it begins before all else: it is what a start waits for longest.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import multiprocessing
 import os
+import signal
+import sys
 import threading
 import time
+import types
+from collections.abc import Iterator
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
+from typing import TYPE_CHECKING
 
-from launch_scripts.launcher.child import wait_for_launcher
-from launch_scripts.launcher.local_swarm import without_main
-from launch_scripts.launcher.preload import start_forkserver
-from swarm.config.scenario import Scenario
+if TYPE_CHECKING:
+    from swarm.config.scenario import Scenario
 
+ROLES_ONLY, ROLES_AND_KERNELS = "roles", "roles and kernels"
+LOADS = "SWARM_FORKSERVER_LOADS"
+"""The variable of the environment that tells the forkserver which of the two to load."""
+_HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 _BACKGROUND = 5
 """Niceness of what compiles kernels that no first route needs."""
+
+
+def start_forkserver(loads: str | None) -> None:
+    """Let a forkserver load what roles share, beside this process. Does nothing where it runs already.
+
+    loads  `ROLES_ONLY` or `ROLES_AND_KERNELS`; None: nothing
+    """
+    # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    forkserver.set_forkserver_preload([] if loads is None else ["launch_scripts.launcher.preloaded"])
+    # The tracker's start unblocks signals, so it comes first.
+    resource_tracker.ensure_running()
+    # What is blocked here stays blocked in the server and in all that it forks: a Ctrl-C, which reaches the
+    # whole process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
+    os.environ[LOADS] = loads or ""
+    try:
+        forkserver.ensure_running()
+    finally:
+        del os.environ[LOADS]
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def without_main() -> Iterator[None]:
+    """Keeps multiprocessing from running the launcher's own script in each child."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 class WarmUp:
     """Starts the forkserver, waits on a thread until it has loaded everything, and compiles the kernels that are
     missing.
 
-    preload  module that the forkserver imports
+    loads    what the forkserver loads
     scenario that of the planners that are to run; None if none are
     """
 
-    def __init__(self, preload: str | None, scenario: Scenario | None = None) -> None:
-        start_forkserver(preload)
+    def __init__(self, loads: str | None, scenario: Scenario | None = None) -> None:
+        start_forkserver(loads)
         self._scenario = scenario
         self._context = multiprocessing.get_context("forkserver")
         self._failure: BaseException | None = None
@@ -170,5 +212,7 @@ def _say(tell: Connection, what: object) -> None:
 
 
 def _end_with_launcher() -> None:
+    from launch_scripts.launcher.child import wait_for_launcher
+
     wait_for_launcher()
     os._exit(0)

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.run_processes import processes
+from launch_scripts.launcher.takeover import processes
 from launch_scripts.parent_death import end_with_parent
 from swarm.errors import SwarmError
 

@@ -11,11 +11,13 @@ import contextlib
 import logging
 import os
 import signal
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
-from launch_scripts.launcher.local_swarm import Running
-from launch_scripts.launcher.run_processes import has_ended, processes, writing
+import psutil
+
+from launch_scripts.launcher.supervisor import Running
+from launch_scripts.process_table import ROLES
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
 from swarm.runtime.health import LIFE_BEFORE
@@ -26,6 +28,7 @@ _BESIDE = "planner"
 """The role whose two lives may work side by side: each answer is complete, and of two the younger life's counts."""
 _WAITS = "agent"
 """The role whose next life waits for the file that the life before has locked."""
+_NAMES = tuple(f"{role}-" for role in ROLES)
 _PATIENCE_S = 60.0
 """For successors to be ready: a target without a tracker has no tree, however long one waits."""
 
@@ -143,3 +146,34 @@ def _launcher_of(run_dir: Path) -> int:
             "wait until one has taken over from the other"
         )
     return found[0]
+
+
+def processes(run_dir: Path, other_than: Collection[int] = ()) -> dict[str, int]:
+    """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
+    found: dict[str, int] = {}
+    for pid, path in _writes():
+        name = path.name.partition(".log")[0]
+        if path.parent == run_dir and name.startswith(_NAMES) and pid not in other_than:
+            found[name] = pid
+    return found
+
+
+def writing(file: Path) -> list[int]:
+    """The processes of this user that may write to a file; one who only reads it is not among them."""
+    return [pid for pid, path in _writes() if path == file]
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a process is gone, or dead and not yet reaped."""
+    try:
+        return bool(psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
+    except psutil.Error:
+        return True
+
+
+def _writes() -> Iterator[tuple[int, Path]]:
+    """(pid, file) for each log that a process of this user has open so that it may write to it."""
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error, OSError):  # ended meanwhile, or somebody else's
+            for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
+                yield process.pid, Path(path)

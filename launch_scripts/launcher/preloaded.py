@@ -1,0 +1,45 @@
+"""Loads, on import, what the processes of a run share: the forkserver imports this module before it forks, so each
+role starts at once.
+
+Loading is paid once for all processes instead of once for each. Where planners are to run, the planner and its
+kernels are loaded too. Kernels that are not compiled yet are left to `WarmUp`, unless there is no folder to keep
+them in: then they are compiled here.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import logging
+import os
+import signal
+
+from launch_scripts.launcher.forkserver import LOADS, ROLES_AND_KERNELS
+from launch_scripts.parent_death import end_with_parent
+
+MODULES = (
+    "launch_scripts.launcher.child",
+    "launch_scripts.launcher.router",
+    "shared_map.keeper.main",
+    "vehicle_agent.main",
+    "launch_scripts.simulation.world.main",
+    "launch_scripts.monitor.main",
+    # What these import as they run, each for itself otherwise.
+    "encodings.idna",
+    "numpy.ma",
+)
+
+loads = os.environ.pop(LOADS, "")
+if loads:
+    end_with_parent(signal.SIGKILL)  # with the launcher, even after kill -9 while kernels compile
+gc.disable()  # all that is made here stays: to look for what may go takes a tenth of the time
+try:
+    for name in MODULES:
+        importlib.import_module(name)
+    if loads == ROLES_AND_KERNELS:
+        importlib.import_module("planner_service.main")
+        importlib.import_module("planner_service.kernel_build").load_what_is_there()
+except Exception:  # a role that cannot be loaded says so better in its own log
+    logging.getLogger(__name__).exception("cannot load what roles share")
+gc.freeze()
+gc.enable()
