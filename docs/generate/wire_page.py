@@ -16,12 +16,11 @@ from docs.generate.json_examples import OUTSIDE_ROLES, example, key_fields, put_
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.grid import REGION_TILES, TILE_CELLS
 from swarm.wire.access import OPERATOR, Grant
-from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES
+from swarm.wire.codec import JSON_ENCODING, MAX_ITEMS, MAX_JSON_BYTES, MAX_PAYLOAD_BYTES
 from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.readable import JSON_ENCODING, MAX_JSON_BYTES
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 from swarm.wire.versions import read_schemas, written_schema

@@ -32,9 +32,8 @@ from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
-from swarm.wire.codec import decode, encode
+from swarm.wire.codec import decode, encode, may_be_json, packed_json
 from swarm.wire.messages import Message
-from swarm.wire.readable import may_be_json, packed_json
 from swarm.wire.topics import Topic
 
 TOKEN_NS = 1_000_000

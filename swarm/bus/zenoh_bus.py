@@ -51,9 +51,8 @@ from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, code_of
-from swarm.wire.codec import decode_either, encode
+from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.messages import Message
-from swarm.wire.readable import encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
 log = logging.getLogger(__name__)
@@ -237,7 +236,7 @@ class ZenohBus:
         key = topic.keyed(self._namespace, **{**concrete, **fields})
         if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
-        payload = encode_readable(message) if as_json else encode(message)
+        payload = encode_json(message) if as_json else encode(message)
         self._intake.sent(payload)
         if as_json:
             query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)

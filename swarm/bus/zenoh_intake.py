@@ -14,9 +14,8 @@ from swarm.bus.bus import Heard, new_counts, newest_of
 from swarm.bus.zenoh_threads import attached, says_json
 from swarm.errors import ProtocolError
 from swarm.wire.access import Authenticator, check_code
-from swarm.wire.codec import decode, decode_many
+from swarm.wire.codec import decode, decode_many, decode_parameters, packed_json
 from swarm.wire.messages import Message
-from swarm.wire.readable import decode_parameters, packed_json
 from swarm.wire.topics import Topic
 
 log = logging.getLogger(__name__)

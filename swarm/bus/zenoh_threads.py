@@ -10,7 +10,7 @@ from typing import Any
 
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.errors import ProtocolError
-from swarm.wire.readable import JSON_ENCODING, may_be_json
+from swarm.wire.codec import JSON_ENCODING, may_be_json
 
 MOST_TOGETHER = 1024
 """Most samples in one `HeardMany`, so that a tick does not wait for long."""

@@ -10,9 +10,10 @@ import msgspec
 from swarm.client.session import Session
 from swarm.errors import ConfigError
 from swarm.runtime.operator import Acknowledged, Operator
-from swarm.wire.codec import field_fault, schema_of_type
+from swarm.wire.codec import field_fault
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Zone, ZoneOrder
+from swarm.wire.versions import schema_of_type
 
 M = TypeVar("M", bound=Message)
 

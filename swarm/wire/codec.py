@@ -1,26 +1,39 @@
 """Messages to bytes and back, by msgspec; msgpack reads what is long, and says what is wrong with the rest.
 
+People and their tools write and read JSON instead, or parameters of a selector. JSON follows the annotations of a
+message's fields, as the checks do: a column of numbers is a list of numbers, other bytes are a list of bytes,
+directions are compass points, inf is null. `packed_json` turns JSON into the MessagePack of the same message, so
+that one decoder with all its checks reads both.
+
 `decode` raises nothing but ProtocolError, whatever bytes it is given, and takes a bounded amount of memory.
 Decision 5 says what each of the two libraries does and what that costs.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import math
 import re
 import reprlib
-from collections.abc import Mapping, Sequence
+import struct
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 import msgpack
 import msgspec
 
 from swarm.errors import ProtocolError
-from swarm.wire.fields import np, numpy_loaded
+from swarm.grid import STEP_COL, STEP_ROW
+from swarm.wire.fields import CODES, OR_INFINITE, Column, Directions, name_of, np, numpy_loaded, taken_apart
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet, faulty_sets
-from swarm.wire.versions import STEPS, as_read, as_written, read_schemas
-from swarm.wire.versions import schema_of_type as schema_of_type
+from swarm.wire.messages.planning import RouteReply
+from swarm.wire.routes import Route
+from swarm.wire.versions import STEPS, as_read, as_written, read_schemas, schema_of_type
 
 MAX_PAYLOAD_BYTES = 8 << 20
 """Longer payloads are rejected unread: 1.6 times the digest of a full replica, the longest message there is."""
@@ -203,3 +216,197 @@ class _Count:
         if self._items > MAX_ITEMS:
             raise ProtocolError(f"more than {MAX_ITEMS} items")
         return built
+
+
+# --- JSON and parameters ------------------------------------------------------------------------------------------
+
+COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+"""Names of the direction codes 0..7."""
+JSON_ENCODING = "application/json"
+"""Zenoh's encoding by which a payload is read as JSON."""
+MAX_JSON_BYTES = 1 << 18
+"""Longer JSON is refused unread: an empty object of two bytes takes 64 bytes of memory."""
+_QUOTED = 60
+"""Most characters of a wrong value in an error."""
+
+
+def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
+    """The request in a selector such as `?row=40&col=200`. Raises ProtocolError on what does not fit."""
+    fields = {key: value for key, value in parameters.items() if key != "format"}
+    allowed = message_type.__struct_fields__
+    unknown = sorted(set(fields) - set(allowed))
+    if unknown:
+        raise ProtocolError(f"unknown parameter {unknown[0]!r}, allowed: {', '.join(allowed)}")
+    try:
+        return msgspec.convert({**fields, "schema": schema_of_type(message_type)}, message_type, strict=False)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise ProtocolError(field_fault(error, fields)) from error
+
+
+def may_be_json(payload: bytes) -> bool:
+    """True if a payload can be a JSON object: no message in MessagePack, which is a map, begins so."""
+    return bool(payload) and payload[0] < 0x80
+
+
+def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str, str] | None = None) -> bytes:
+    """The MessagePack of a message written as JSON: what `decode` reads. Raises ProtocolError, and nothing else.
+
+    `schema` may be left out, as the key says what is meant.
+
+    named  the fields of the key, which may be left out as well
+    """
+    if len(payload) > MAX_JSON_BYTES:
+        raise ProtocolError(f"JSON of {len(payload)} bytes, at most {MAX_JSON_BYTES}; MessagePack may be longer")
+    try:
+        given = msgspec.json.decode(payload)
+    except Exception as error:  # not UTF-8, no JSON, nested too deeply
+        raise ProtocolError(f"no JSON: {error}"[:300]) from error
+    if not isinstance(given, dict):
+        raise ProtocolError(f"JSON {_quoted(given)}, expected an object with the fields of {message_type.__name__}")
+    hints = _hints_of(message_type)
+    for name, chunk in (named or {}).items():
+        if name in hints and name not in given:
+            given[name] = int(chunk) if taken_apart(hints[name])[0] is int and chunk.isdecimal() else chunk
+    schema = given.pop("schema", schema_of_type(message_type))
+    try:
+        packed: bytes = msgpack.packb({"schema": schema} | _turned(given, message_type, "", _packed_column))
+    except ProtocolError:
+        raise
+    except Exception as error:  # an integer of more than 64 bits, a lone surrogate
+        raise ProtocolError(f"{type(error).__name__}: {error}"[:300]) from error
+    return packed
+
+
+def encode_json(message: Message) -> bytes:
+    """A message as JSON for people. Routes are listed one by one, with the cells that they pass."""
+    fields = _plain(message)
+    if isinstance(message, RouteReply):
+        fields["routes"] = [
+            {**_plain(each), "cells_row_col": _cells_row_col(each, message.cols)} for each in message.routes
+        ]
+    return msgspec.json.encode({"schema": schema_of_type(type(message))} | fields)
+
+
+def _plain(struct: msgspec.Struct) -> Any:
+    """The fields of a struct as JSON has them."""
+    fields = msgspec.to_builtins(struct, builtin_types=_BYTES, str_keys=False)
+    fields.pop("schema", None)
+    return _turned(fields, type(struct), "", _listed_column)
+
+
+@cache
+def _hints_of(struct: type[msgspec.Struct]) -> dict[str, Any]:
+    hints = typing.get_type_hints(struct, include_extras=True)
+    return {name: hints[name] for name in struct.__struct_fields__}
+
+
+def _turned(value: Any, hint: Any, place: str, turn: Callable[[Any, Column, str], Any]) -> Any:
+    """A value from MessagePack's form to JSON's or back, by its type. What does not fit the type stays as it is,
+    for the decoder to refuse.
+
+    place  of the value in its message, for errors
+    turn   how columns are turned, and with them the whole: `_listed_column` or `_packed_column`
+    """
+    bare, notes = taken_apart(hint)
+    kind, args = typing.get_origin(bare) or bare, typing.get_args(bare)
+    if kind in (types.UnionType, typing.Union):
+        (one,) = (arg for arg in args if arg is not types.NoneType)
+        return None if value is None else _turned(value, one, place, turn)
+    if kind is bytes:
+        return turn(value, next((note for note in notes if isinstance(note, Column)), _BYTE_COLUMN), place)
+    if kind is float and OR_INFINITE in notes:
+        return _null_for_infinite(value) if turn is _listed_column else math.inf if value is None else value
+    if kind is list and isinstance(value, list):
+        return [_turned(each, args[0], place, turn) for each in value]
+    if kind is dict and isinstance(value, dict):
+        numbered = turn is _packed_column and taken_apart(args[0])[0] is int  # JSON has texts for keys
+        try:
+            value = {int(key): each for key, each in value.items()} if numbered else value
+        except ValueError as error:
+            raise ProtocolError(f"{place} has a key that is no integer, such as 4") from error
+        return {key: _turned(each, args[1], place, turn) for key, each in value.items()}
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return _turned_struct(value, kind, place, turn)
+    return value
+
+
+def _turned_struct(value: Any, kind: type[msgspec.Struct], place: str, turn: Callable[..., Any]) -> Any:
+    hints, dot = _hints_of(kind), f"{place}." if place else ""
+    if kind.__struct_config__.array_like and isinstance(value, list | tuple):
+        parts = zip(value, hints.items(), strict=False)
+        return [_turned(each, hint, dot + name, turn) for each, (name, hint) in parts] + list(value[len(hints) :])
+    if not isinstance(value, dict):
+        return value
+    for name in value:
+        if name not in hints:
+            allowed = ", ".join(hints) or "no fields"
+            raise ProtocolError(f"unknown field {dot}{name[:_QUOTED]!r}; {kind.__name__} has {allowed}")
+    return {name: _turned(each, hints[name], dot + name, turn) for name, each in value.items()}
+
+
+_BYTE_COLUMN = Column("<u1")
+_DIRECTION_COLUMN = taken_apart(Directions)[1][-1]
+
+
+def _layout_of(column: Column) -> tuple[struct.Struct, list[str] | None]:
+    """How the values or rows of a column are packed; the types in a row, None where there are single values."""
+    row = [part for _, part in column.dtype] if isinstance(column.dtype, tuple) else None
+    return struct.Struct("<" + "".join(CODES[part] for part in row or [str(column.dtype)])), row
+
+
+def _null_for_infinite(value: Any) -> Any:
+    return value if math.isfinite(value) else None
+
+
+def _listed_column(data: bytes, column: Column, place: str) -> list[Any]:
+    """A column as the list of its values, or of its rows."""
+    layout, row = _layout_of(column)
+    if column == _DIRECTION_COLUMN:
+        return [COMPASS[code] for code in data]
+    if row is not None:
+        return [list(each) for each in layout.iter_unpack(data)]
+    return [_null_for_infinite(each) for (each,) in layout.iter_unpack(data)]
+
+
+def _packed_column(given: Any, column: Column, place: str) -> bytes:
+    """The bytes of a column that JSON gives as a list of its values or rows, or as base64 of its bytes."""
+    layout, row = _layout_of(column)
+    what = "[" + ", ".join(map(name_of, row)) + "]" if row else name_of(str(column.dtype))
+    if isinstance(given, str):
+        try:
+            return base64.b64decode(given, validate=True)
+        except ValueError as error:
+            raise ProtocolError(f"{place} {_quoted(given)} is no base64: {error}") from error
+    if not isinstance(given, list):
+        raise ProtocolError(f"{place} is {_quoted(given)}, expected a list of {what}, or base64 of their bytes")
+    if column == _DIRECTION_COLUMN and all(isinstance(each, str) for each in given):
+        unknown = next((each for each in given if each not in COMPASS), None)
+        if unknown is not None:
+            raise ProtocolError(f"{place} has {_quoted(unknown)}, expected one of {', '.join(COMPASS)}")
+        return bytes(map(COMPASS.index, given))
+    packed = bytearray()
+    for each in given:
+        values = each if row is not None and isinstance(each, list) else [each]
+        infinite = layout.format in ("<f", "<d") and each is None
+        try:
+            packed += layout.pack(*([math.inf] if infinite else values))
+        except (struct.error, OverflowError) as error:
+            raise ProtocolError(f"{place} has {_quoted(each)}, expected {what}") from error
+    return bytes(packed)
+
+
+def _quoted(given: Any) -> str:
+    text = repr(given)
+    return text if len(text) <= _QUOTED else text[:_QUOTED] + " ..."
+
+
+def _cells_row_col(route: Route, cols: int) -> list[list[int]]:
+    row, col = divmod(route.start, cols)
+    cells = [[row, col]]
+    for code in route.directions:
+        row, col = row + STEP_ROW[code], col + STEP_COL[code]
+        cells.append([row, col])
+    return cells
+
+
+# --- JSON and parameters ------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import re
 import reprlib
 import sys
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 from struct import Struct
@@ -300,16 +300,25 @@ def taken_apart(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, notes
 
 
-def _each_id(names: list[str]) -> Rule:
-    """Ids that are fields, looked up all at once."""
-    get = attrgetter(*names, names[0])  # a tuple even of one
+def _ids_rule(get: Callable[[Any], Iterable[Any]], named: Callable[[Any], Iterable[tuple[str, Any]]]) -> Rule:
+    """A rule that some values of a struct are ids.
+
+    get    all of them at once, which are looked up among those found valid: the usual case
+    named  each with its place in the struct, to say which is none
+    """
 
     def rule(struct: Any) -> None:
         if not _KNOWN_IDS.issuperset(get(struct)):
-            for name in names:
-                check_id(name, getattr(struct, name))
+            for name, value in named(struct):
+                check_id(name, value)
 
     return rule
+
+
+def _each_id(names: list[str]) -> Rule:
+    """Ids that are fields."""
+    get = attrgetter(*names, names[0])  # a tuple even of one
+    return _ids_rule(get, lambda struct: ((name, getattr(struct, name)) for name in names))
 
 
 def _id_or_none(name: str) -> Rule:
@@ -326,27 +335,17 @@ def _id_or_none(name: str) -> Rule:
 def _all_ids(name: str) -> Rule:
     """Ids in a list, or those which are the keys of a map."""
     get = attrgetter(name)
-
-    def rule(struct: Any) -> None:
-        values = get(struct)
-        if not _KNOWN_IDS.issuperset(values):
-            for value in values:
-                check_id(name, value)
-
-    return rule
+    return _ids_rule(get, lambda struct: ((name, value) for value in get(struct)))
 
 
 def _ids_of_parts(name: str, id: str) -> Rule:
     """An id of each part in a list."""
     get, get_id = attrgetter(name), attrgetter(id)
 
-    def rule(struct: Any) -> None:
-        parts = get(struct)
-        if not _KNOWN_IDS.issuperset(map(get_id, parts)):
-            for index, part in enumerate(parts):
-                check_id(f"{name}[{index}].{id}", get_id(part))
+    def named(struct: Any) -> Iterable[tuple[str, Any]]:
+        return ((f"{name}[{index}].{id}", get_id(part)) for index, part in enumerate(get(struct)))
 
-    return rule
+    return _ids_rule(lambda struct: map(get_id, get(struct)), named)
 
 
 def _column_rule(name: str, column: Column) -> Rule:
@@ -422,30 +421,3 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
             raise ValueError(f"{name} has {worst}, expected {expected}")
 
     return check
-
-
-def unbounded(struct: type[msgspec.Struct]) -> Iterator[str]:
-    """The fields of a struct whose type leaves something unbounded, each with what it lacks."""
-    for name, hint in typing.get_type_hints(struct, include_extras=True).items():
-        yield from (f"{struct.__name__}.{name}: {lack}" for lack in _lacking(hint))
-
-
-def _lacking(hint: Any) -> Iterator[str]:
-    bare, notes = taken_apart(hint)
-    origin = typing.get_origin(bare) or bare
-    metas = [note for note in notes if isinstance(note, Meta)]
-    sized = any(meta.max_length is not None for meta in metas)
-    if origin in (int, float):
-        below = any(meta.ge is not None or meta.gt is not None for meta in metas)
-        above = any(meta.le is not None or meta.lt is not None for meta in metas) or OR_INFINITE in notes
-        if not (below and above):
-            yield f"{origin.__name__} without bounds"
-    elif origin is bytes:
-        if not sized and not any(isinstance(note, Column) and note.per for note in notes):
-            yield "bytes without a length"
-    elif origin in (str, list, dict) and not sized:
-        yield f"{origin.__name__} without a length"
-    elif isinstance(origin, type) and issubclass(origin, msgspec.Struct):
-        yield from unbounded(origin)
-    for part in typing.get_args(bare):
-        yield from _lacking(part)

@@ -17,12 +17,11 @@ from support.effort import few
 from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
-from swarm.wire.codec import decode, encode
+from swarm.wire.codec import MAX_JSON_BYTES, decode, encode, encode_json, may_be_json, packed_json
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import CostRequest, PushedRoute, TargetPose
 from swarm.wire.messages.vehicles import Body
-from swarm.wire.readable import MAX_JSON_BYTES, encode_readable, may_be_json, packed_json
 from swarm.wire.topics import TOPICS
 
 PUT = tuple({topic.message for topic in TOPICS if topic.published})
@@ -36,7 +35,7 @@ def read(text: str | bytes, kind: type[Message], **named: str) -> Message:
 
 
 def as_dict(message: Message) -> dict[str, Any]:
-    fields: dict[str, Any] = json.loads(encode_readable(message))
+    fields: dict[str, Any] = json.loads(encode_json(message))
     return fields
 
 
@@ -50,9 +49,9 @@ def test_what_is_shown_as_json_says_the_same_when_it_is_put(kind):
     @settings(max_examples=few(40), deadline=None)
     @given(MESSAGES[kind])
     def round_trip(message):
-        shown = encode_readable(message)
+        shown = encode_json(message)
         again = read(shown, kind)
-        assert encode_readable(again) == shown
+        assert encode_json(again) == shown
         if None not in msgspec.to_builtins(message).values() and b"null" not in shown:
             assert again == message
 
@@ -65,7 +64,7 @@ def test_no_message_in_messagepack_is_taken_for_json(kind):
     @given(MESSAGES[kind])
     def begins(message):
         assert not may_be_json(encode(message))
-        assert may_be_json(encode_readable(message))
+        assert may_be_json(encode_json(message))
 
     begins()
 
@@ -152,7 +151,7 @@ def test_twenty_thousand_mutations_of_json_raise_nothing_but_protocol_errors():
     accepted = 0
     for n in range(20_000):
         message = EXAMPLES[n % len(EXAMPLES)]
-        text = bytearray(encode_readable(message))
+        text = bytearray(encode_json(message))
         for _ in range(rng.choice((1, 1, 2, 5))):
             at = rng.randrange(len(text) + 1)
             text[at : at + rng.randrange(3)] = rng.choice(

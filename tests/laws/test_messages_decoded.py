@@ -21,14 +21,13 @@ from support.effort import few
 from support.wire_strategies import EXAMPLES, MESSAGES, types_of_the_wire
 
 from swarm.errors import ProtocolError
-from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, encode
+from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, decode_parameters, encode, encode_json
 from swarm.wire.fields import Column, pack_column, taken_apart
 from swarm.wire.messages import Message, Nothing, schema_of
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.traffic import Standing, Table
-from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.routes import Route, Routes, RouteStatus
 from swarm.wire.topics import TOPICS
 
@@ -301,7 +300,7 @@ def test_a_route_leaves_the_eight_directions_never():
 
 
 def test_a_route_reply_is_readable_as_json():
-    reply = json.loads(encode_readable(BY_TYPE[RouteReply]))
+    reply = json.loads(encode_json(BY_TYPE[RouteReply]))
     found, none = reply["routes"]
     assert reply["schema"] == schema_of("route")
     assert found["status"] == "ok"
@@ -313,10 +312,10 @@ def test_a_route_reply_is_readable_as_json():
 
 def test_every_message_is_readable_as_json():
     for example in EXAMPLES:
-        fields = json.loads(encode_readable(example))
+        fields = json.loads(encode_json(example))
         assert set(msgpack.unpackb(encode(example), strict_map_key=False)) <= set(fields)
-    assert json.loads(encode_readable(BY_TYPE[CostReply]))["cost_to_go_s"] == [3.0, None]
-    assert json.loads(encode_readable(BY_TYPE[MarkSet]))["cells"] == [5, 1023]
+    assert json.loads(encode_json(BY_TYPE[CostReply]))["cost_to_go_s"] == [3.0, None]
+    assert json.loads(encode_json(BY_TYPE[MarkSet]))["cells"] == [5, 1023]
 
 
 def test_a_person_asks_with_parameters():

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import random
+import typing
+from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import rerun as rr
@@ -32,7 +36,7 @@ from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator
 from swarm.wire.codec import decode
-from swarm.wire.fields import unbounded
+from swarm.wire.fields import OR_INFINITE, Column, taken_apart
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
@@ -272,6 +276,33 @@ def lied_to(run: str, state: str, seed: int, steps: int, altered: bool) -> Lied:
     liar.serving = False
     liar.bus.close()
     return swarm
+
+
+def unbounded(struct: type[msgspec.Struct]) -> Iterator[str]:
+    """The fields of a struct whose type leaves something unbounded, each with what it lacks."""
+    for name, hint in typing.get_type_hints(struct, include_extras=True).items():
+        yield from (f"{struct.__name__}.{name}: {lack}" for lack in _lacking(hint))
+
+
+def _lacking(hint: Any) -> Iterator[str]:
+    bare, notes = taken_apart(hint)
+    origin = typing.get_origin(bare) or bare
+    metas = [note for note in notes if isinstance(note, msgspec.Meta)]
+    sized = any(meta.max_length is not None for meta in metas)
+    if origin in (int, float):
+        below = any(meta.ge is not None or meta.gt is not None for meta in metas)
+        above = any(meta.le is not None or meta.lt is not None for meta in metas) or OR_INFINITE in notes
+        if not (below and above):
+            yield f"{origin.__name__} without bounds"
+    elif origin is bytes:
+        if not sized and not any(isinstance(note, Column) and note.per for note in notes):
+            yield "bytes without a length"
+    elif origin in (str, list, dict) and not sized:
+        yield f"{origin.__name__} without a length"
+    elif isinstance(origin, type) and issubclass(origin, msgspec.Struct):
+        yield from unbounded(origin)
+    for part in typing.get_args(bare):
+        yield from _lacking(part)
 
 
 def test_no_field_of_any_message_is_without_bounds() -> None:

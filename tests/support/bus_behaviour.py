@@ -11,11 +11,10 @@ from docs.generate.wire_page import PATH as WIRE_PAGE
 from shared_map.replication.mark_sets import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
-from swarm.wire.codec import encode
+from swarm.wire.codec import encode, encode_json
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Stored
-from swarm.wire.readable import encode_readable
 from swarm.wire.topics import MARKS, NOTE, RUN, STORED, TRUE_POSE
 
 # --- publish and subscribe ----------------------------------------------------------------------------------
@@ -87,7 +86,7 @@ def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(w
         a, TRUE_POSE, encode(pose("t2")), in_json=True, target="t2"
     )  # whatever it says, this is MessagePack
     world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:], in_json=True, target="t3")
-    world.put_bytes(a, MARKS, encode_readable(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
+    world.put_bytes(a, MARKS, encode_json(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
     world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
     world.until(lambda: len(alone) == 2 and together)
     assert [event.message for event in alone] == [pose(), pose("t2")]

@@ -24,7 +24,7 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
 
     from swarm.config.explain import explain
     from swarm.errors import ConfigError
-    from swarm.wire.codec import schema_of_type
+    from swarm.wire.versions import schema_of_type
 
     given = {name: value for name, value in fields.items() if value is not None}
     try:

@@ -23,9 +23,9 @@ from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
 from swarm.runtime.inbox import Inbox
+from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
-from swarm.wire.readable import COMPASS, encode_readable
 from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import COST, ROUTE
 
@@ -128,7 +128,7 @@ def _ask(bus: Bus, request: CostRequest | RouteRequest, target: str, where: obje
 def as_json(answer: Answer) -> str:
     """The planner's answer, with its places in all coordinates that the terrain has."""
     frame, goal, last, cells = answer.frame, answer.goal, answer.target_cell, answer.path()
-    fields = json.loads(encode_readable(answer.reply))
+    fields = json.loads(encode_json(answer.reply))
     fields["crs"] = frame.grid.crs
     fields["from"] = fields_of(frame, answer.start)
     fields["to"] = None if goal is None else fields_of(frame, goal)

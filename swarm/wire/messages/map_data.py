@@ -88,26 +88,17 @@ def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes)
     if max(kinds) > LAST_KIND:
         raise ValueError(f"kind {max(kinds)} is not in 0..{LAST_KIND}")
     if len(kinds) > _FEW and numpy_loaded():
-        array = column(cells, "<u2")
-        rising = bool((array[1:] > array[:-1]).all())
-        last = int(array[-1])
-        times = column(stamps_ns, "<i8")
-        oldest_ns, newest_ns = int(times.min()), int(times.max())
-        told = column(paces, "<f4")[column(kinds, "<u1") == MarkKind.PACE]
-        possible = bool(((told >= PACE_LEAST) & (told <= PACE_MOST)).all())
-    else:
-        listed = memoryview(cells).cast("H").tolist()
-        rising = sorted(set(listed)) == listed
-        last = listed[-1]
-        stamps = memoryview(stamps_ns).cast("q").tolist()
-        oldest_ns, newest_ns = min(stamps), max(stamps)
-        said = zip(memoryview(paces).cast("f").tolist(), kinds, strict=True)
-        possible = all(kind != MarkKind.PACE or PACE_LEAST <= pace <= PACE_MOST for pace, kind in said)
-    if not rising or last >= TILE_AREA:
+        counts = np.array([len(kinds)], np.int64)
+        if not faulty_sets(counts, cells, kinds, paces, stamps_ns).size:
+            return
+    listed = memoryview(cells).cast("H").tolist()
+    if sorted(set(listed)) != listed or listed[-1] >= TILE_AREA:
         raise ValueError(f"cells must increase strictly below {TILE_AREA}")
-    if not possible:
+    driven = zip(memoryview(paces).cast("f").tolist(), kinds, strict=True)
+    if not all(kind != MarkKind.PACE or PACE_LEAST <= pace <= PACE_MOST for pace, kind in driven):
         raise ValueError(f"the pace of a PACE mark must be in {PACE_LEAST:.4g} ... {PACE_MOST:g} s/m")
-    if oldest_ns < 0 or newest_ns >= STAMP_LIMIT_NS:
+    stamps = memoryview(stamps_ns).cast("q").tolist()
+    if min(stamps) < 0 or max(stamps) >= STAMP_LIMIT_NS:
         raise ValueError("stamps_ns must not be negative, and below 2**62")
 
 

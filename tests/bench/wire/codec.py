@@ -25,10 +25,11 @@ from bench.isolated import measure, peak_bytes
 from bench.tables import number, table, times
 from swarm.config.load import load_scenario
 from swarm.errors import ProtocolError
-from swarm.wire.codec import MAX_PAYLOAD_BYTES, decode, encode, schema_of_type
+from swarm.wire.codec import MAX_PAYLOAD_BYTES, decode, encode
 from swarm.wire.messages import Message
 from swarm.wire.messages.planning import CostRequest
 from swarm.wire.topics import TOPICS
+from swarm.wire.versions import schema_of_type
 
 _SCENARIO = Path(__file__).parents[3] / "launch_scripts" / "scenarios" / "synthetic.toml"
 _SECONDS = 6
