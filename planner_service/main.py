@@ -57,7 +57,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.function("stopwatch", time.thread_time_ns, int),
             boundary.function("all kernels", lambda: kernels.complete, bool),
             boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
-            boundary.outside(prepared, PREPARED_COSTS),
+            boundary.external(prepared, PREPARED_COSTS),
         )
         process = Process(
             boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id), setup.health

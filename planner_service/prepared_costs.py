@@ -25,12 +25,12 @@ from shared_map.source_digest import source_digest
 from shared_map.terrain.kept import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
-from swarm.recording.outside import Outside
+from swarm.recording.external_calls import ExternalCalls
 
 log = logging.getLogger(__name__)
 
 
-PREPARED_COSTS = Outside(
+PREPARED_COSTS = ExternalCalls(
     "prepared costs",
     calls={"load": np.ndarray | None, "claim": bool, "leave": None},
     fixed=("cell_cost",),

@@ -40,7 +40,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         recorded(setup, terrain.digest) as boundary,
     ):
         inbox = Inbox()
-        kept = boundary.outside(store, PROMISE_STORE)
+        kept = boundary.external(store, PROMISE_STORE)
         service = AgentService(setup, terrain, truth, boundary.bus(bus), inbox.post, kept)
         tick_hz = setup.scenario.vehicles.tick_hz
         process = Process(

@@ -14,7 +14,7 @@ import msgspec
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
-from swarm.recording.outside import Outside
+from swarm.recording.external_calls import ExternalCalls
 from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way import OwnRecord
 
@@ -52,7 +52,7 @@ class PromiseStore(Protocol):
     def save(self, promised: int, table: Table) -> None: ...
 
 
-PROMISE_STORE = Outside(
+PROMISE_STORE = ExternalCalls(
     "store",
     calls={"reserve": str | None, "save_own": None, "save": None},
     facts={"own": OwnRecord, "saved": dict[int, tuple[int, Table]], "ready": bool},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -101,34 +102,22 @@ def rebuilt(setup: RoleSetup, ground: Ground, boundary: Replaying) -> Service:
     terrain, truth, bus = ground.terrain, ground.truth, boundary.bus()
     match setup.role:
         case "keeper":
-            return KeeperService(setup, terrain, bus, post, boundary.outside(cast(KeeperStore, None), KEEPER_STORE))
+            store = boundary.external(cast(KeeperStore, None), KEEPER_STORE)
+            return KeeperService(setup, terrain, bus, post, store)
         case "planner":
-            return _planner(setup, terrain, boundary)
+            stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
+            kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
+            of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
+            shelf = boundary.external(cast(PreparedCosts, _Costs(terrain, setup.scenario)), PREPARED_COSTS)
+            return PlannerService(
+                setup, terrain, bus, post, boundary.worker(), stopwatch, kernels, of_classes, shelf
+            )
         case "targets":
             return TargetsService(setup, terrain, truth, bus, post)
         case "agent":
-            promises = boundary.outside(cast(PromiseStore, None), PROMISE_STORE)
+            promises = boundary.external(cast(PromiseStore, None), PROMISE_STORE)
             return AgentService(setup, terrain, truth, bus, post, promises)
     raise StoreError(f"no process of role {setup.role!r} is replayed")
-
-
-def _planner(setup: RoleSetup, terrain: Terrain, boundary: Replaying) -> PlannerService:
-    costs = cast(PreparedCosts, _Costs(terrain, setup.scenario))
-
-    def post(event: Event) -> None:
-        pass
-
-    return PlannerService(
-        setup,
-        terrain,
-        boundary.bus(),
-        post,
-        boundary.worker(),
-        boundary.function("stopwatch", None, int),
-        boundary.function("all kernels", None, bool),
-        boundary.function("kernels of classes", None, bool),
-        boundary.outside(costs, PREPARED_COSTS),
-    )
 
 
 class _Costs:

@@ -12,16 +12,8 @@ from launch_scripts.replay.rebuild import REPLAYED, Ground, Grounds, rebuilt, se
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.recording.recording import path_of, versions
-from swarm.recording.records import (
-    CALLS,
-    FOLDER,
-    SUFFIX,
-    Cut,
-    Head,
-    RecordReader,
-    RecordWriter,
-)
-from swarm.recording.replaying import Outcome, Progress, replay
+from swarm.recording.records import FOLDER, SUFFIX, Called, Cut, Handled, Head, RecordReader, RecordWriter
+from swarm.recording.replaying import Outcome, replay
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +59,11 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
             f"{folder} holds no recorded inputs: `swarm up` and `swarm demo` record them with --record-inputs, "
             "`swarm simulate` always does"
         )
-    order = {role: place for place, role in enumerate(REPLAYED)}
-    found.sort(key=lambda each: (order.get(each[0].role, len(order)), _natural(each[0].id), each[0].incarnation))
+    order = {role: n for n, role in enumerate(REPLAYED)}
+    # t2 before t10.
+    found.sort(
+        key=lambda each: (order.get(each[0].role, len(order)), len(each[0].id), each[0].id, each[0].incarnation)
+    )
     lives: dict[str, int] = {}
     recorded: list[Recorded] = []
     for head, path in found:
@@ -117,28 +112,20 @@ def replay_run(
     recordings = recordings_of(folder, process)
     whole, before = sum(each.bytes for each in recordings), 0
     for recorded in recordings:
-        share_of = partial(_share, progress, before, whole)
+
+        def share(read: int, before: int = before) -> None:
+            progress((before + read) / whole)
+
         before += recorded.bytes
         try:
-            outcome = _replay(folder, recorded, grounds, until_s, share_of)
+            with RecordReader(recorded.path) as reader:
+                setup = setup_of(reader.head, folder)
+                make = partial(rebuilt, setup, grounds.of(setup, reader.head.terrain))
+                outcome = replay(reader, make, setup.scenario.network.namespace, until_s, share)
         except SwarmError as error:
             yield Replayed(recorded=recorded, outcome=None, why=str(error))
         else:
             yield Replayed(recorded=recorded, outcome=outcome)
-
-
-def _share(progress: Callable[[float], None], before: int, whole: int, read: int) -> None:
-    progress((before + read) / whole)
-
-
-def _replay(
-    folder: Path, recorded: Recorded, grounds: Grounds, until_s: float | None, progress: Progress
-) -> Outcome:
-    with RecordReader(recorded.path) as reader:
-        setup = setup_of(reader.head, folder)
-        ground = grounds.of(setup, reader.head.terrain)
-        namespace = setup.scenario.network.namespace
-        return replay(reader, lambda boundary: rebuilt(setup, ground, boundary), namespace, until_s, progress)
 
 
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
@@ -165,7 +152,7 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
         writer = RecordWriter(path)
         writer.write(head)
         for record in reader:
-            if isinstance(record, CALLS) and until_ns is not None and record.now_ns > until_ns:
+            if isinstance(record, Called | Handled) and until_ns is not None and record.now_ns > until_ns:
                 writer.write(Cut(f"kept until {until_s:g} s", whole=True))
                 break
             writer.write(record)
@@ -182,8 +169,3 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
         path.unlink(missing_ok=True)
         raise
     return path
-
-
-def _natural(id: str) -> tuple[int, str]:
-    """t2 before t10."""
-    return len(id), id

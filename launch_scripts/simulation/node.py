@@ -132,18 +132,18 @@ class Node:
         match self.spec.role:
             case "keeper":
                 self.store = self.store or KeeperStore(":memory:")
-                return KeeperService(setup, terrain, bus, post, boundary.outside(self.store, KEEPER_STORE))
+                return KeeperService(setup, terrain, bus, post, boundary.external(self.store, KEEPER_STORE))
             case "planner":
                 stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
                 kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
                 of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
-                prepared = boundary.outside(None, PREPARED_COSTS)
+                prepared = boundary.external(None, PREPARED_COSTS)
                 return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
             case "targets":
                 return TargetsService(setup, terrain, truth, bus, post)
             case "agent":
                 self.promises = self.promises or MemoryPromiseStore(self._phase_ns + setup.incarnation)
-                promises = boundary.outside(self.promises, PROMISE_STORE)
+                promises = boundary.external(self.promises, PROMISE_STORE)
                 return AgentService(setup, terrain, truth, bus, post, promises)
         raise ValueError(f"no simulation of role {self.spec.role}")
 

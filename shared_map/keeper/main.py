@@ -41,7 +41,7 @@ def run(
         recorded(setup, terrain.digest) as boundary,
     ):
         inbox = Inbox()
-        kept = boundary.outside(store, KEEPER_STORE)
+        kept = boundary.external(store, KEEPER_STORE)
         service = KeeperService(setup, terrain, boundary.bus(bus), inbox.post, kept)
         process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ, health=setup.health)
         process.stop_on_signals()

@@ -22,7 +22,7 @@ from shared_map.replication.marks import base_seq, is_tombstone
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
-from swarm.recording.outside import Outside
+from swarm.recording.external_calls import ExternalCalls
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order
@@ -398,7 +398,7 @@ def _move_aside(path: Path) -> Path:
     return aside
 
 
-KEEPER_STORE = Outside(
+KEEPER_STORE = ExternalCalls(
     "store",
     calls={
         "bind": None,

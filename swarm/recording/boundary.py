@@ -14,7 +14,7 @@ import numpy as np
 
 from swarm.bus.bus import Answerer, Bus, Heard, Post, Worker
 from swarm.liveness import Peer
-from swarm.recording.outside import Outside, content_of, unpack
+from swarm.recording.external_calls import ExternalCalls, content_of, unpack
 from swarm.runtime.process import Service
 from swarm.wire.codec import decode
 from swarm.wire.messages import Message
@@ -39,7 +39,7 @@ class Boundary:
         """A function that says what no message does, such as how much CPU was used; None where there is none."""
         return function
 
-    def outside(self, thing: T, what: Outside) -> T:
+    def external(self, thing: T, what: ExternalCalls) -> T:
         """An object outside, such as a store; None where there is none."""
         return thing
 
@@ -94,35 +94,31 @@ class BoundaryBus:
         self._bus.collect(topic, **fields)
 
     def collected(self, topic: Topic) -> list[Heard]:
-        heard: list[Heard] | None = None
+        def collect() -> list[tuple[list[str], Message]]:
+            return [(list(each.fields.values()), each.message) for each in self._bus.collected(topic)]
 
-        def collect() -> bytes:
-            nonlocal heard
-            heard = self._bus.collected(topic)
-            return content_of([(list(each.fields.values()), content_of(each.message)) for each in heard])
-
-        content = self._crossing.read(f"collected {topic.name}", collect)
-        if heard is not None:
-            return heard
-        samples = unpack(content, list[tuple[list[str], bytes]])
-        return [
-            Heard(topic, dict(zip(topic.fields, chunks, strict=True)), decode(payload, topic.message))
-            for chunks, payload in samples
-        ]
+        pairs = self._samples(f"collected {topic.name}", topic, collect, list[str])
+        return [Heard(topic, dict(zip(topic.fields, chunks, strict=True)), message) for chunks, message in pairs]
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        heard: list[tuple[str, Message]] | None = None
+        what = f"collected together {topic.name}"
+        return self._samples(what, topic, lambda: self._bus.collected_together(topic), str)
 
-        def collect() -> bytes:
+    def _samples(
+        self, what: str, topic: Topic, collect: Callable[[], list[tuple[T, Message]]], kind: Any
+    ) -> list[tuple[T, Message]]:
+        """Samples that wait, each with its key: collected from the bus and taken down, or made of what was."""
+        heard: list[tuple[T, Message]] | None = None
+
+        def taken_down() -> bytes:
             nonlocal heard
-            heard = self._bus.collected_together(topic)
+            heard = collect()
             return content_of([(key, content_of(message)) for key, message in heard])
 
-        content = self._crossing.read(f"collected together {topic.name}", collect)
+        content = self._crossing.read(what, taken_down)
         if heard is not None:
             return heard
-        samples = unpack(content, list[tuple[str, bytes]])
-        return [(key, decode(payload, topic.message)) for key, payload in samples]
+        return [(key, decode(each, topic.message)) for key, each in unpack(content, list[tuple[kind, bytes]])]
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         self._says("unsubscribe", topic, fields)
@@ -217,7 +213,7 @@ class BoundaryWorker:
 class BoundaryObject:
     """Stands for an object outside: what its methods return crosses the boundary."""
 
-    def __init__(self, thing: object, what: Outside, crossing: Crossing) -> None:
+    def __init__(self, thing: object, what: ExternalCalls, crossing: Crossing) -> None:
         self._thing = thing
         self._what = what
         self._crossing = crossing

@@ -1,9 +1,13 @@
-"""Events of the bus as records of a recording, and back."""
+"""What enters a service by a call, as records of a recording, and back: events of the bus, and what the loop of its
+process counted, which the service publishes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import msgspec
 
 from swarm.bus.bus import (
     Answerer,
@@ -20,23 +24,25 @@ from swarm.bus.bus import (
 )
 from swarm.errors import ProtocolError, StoreError
 from swarm.liveness import Peer
-from swarm.recording.outside import content_of
-from swarm.recording.records import (
-    AskOver,
-    Call,
-    GotReply,
-    HeardOne,
-    HeardSome,
-    JobEnded,
-    LinkSeen,
-    TokenChanged,
-    WasAsked,
-)
+from swarm.recording.external_calls import content_of
+from swarm.recording.records import Handled, LoopFigures
+from swarm.runtime.stats import Counters, Histogram
 from swarm.wire.codec import decode, decode_either, decode_many
-from swarm.wire.messages import Message
-from swarm.wire.topics import TOPICS, Topic
+from swarm.wire.topics import TOPICS
 
 _TOPICS = {topic.name: topic for topic in TOPICS}
+_REST: dict[str, Any] = {
+    "Heard": tuple[()],
+    "HeardMany": tuple[()],
+    "Asked": tuple[float],
+    "Replied": tuple[str, float],
+    "AskEnded": tuple[str, int, str | None],
+    "Appeared": tuple[str, str, int],
+    "Disappeared": tuple[str, str, int],
+    "LinkChanged": tuple[bool, bool],
+    "JobDone": tuple[str, int, int, list[tuple[str, bytes]]],
+}
+"""Class of an event -> types of what its record holds beside topic, key and messages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,82 +53,144 @@ class JobDone(WorkDone):
     reads: Sequence[tuple[str, bytes]]
 
 
-def record_of(event: Event, now_ns: int) -> Call:
+def record_of(event: Event, now_ns: int) -> Handled:
     """The record of an event that is handled now."""
+    samples: list[tuple[str, bytes]] = []
+    rest: tuple[Any, ...] = ()
     match event:
-        case Heard(topic, fields, message):
-            return HeardOne(now_ns, topic.name, list(fields.values()), content_of(message))
-        case HeardMany(topic, samples):
-            return HeardSome(now_ns, topic.name, [(key, content_of(message)) for key, message in samples])
-        case Asked(topic, fields, request):
-            chunks = [fields[name] for name in topic.fields]
-            return WasAsked(now_ns, topic.name, chunks, content_of(request), event.timeout_s)
-        case Replied(tag, topic, fields, message, took_s):
-            chunks = [fields[name] for name in topic.fields]
-            return GotReply(now_ns, topic.name, chunks, content_of(message), tag, took_s)
-        case AskEnded(tag, topic, replies, failure):
-            return AskOver(now_ns, topic.name, tag, replies, failure)
-        case Appeared(peer):
-            return TokenChanged(now_ns, peer.role, peer.id, peer.incarnation, True)
-        case Disappeared(peer):
-            return TokenChanged(now_ns, peer.role, peer.id, peer.incarnation, False)
-        case LinkChanged(up, beyond):
-            return LinkSeen(now_ns, up, beyond)
+        case Heard(message=message):
+            samples = [("", content_of(message))]
+        case HeardMany(samples=many):
+            samples = [(key, content_of(message)) for key, message in many]
+        case Asked(request=message):
+            samples, rest = [("", content_of(message))], (event.timeout_s,)
+        case Replied(message=message):
+            samples, rest = [("", content_of(message))], (event.tag, event.took_s)
+        case AskEnded():
+            rest = (event.tag, event.replies, event.failure)
+        case Appeared(peer) | Disappeared(peer):
+            rest = (peer.role, peer.id, peer.incarnation)
+        case LinkChanged():
+            rest = (event.up, event.beyond)
         case JobDone():
-            return JobEnded(now_ns, event.tag, event.number, event.took_ns, list(event.reads))
-    raise TypeError(f"an event that no boundary has passed: {event!r}")
+            rest = (event.tag, event.number, event.took_ns, list(event.reads))
+        case _:
+            raise TypeError(f"an event that no boundary has passed: {event!r}")
+    topic, fields = getattr(event, "topic", None), getattr(event, "fields", None)
+    chunks = [fields[name] for name in topic.fields] if topic is not None and fields is not None else []
+    return Handled(now_ns, type(event).__name__, "" if topic is None else topic.name, chunks, samples, rest)
 
 
-def event_of(call: Call, answerer: Answerer | None = None) -> Event:
+def rest_of(record: Handled) -> Any:
+    """What a record holds beside topic, key and messages. Raises StoreError where that is not of its event."""
+    try:
+        return msgspec.convert(record.rest, _REST[record.kind])
+    except (KeyError, msgspec.ValidationError) as error:
+        raise StoreError(f"a record that is no event: {error}") from error
+
+
+def event_of(record: Handled, answerer: Answerer) -> Event:
     """The event in a record, but for jobs. Raises StoreError on one that cannot have been an event.
 
     answerer  takes the answers to what was asked
     """
+    rest = rest_of(record)
+    match record.kind:
+        case "Appeared":
+            return Appeared(Peer(*rest))
+        case "Disappeared":
+            return Disappeared(Peer(*rest))
+        case "LinkChanged":
+            return LinkChanged(*rest)
+    if record.topic not in _TOPICS:
+        raise StoreError(f"this build has no topic {record.topic!r}")
+    topic = _TOPICS[record.topic]
+    if record.kind in ("Heard", "Asked", "Replied") and len(record.chunks) != len(topic.fields):
+        raise StoreError(f"topic {topic.name} has {len(topic.fields)} fields, not {len(record.chunks)}")
+    fields = dict(zip(topic.fields, record.chunks, strict=False))
+    payloads = [payload for _, payload in record.samples]
     try:
-        match call:
-            case HeardOne(topic=name, chunks=chunks, payload=payload):
-                topic = _topic(name)
-                return Heard(topic, _fields(topic, chunks), decode(payload, topic.message))
-            case HeardSome(topic=name, samples=samples):
-                topic = _topic(name)
-                messages = decode_many([payload for _, payload in samples], topic.message)
-                return HeardMany(
-                    topic, [(key, _whole(each)) for (key, _), each in zip(samples, messages, strict=True)]
-                )
-            case WasAsked(topic=name, chunks=chunks, payload=payload):
-                topic = _topic(name)
-                if topic.request is None or answerer is None:
-                    raise StoreError(f"topic {name} is never asked")
-                return Asked(topic, _fields(topic, chunks), decode(payload, topic.request), answerer)
-            case GotReply(topic=name, chunks=chunks, payload=payload, tag=tag, took_s=took_s):
-                topic = _topic(name)
-                message = decode_either(payload, topic.message, topic.bulk)
-                return Replied(tag, topic, _fields(topic, chunks), message, took_s)
-            case AskOver(topic=name, tag=tag, replies=replies, failure=failure):
-                return AskEnded(tag, _topic(name), replies, failure)
-            case TokenChanged(role=role, id=id, incarnation=incarnation, up=up):
-                peer = Peer(role, id, incarnation)
-                return Appeared(peer) if up else Disappeared(peer)
-            case LinkSeen(up=up, beyond=beyond):
-                return LinkChanged(up, beyond)
+        match record.kind, payloads:
+            case "Heard", [payload]:
+                return Heard(topic, fields, decode(payload, topic.message))
+            case "Asked", [payload] if topic.request is not None:
+                return Asked(topic, fields, decode(payload, topic.request), answerer)
+            case "Replied", [payload]:
+                tag, took_s = rest
+                return Replied(tag, topic, fields, decode_either(payload, topic.message, topic.bulk), took_s)
+            case "AskEnded", _:
+                tag, replies, failure = rest
+                return AskEnded(tag, topic, replies, failure)
+            case "HeardMany", _:
+                samples = []
+                for (key, _), message in zip(record.samples, decode_many(payloads, topic.message), strict=True):
+                    if isinstance(message, ProtocolError):
+                        raise message
+                    samples.append((key, message))
+                return HeardMany(topic, samples)
     except ProtocolError as error:
         raise StoreError(f"a recorded message is none to this build: {error}") from error
-    raise StoreError("a record that is no event")
+    raise StoreError(f"a record of {record.kind} on topic {topic.name} that is no event")
 
 
-def _topic(name: str) -> Topic:
-    if name not in _TOPICS:
-        raise StoreError(f"this build has no topic {name!r}")
-    return _TOPICS[name]
+class LoopCounters(Counters):
+    """The counters of a service, for its loop: the same figures, and which of them the loop writes."""
+
+    def __init__(self, counters: Counters) -> None:
+        self.counts = counters.counts
+        self.gauges = counters.gauges
+        self.histograms = counters.histograms
+        self.counts_by = counters.counts_by
+        self.histograms_by = counters.histograms_by
+        self._counts: dict[str, int | None] = {}
+        """Written by the loop, as last recorded; so are those below."""
+        self._gauges: dict[str, float | None] = {}
+        self._buckets: dict[str, dict[int, int]] = {}
+
+    def count(self, name: str, by: int = 1) -> None:
+        self._counts.setdefault(name, None)
+        super().count(name, by)
+
+    def set_counts(self, counts: Mapping[str, int]) -> None:
+        for name in counts:
+            self._counts.setdefault(name, None)
+        super().set_counts(counts)
+
+    def gauge(self, name: str, value: float) -> None:
+        self._gauges.setdefault(name, None)
+        super().gauge(name, value)
+
+    def observe(self, name: str, value: float) -> None:
+        self._buckets.setdefault(name, {})
+        super().observe(name, value)
+
+    def changed(self) -> LoopFigures | None:
+        """What the loop has changed since this was called last; None if it has not changed anything."""
+        counts = {name: self.counts[name] for name, told in self._counts.items() if self.counts[name] != told}
+        gauges = {
+            name: self.gauges[name]
+            for name, told in self._gauges.items()
+            if name in self.gauges and self.gauges[name] != told
+        }
+        buckets: dict[str, dict[int, int]] = {}
+        for name, told_buckets in self._buckets.items():
+            found = self.histograms[name].buckets
+            new = {bucket: count for bucket, count in found.items() if count != told_buckets.get(bucket)}
+            if new:
+                buckets[name] = new
+                told_buckets.update(new)
+        if not counts and not gauges and not buckets:
+            return None
+        self._counts.update(counts)
+        self._gauges.update(gauges)
+        return LoopFigures(counts, gauges, buckets)
 
 
-def _fields(topic: Topic, chunks: Sequence[str]) -> dict[str, str]:
-    if len(chunks) != len(topic.fields):
-        raise StoreError(f"topic {topic.name} has {len(topic.fields)} fields, not {len(chunks)}")
-    return dict(zip(topic.fields, chunks, strict=True))
-
-
-def _whole(message: Message | ProtocolError) -> Message:
-    if isinstance(message, ProtocolError):
-        raise message
-    return message
+def set_figures(counters: Counters, figures: LoopFigures | None) -> None:
+    """Write recorded figures into a service's counters."""
+    if figures is None:
+        return
+    counters.set_counts(figures.counts)
+    counters.gauges.update(figures.gauges)
+    for name, buckets in figures.buckets.items():
+        counters.histograms.setdefault(name, Histogram()).buckets.update(buckets)

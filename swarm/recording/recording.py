@@ -17,22 +17,19 @@ from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 from swarm.recording.boundary import Boundary, BoundaryAnswerer, BoundaryBus, BoundaryObject, BoundaryWorker
-from swarm.recording.events import JobDone, record_of
-from swarm.recording.loop_figures import LoopCounters
-from swarm.recording.outside import Outside, content_of, pack
+from swarm.recording.events import JobDone, LoopCounters, record_of
+from swarm.recording.external_calls import ExternalCalls, content_of, pack
 from swarm.recording.records import (
     FOLDER,
     SUFFIX,
     Call,
+    Called,
     Ended,
     Head,
     Output,
     Outputs,
     Read,
     RecordWriter,
-    Started,
-    Stopped,
-    Ticked,
 )
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
@@ -124,7 +121,7 @@ class Recording(Boundary):
         self.read_as(there_is(name), lambda: function is not None, bool)
         return None if function is None else lambda: self.read_as(name, function, kind)
 
-    def outside(self, thing: T, what: Outside) -> T:
+    def external(self, thing: T, what: ExternalCalls) -> T:
         self.read_as(there_is(what.name), lambda: thing is not None, bool)
         return thing if thing is None else cast(T, BoundaryObject(thing, what, self))
 
@@ -225,7 +222,7 @@ class _RecordedService:
         return self._service.lacks()
 
     def start(self, now_ns: int) -> None:
-        with self._recording.call(Started(now_ns, self._counters.changed())):
+        with self._recording.call(Called(now_ns, "start", self._counters.changed())):
             self._service.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -236,11 +233,11 @@ class _RecordedService:
             self._service.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        with self._recording.call(Ticked(now_ns, self._counters.changed())):
+        with self._recording.call(Called(now_ns, "tick", self._counters.changed())):
             self._service.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        with self._recording.call(Stopped(now_ns, self._counters.changed())):
+        with self._recording.call(Called(now_ns, "stop", self._counters.changed())):
             self._service.stop(now_ns)
 
 

@@ -1,6 +1,6 @@
 """A recording as a file: blocks behind each other, each with its length and checksum, of compressed records.
 
-    "swarm recording 1\n" {length u32, crc32 u32, zlib({length u32, record} {length, record} ...)} ...
+    "swarm recording 2\n" {length u32, crc32 u32, zlib({length u32, record} {length, record} ...)} ...
 
 Records are MessagePack, numbers little-endian. A process that is killed leaves a file that can be read up to its
 last whole block. Whatever stands in a file, reading it raises nothing but StoreError.
@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
 
@@ -24,7 +24,7 @@ from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)
 
-MAGIC = b"swarm recording 1\n"
+MAGIC = b"swarm recording 2\n"
 SUFFIX = ".inputs"
 FOLDER = "inputs"
 """Of a run's folder: one recording per life of a process."""
@@ -80,88 +80,33 @@ class LoopFigures(msgspec.Struct, frozen=True, array_like=True):
     buckets: dict[str, dict[int, int]]
 
 
-class Started(Record, frozen=True, tag=1):
+class Called(Record, frozen=True, tag=1):
+    """A call of the service's `start`, `tick` or `stop`."""
+
     now_ns: int
+    method: Literal["start", "tick", "stop"]
     figures: LoopFigures | None = None
 
 
-class Ticked(Record, frozen=True, tag=2):
-    now_ns: int
-    figures: LoopFigures | None = None
+class Handled(Record, frozen=True, tag=2):
+    """An event that the service handled (`swarm.recording.events`).
 
-
-class Stopped(Record, frozen=True, tag=3):
-    now_ns: int
-    figures: LoopFigures | None = None
-
-
-class HeardOne(Record, frozen=True, tag=4):
-    """chunks  of the key, in the order of the topic's fields"""
+    kind     the name of its class in `swarm.bus.bus`
+    topic    its name; empty of an event that has none
+    chunks   of the key, in the order of the topic's fields
+    samples  (key below the namespace, payload) of each message; the key of a single one is empty
+    rest     the other fields of the event
+    """
 
     now_ns: int
-    topic: str
-    chunks: list[str]
-    payload: bytes
+    kind: str
+    topic: str = ""
+    chunks: list[str] = []
+    samples: list[tuple[str, bytes]] = []
+    rest: tuple[Any, ...] = ()
 
 
-class HeardSome(Record, frozen=True, tag=5):
-    """samples  (key below the namespace, payload)"""
-
-    now_ns: int
-    topic: str
-    samples: list[tuple[str, bytes]]
-
-
-class WasAsked(Record, frozen=True, tag=6):
-    now_ns: int
-    topic: str
-    chunks: list[str]
-    payload: bytes
-    timeout_s: float
-
-
-class GotReply(Record, frozen=True, tag=7):
-    now_ns: int
-    topic: str
-    chunks: list[str]
-    payload: bytes
-    tag: str
-    took_s: float
-
-
-class AskOver(Record, frozen=True, tag=8):
-    now_ns: int
-    topic: str
-    tag: str
-    replies: int
-    failure: str | None
-
-
-class TokenChanged(Record, frozen=True, tag=9):
-    now_ns: int
-    role: str
-    id: str
-    incarnation: int
-    up: bool
-
-
-class LinkSeen(Record, frozen=True, tag=10):
-    now_ns: int
-    up: bool
-    beyond: bool
-
-
-class JobEnded(Record, frozen=True, tag=11):
-    """number  of the job among those that were submitted, from 0; reads  what it read of the outside"""
-
-    now_ns: int
-    tag: str
-    number: int
-    took_ns: int
-    reads: list[tuple[str, bytes]]
-
-
-class Read(Record, frozen=True, tag=12):
+class Read(Record, frozen=True, tag=3):
     """What the service read of the outside, inside the call before; before the first call while it was made."""
 
     what: str
@@ -176,13 +121,13 @@ class Output(msgspec.Struct, frozen=True, array_like=True):
     digest: bytes
 
 
-class Outputs(Record, frozen=True, tag=13):
+class Outputs(Record, frozen=True, tag=4):
     """All that the call before let out, in order. A call that lets nothing out has none."""
 
     outputs: list[Output]
 
 
-class Cut(Record, frozen=True, tag=14):
+class Cut(Record, frozen=True, tag=5):
     """The last record of a recording that does not go on to the end, though the process did.
 
     whole  whether all that the last call let out is there
@@ -192,36 +137,11 @@ class Cut(Record, frozen=True, tag=14):
     whole: bool = False
 
 
-class Ended(Record, frozen=True, tag=15):
+class Ended(Record, frozen=True, tag=6):
     """The last record of a process that ended in order."""
 
 
-Call = (
-    Started
-    | Ticked
-    | Stopped
-    | HeardOne
-    | HeardSome
-    | WasAsked
-    | GotReply
-    | AskOver
-    | TokenChanged
-    | LinkSeen
-    | JobEnded
-)
-CALLS = (
-    Started,
-    Ticked,
-    Stopped,
-    HeardOne,
-    HeardSome,
-    WasAsked,
-    GotReply,
-    AskOver,
-    TokenChanged,
-    LinkSeen,
-    JobEnded,
-)
+Call = Called | Handled
 AnyRecord = Head | Call | Read | Outputs | Cut | Ended
 
 _encode = msgspec.msgpack.Encoder().encode

@@ -3,36 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
-from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.bus.bus import Answerer, Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.recording.boundary import Boundary, BoundaryAnswerer, BoundaryBus, BoundaryObject, BoundaryWorker
-from swarm.recording.events import event_of
-from swarm.recording.loop_figures import set_figures
-from swarm.recording.outside import Outside, unpack
+from swarm.recording.events import event_of, rest_of, set_figures
+from swarm.recording.external_calls import ExternalCalls, unpack
 from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as, there_is
-from swarm.recording.records import (
-    CALLS,
-    Call,
-    Cut,
-    Ended,
-    JobEnded,
-    Output,
-    Outputs,
-    Read,
-    RecordReader,
-    Started,
-    Stopped,
-    Ticked,
-    WasAsked,
-)
+from swarm.recording.records import Call, Called, Cut, Ended, Handled, Output, Outputs, Read, RecordReader
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.process import Service
-from swarm.wire.messages import Message
 
 T = TypeVar("T")
 MAKING = "making the service"
@@ -102,8 +86,8 @@ class Replaying(Boundary):
     """Gives a service what was recorded, and takes what it lets out."""
 
     def __init__(self, namespace: str) -> None:
-        self._bus = BoundaryBus(cast(Bus, _NoBus(namespace)), self)
-        self._worker = BoundaryWorker(cast(Worker, _NoWorker()), self)
+        self._bus = BoundaryBus(cast(Bus, _Nobody(namespace=namespace)), self)
+        self._worker = BoundaryWorker(cast(Worker, _Nobody()), self)
         self.reads: deque[tuple[str, bytes]] = deque()
         """Of the event in hand: what it may still read."""
         self.outputs: list[_LetOut] = []
@@ -124,7 +108,7 @@ class Replaying(Boundary):
             return None
         return lambda: cast(T, self.read_as(name, function, kind))
 
-    def outside(self, thing: T, what: Outside) -> T:
+    def external(self, thing: T, what: ExternalCalls) -> T:
         there = self.read_as(there_is(what.name), None, bool)
         return cast(T, BoundaryObject(thing, what, self) if there else None)
 
@@ -155,25 +139,26 @@ class Replaying(Boundary):
 
     # --- events ---------------------------------------------------------------------------------------------
 
-    def event_of(self, call: Call, started_ns: int) -> Event:
-        if isinstance(call, JobEnded):
-            return self._job_done(call)
-        if isinstance(call, WasAsked):
+    def event_of(self, record: Handled) -> Event:
+        """The event in a record. A job that has ended is run now, with what it read then."""
+        if record.kind == "JobDone":
+            return self._job_done(*rest_of(record))
+        event = event_of(record, _nobody_asks)
+        if isinstance(event, Asked):
             self._asked += 1
-            asked = event_of(call, _NoAnswerer(call.timeout_s))
-            assert isinstance(asked, Asked)
-            answerer = BoundaryAnswerer(asked.answerer, asked.topic, self._asked, self)
-            return Asked(asked.topic, asked.fields, asked.request, answerer)
-        return event_of(call)
+            (timeout_s,) = record.rest
+            answerer = cast(Answerer, _Nobody(timeout_s=timeout_s))
+            event = replace(event, answerer=BoundaryAnswerer(answerer, event.topic, self._asked, self))
+        return event
 
-    def _job_done(self, call: JobEnded) -> WorkDone:
-        job = self._jobs.pop(call.number, None)
+    def _job_done(self, tag: str, number: int, took_ns: int, read: list[tuple[str, bytes]]) -> WorkDone:
+        job = self._jobs.pop(number, None)
         if job is None:
-            raise _NotRecorded(f"result of job {call.number}, which this build has not begun")
-        reads, self.reads = self.reads, deque(call.reads)
+            raise _NotRecorded(f"result of job {number}, which this build has not begun")
+        reads, self.reads = self.reads, deque(read)
         self._in_job = True
         try:
-            return WorkDone(call.tag, job(), call.took_ns)
+            return WorkDone(tag, job(), took_ns)
         finally:
             self._in_job = False
             self.reads = reads
@@ -190,29 +175,24 @@ def replay(
 
     make  makes the service behind a boundary
     """
-    run = _Replay(reader, make, namespace, until_s, progress)
     with collected_rarely():
-        return run.run()
+        return _Replay(reader, make, Replaying(namespace), until_s, progress).run()
 
 
+@dataclass
 class _Replay:
-    def __init__(
-        self,
-        reader: RecordReader,
-        make: Callable[[Replaying], Service],
-        namespace: str,
-        until_s: float | None,
-        progress: Progress,
-    ) -> None:
-        self._reader = reader
-        self._make = make
-        self._until_s = until_s
-        self._progress = progress
-        self._boundary = Replaying(namespace)
-        self._service: Service | None = None
-        self._events = self._outputs = 0
-        self._seconds = 0.0
-        self._ended = "was killed"
+    """A replay under way: see `replay`."""
+
+    reader: RecordReader
+    make: Callable[[Replaying], Service]
+    boundary: Replaying
+    until_s: float | None
+    progress: Progress
+    service: Service | None = None
+    events: int = 0
+    outputs: int = 0
+    seconds: float = 0.0
+    ended: str = "was killed"
 
     def run(self) -> Outcome:
         difference: Difference | None = None
@@ -220,102 +200,95 @@ class _Replay:
             difference = self._feed(step)
             if difference is not None:
                 break
-            self._events += step.call is not None
-            self._outputs += len(step.outputs)
+            self.events += step.call is not None
+            self.outputs += len(step.outputs)
         return Outcome(
-            events=self._events,
-            outputs=self._outputs,
-            seconds=self._seconds,
+            events=self.events,
+            outputs=self.outputs,
+            seconds=self.seconds,
             difference=difference,
-            ended="" if difference is not None else self._ended,
-            damaged=self._reader.damaged,
+            ended="" if difference is not None else self.ended,
+            damaged=self.reader.damaged,
         )
 
     def _steps(self) -> Iterator[_Step]:
         """The calls in the recording that are whole: the last one of a process that was killed may not be."""
         step, at = _Step(None), 0
-        until_ns = None if self._until_s is None else self._reader.head.started_ns + int(self._until_s * NS_PER_S)
-        for record in self._reader:
+        until_ns = None if self.until_s is None else self.reader.head.started_ns + int(self.until_s * NS_PER_S)
+        for record in self.reader:
             if isinstance(record, Read):
                 step.reads.append((record.what, record.value))
             elif isinstance(record, Outputs):
                 step.outputs += record.outputs
-            elif isinstance(record, CALLS):
+            elif isinstance(record, Called | Handled):
                 yield step
-                if self._reader.at != at:  # a block further
-                    at = self._reader.at
-                    self._progress(at)
+                if self.reader.at != at:  # a block further
+                    at = self.reader.at
+                    self.progress(at)
                 if until_ns is not None and record.now_ns > until_ns:
-                    self._ended = f"replayed until {self._until_s:g} s"
+                    self.ended = f"replayed until {self.until_s:g} s"
                     return
                 step = _Step(record)
             elif isinstance(record, Ended):
                 yield step
-                self._ended = "ended as asked"
+                self.ended = "ended as asked"
                 return
             elif isinstance(record, Cut):
                 if record.whole:
                     yield step
-                self._ended = record.why
+                self.ended = record.why
                 return
             else:
-                raise StoreError(f"{self._reader.path} is damaged: a second head")
+                raise StoreError(f"{self.reader.path} is damaged: a second head")
         if _was_raised(step):
             yield step
-            self._ended = "ended by an error"
+            self.ended = "ended by an error"
 
     def _feed(self, step: _Step) -> Difference | None:
-        boundary, call = self._boundary, step.call
+        boundary, call = self.boundary, step.call
         boundary.reads, boundary.outputs = step.reads, []
         stray: str | None = None
         if call is not None:
-            self._seconds = (call.now_ns - self._reader.head.started_ns) / NS_PER_S
+            self.seconds = (call.now_ns - self.reader.head.started_ns) / NS_PER_S
         try:
             self._call(call)
         except _NotRecorded as missing:
             stray = f"reads {missing}, which is not in the recording there"
         except StoreError as error:
             if not _was_raised(step):
-                raise StoreError(f"event {self._events + 1} of {self._reader.path}: {error}") from error
+                raise StoreError(f"event {self.events + 1} of {self.reader.path}: {error}") from error
             boundary.raised(error)
         except Exception as error:
             boundary.raised(error)
         for recorded, replayed in zip(step.outputs, boundary.outputs, strict=False):
             if recorded != replayed.output:
-                return self._difference(step, recorded, _said(replayed))
+                return self._difference(step, recorded, _described_output(replayed))
         done = min(len(step.outputs), len(boundary.outputs))
         if stray is not None:
             return self._difference(step, step.outputs[done] if done < len(step.outputs) else None, stray)
         if len(step.outputs) > done:
             return self._difference(step, step.outputs[done], None)
         if len(boundary.outputs) > done:
-            return self._difference(step, None, _said(boundary.outputs[done]))
+            return self._difference(step, None, _described_output(boundary.outputs[done]))
         return None
 
     def _call(self, call: Call | None) -> None:
         if call is None:
-            self._service = self._make(self._boundary)
+            self.service = self.make(self.boundary)
             return
-        service = self._service
+        service = self.service
         assert service is not None
-        match call:
-            case Started(now_ns, figures):
-                set_figures(service.counters, figures)
-                service.start(now_ns)
-            case Ticked(now_ns, figures):
-                set_figures(service.counters, figures)
-                service.tick(now_ns)
-            case Stopped(now_ns, figures):
-                set_figures(service.counters, figures)
-                service.stop(now_ns)
-            case _:
-                service.handle(self._boundary.event_of(call, self._reader.head.started_ns), call.now_ns)
+        if isinstance(call, Handled):
+            service.handle(self.boundary.event_of(call), call.now_ns)
+        else:
+            set_figures(service.counters, call.figures)
+            getattr(service, call.method)(call.now_ns)
 
     def _difference(self, step: _Step, recorded: Output | None, replayed: str | None) -> Difference:
         return Difference(
-            event=self._events + (step.call is not None),
+            event=self.events + (step.call is not None),
             what=MAKING if step.call is None else described(step.call),
-            seconds=self._seconds,
+            seconds=self.seconds,
             recorded=None if recorded is None else _named(recorded),
             replayed=replayed,
         )
@@ -323,22 +296,17 @@ class _Replay:
 
 def described(call: Call) -> str:
     """An event in a few words."""
-    match call:
-        case Started():
-            return "start"
-        case Ticked():
-            return "tick"
-        case Stopped():
-            return "stop"
-        case JobEnded(tag=tag, number=number):
-            return f"end of job {number} {tag}"
-    event = event_of(call, _NoAnswerer(0.0))
-    match event:
+    if isinstance(call, Called):
+        return call.method
+    if call.kind == "JobDone":
+        tag, number, *_ = rest_of(call)
+        return f"end of job {number} {tag}"
+    match event_of(call, _nobody_asks):
         case Heard(topic=topic, fields=fields):
             return topic.below(fields)
         case Asked(topic=topic, fields=fields):
             return f"query {topic.below(fields)}"
-    return type(event).__name__
+    return call.kind
 
 
 def _was_raised(step: _Step) -> bool:
@@ -351,38 +319,19 @@ def _named(output: Output) -> str:
     return f"{output.to} ({output.length} bytes, digest {output.digest.hex()})"
 
 
-def _said(let_out: _LetOut) -> str:
+def _described_output(let_out: _LetOut) -> str:
     text = "" if let_out.what is None else f": {let_out.what}"
     return f"{_named(let_out.output)}{text}"
 
 
-class _NoBus:
-    """A network on which nothing is heard and nobody listens."""
+class _Nobody:
+    """Stands for what is outside: a bus on which nothing is heard, a worker, who asked. It takes every call."""
 
-    def __init__(self, namespace: str) -> None:
-        self.namespace = namespace
+    def __init__(self, **facts: object) -> None:
+        vars(self).update(facts)
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *_, **__: None
 
 
-class _NoWorker:
-    def close(self) -> None:
-        pass
-
-
-class _NoAnswerer:
-    def __init__(self, timeout_s: float) -> None:
-        self.timeout_s = timeout_s
-
-    def waited_s(self) -> float:
-        return 0.0
-
-    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
-        pass
-
-    def refuse(self, reason: str) -> None:
-        pass
-
-    def end(self) -> None:
-        pass
+_nobody_asks = cast(Answerer, _Nobody(timeout_s=0.0))

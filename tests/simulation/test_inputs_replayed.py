@@ -26,21 +26,10 @@ from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
 from swarm.recording import records
-from swarm.recording.outside import Outside
+from swarm.recording.events import rest_of
+from swarm.recording.external_calls import ExternalCalls
 from swarm.recording.recording import Recording
-from swarm.recording.records import (
-    CALLS,
-    MAGIC,
-    Cut,
-    HeardOne,
-    JobEnded,
-    Output,
-    Outputs,
-    Read,
-    Record,
-    RecordReader,
-    packed,
-)
+from swarm.recording.records import MAGIC, Called, Cut, Handled, Output, Outputs, Read, Record, RecordReader, packed
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 
@@ -99,25 +88,26 @@ def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
         "all kernels": lambda: next(calls) > 40,
         "kernels of classes": lambda: True,
     }
-    function, outside = Recording.function, Recording.outside
+    function, outside = Recording.function, Recording.external
 
     def functions(self: Recording, name: str, given: object, kind: Any) -> Any:
         return function(self, name, live[name], kind)
 
-    def shelves(self: Recording, thing: object, what: Outside) -> Any:
+    def shelves(self: Recording, thing: object, what: ExternalCalls) -> Any:
         if what is PREPARED_COSTS:
             thing = PreparedCosts(tmp_path, terrain, scenario.planner)
         return outside(self, thing, what)
 
     monkeypatch.setattr(Recording, "function", functions)
-    monkeypatch.setattr(Recording, "outside", shelves)
+    monkeypatch.setattr(Recording, "external", shelves)
     simulate(scenario, seconds=3, record_to=tmp_path)
     read = set()
     for process in ("planner-t0", "planner-t1"):
         (replayed,) = replay_run(tmp_path, process)
         assert replayed.same, replayed
-        ended = [each for each in records_of(replayed.recorded.path) if isinstance(each, JobEnded)]
-        read |= {what for each in ended for what, _ in each.reads}
+        whole = records_of(replayed.recorded.path)
+        ended = [each for each in whole if isinstance(each, Handled) and each.kind == "JobDone"]
+        read |= {what for each in ended for what, _ in rest_of(each)[3]}
     assert read >= {"load", "claim"}
 
 
@@ -177,7 +167,7 @@ def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.Da
     else:
         other = {"digest": bytes(8)} if kind == "digest" else {"to": "put nowhere"}
         outputs[wrong] = msgspec.structs.replace(outputs[wrong], **other)
-    event = sum(isinstance(each, CALLS) for each in whole[:at])
+    event = sum(isinstance(each, Called | Handled) for each in whole[:at])
     folder = rewritten(
         run, run.parent / f"changed-{process}", process, [*whole[:at], Outputs(outputs), *whole[at + 1 :]]
     )
@@ -213,9 +203,9 @@ def test_other_code_is_found_at_the_event_at_which_it_does_something_else(
 
 def test_an_input_that_is_lost_shows(run: Path, tmp_path: Path) -> None:
     whole = records_of(next(each.path for each in recordings_of(run, "keeper-0")))
-    kept = [each for each in whole if not (isinstance(each, HeardOne) and each.topic == "sighted")]
+    kept = [each for each in whole if not (isinstance(each, Handled) and each.topic == "sighted")]
     kept = [each for n, each in enumerate(kept) if not (isinstance(each, Read) and n == 40)]
-    marks = [each for each in whole if isinstance(each, records.HeardSome)]
+    marks = [each for each in whole if isinstance(each, Handled) and each.kind == "HeardMany"]
     assert marks
     folder = rewritten(run, tmp_path / "lost", "keeper-0", [each for each in kept if each is not marks[-1]])
     (found,) = replay_run(folder)
@@ -287,12 +277,16 @@ def test_a_recording_names_no_file_elsewhere_and_nothing_that_a_terminal_obeys(
 
 def test_bytes_that_match_their_checksum_and_are_no_records_are_said_too(run: Path, tmp_path: Path) -> None:
     whole = records_of(next(each.path for each in recordings_of(run, "planner-t0")))
-    at = next(n for n, each in enumerate(whole) if isinstance(each, HeardOne))
+    at = next(n for n, each in enumerate(whole) if isinstance(each, Handled) and each.kind == "Heard")
     heard = whole[at]
-    assert isinstance(heard, HeardOne)
+    assert isinstance(heard, Handled)
     for number, wrong in enumerate(
         (
-            msgspec.structs.replace(heard, payload=b"\xff"),
+            msgspec.structs.replace(heard, samples=[("", b"\xff")]),
+            msgspec.structs.replace(heard, samples=[]),
+            msgspec.structs.replace(heard, kind="Nothing"),
+            msgspec.structs.replace(heard, kind="Replied"),
+            msgspec.structs.replace(heard, kind="JobDone", rest=("tag", 0, "soon", [])),
             msgspec.structs.replace(heard, topic="nothing"),
             msgspec.structs.replace(heard, chunks=["a"] * 9),
             whole[0],

@@ -18,7 +18,7 @@ _MOST_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
-class Outside:
+class ExternalCalls:
     """What a service may use of an object outside, such as a store.
 
     name   of it, in the recording
