@@ -19,8 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from launch_scripts.observe.palette import BLUE, GREEN, INK, ORANGE
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLUE, GREEN, INK, ORANGE, STYLE
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.class_grounds import class_grounds

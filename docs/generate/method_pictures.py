@@ -26,8 +26,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from docs.generate.printed import lattice_route, printed_costs, printed_range
-from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED, STYLE
 from planner_service.strategy import ROWS, STAGES, Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid

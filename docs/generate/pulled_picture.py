@@ -14,8 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from launch_scripts.observe.palette import BLUE, INK, ORANGE, RED
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLUE, INK, ORANGE, RED, STYLE
 from planner_service.route_finder import RouteFinder
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import build_terrain

@@ -16,8 +16,7 @@ from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from launch_scripts.observe.palette import BLUE, INK, ORANGE, RED
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLUE, INK, ORANGE, RED, STYLE
 from planner_service.route_finder import RouteFinder
 from shared_map.class_grounds import class_terrains
 from shared_map.terrain.terrain import Terrain, build_terrain

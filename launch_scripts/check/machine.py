@@ -16,7 +16,7 @@ from typing import Any
 
 from launch_scripts.check.findings import Finding, failure, ok, warning
 from launch_scripts.check.needs import available_bytes
-from launch_scripts.observe.disk_watch import can_write
+from launch_scripts.observe.run_folder import can_write
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import SwarmError

@@ -62,14 +62,14 @@ def swarm_answer(status: Status) -> Answer:
     from launch_scripts.web.health_probe import Answer
     from swarm.runtime.stats import READY
 
-    observed = status.model.observed
+    observed = status.latest
     processes = {(role, id): observed.newest_stats(role, id) for role, id in observed.up()}
     unready = [
         f"{role}-{id}"
         for (role, id), stats in sorted(processes.items())
         if stats is not None and stats.gauges.get(READY) == 0.0
     ]
-    missing = [f"{name.replace(' ', '-', 1)}: does not run" for name in status.model.missing()]
+    missing = [f"{name.replace(' ', '-', 1)}: does not run" for name in observed.missing()]
     missing += [f"{name}: not ready, as it says" for name in unready]
     if not any(info.run_id for info in status.members):
         missing.append("no run: only routers answer")

@@ -216,22 +216,21 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 
 def ask_status(where: Where, tls: Tls) -> Status:
     """A running swarm as it is now. Raises BusError if nobody answers."""
-    from launch_scripts.commands.running.status import StatusWatch
+    from launch_scripts.commands.running.status import status_of
+    from launch_scripts.observe.run_observer import OutsideObserver
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
     from swarm.errors import BusError
-    from swarm.runtime.inbox import Inbox
 
-    inbox, clock = Inbox(), MonotonicClock()
+    clock = MonotonicClock()
     with open_bus(where.network(tls)) as bus:
-        watch = StatusWatch(bus, inbox.post)
+        observer = OutsideObserver(bus)
         began_s = time.monotonic()
         while (spent_s := time.monotonic() - began_s) < _STATUS_MOST_S:
-            if spent_s >= _STATUS_LISTEN_S and watch.whole:
+            if spent_s >= _STATUS_LISTEN_S and observer.whole:
                 break
-            if (event := inbox.take(0.1)) is not None:
-                watch.take(event, clock.now_ns())
-        told = watch.status(clock.now_ns())
+            observer.listen(clock, 0.1)
+        told = status_of(observer, clock.now_ns())
     if told is None:
         admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
         raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from launch_scripts.observe.files import replacing
+from launch_scripts.observe.run_folder import replacing
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
 from swarm.wire.fields import check_id

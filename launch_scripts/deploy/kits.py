@@ -19,7 +19,7 @@ from launch_scripts.deploy.hosts import HostName
 from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
-from launch_scripts.observe.files import write_file
+from launch_scripts.observe.run_folder import write_file
 from launch_scripts.process_table import OPERATOR
 from swarm.bus.access_control import common_name
 from swarm.config.input_files import FileKind, read_bytes

@@ -15,7 +15,7 @@ from swarm.runtime.health import Health
 from swarm.runtime.supervisor import supervisor_of
 
 if TYPE_CHECKING:
-    from launch_scripts.observe.latest_state import Observed
+    from launch_scripts.observe.latest_state import LatestState
     from launch_scripts.web.metrics_endpoint import MetricsEndpoint
 
 _TURNS_HZ = 2.0
@@ -54,7 +54,7 @@ class MachineSignals:
 
     def turned(
         self,
-        observed: Observed,
+        observed: LatestState,
         started_ns: int,
         missing: Sequence[str],
         up: Collection[tuple[str, str]] | None = None,

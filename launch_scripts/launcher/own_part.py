@@ -3,7 +3,6 @@ itself. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console, Group
@@ -13,14 +12,13 @@ from launch_scripts.launcher.live_table import SHOWN_ALARMS
 from launch_scripts.launcher.loads_table import loads_table
 from launch_scripts.observe.alarms import Alarm, alarms_of
 from launch_scripts.observe.facts import lines_of
+from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.plan import RunPlan
-from launch_scripts.observe.process_load import ProcessLoad, ProcessLoads, by_role
-from launch_scripts.observe.run_model import RunModel
+from launch_scripts.observe.process_load import ProcessLoad, by_role
 from launch_scripts.process_table import ROLES, ProcessSpec
 from swarm.grid import GridSpec
 from swarm.liveness import Peer, job_of
 from swarm.wire.messages import Message
-from swarm.wire.messages.processes import Stats
 
 _NOT_NEEDED = ("router", "monitor")
 """Roles that a run goes on without: see `RunPlan.crew`."""
@@ -35,21 +33,17 @@ class OwnPart:
     """
 
     def __init__(self, grid: GridSpec, started_ns: int) -> None:
-        self.model = RunModel(RunPlan((), (), 0, started_ns), grid)
-        self.observed, self.book = self.model.observed, self.model.book
+        self.observed = LatestState(RunPlan((), (), 0, started_ns), grid)
         self.own: frozenset[ProcessSpec] = frozenset()
         """Set by the owner whenever a process is added or dismissed."""
-        self._loads = ProcessLoads()
 
-    def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
+    def heard(self, message: Message, now_ns: int) -> None:
         """Take in what comes on the keys of these processes, and orders."""
-        self.model.heard(message, now_ns)
-        if isinstance(message, Stats):
-            self._loads.hear(message)
+        self.observed.heard(message, now_ns)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
-        self.model.alive(peer, up, now_ns)
+        self.observed.alive(peer, up, now_ns)
 
     def up(self) -> list[tuple[str, str]]:
         """(role, id) of these processes that are alive."""
@@ -64,18 +58,18 @@ class OwnPart:
     def loads(self) -> list[ProcessLoad]:
         """What they take up, each that has told twice."""
         own = self._keys()
-        return [line for line in self._loads.lines(self.up()) if (line.role, line.id) in own]
+        return [line for line in self.observed.loads.lines(self.up()) if (line.role, line.id) in own]
 
     def alarms(self, now_ns: int) -> tuple[Alarm, ...]:
         """What went wrong with them or is told by them."""
         crew = tuple(sorted(key for key in self._keys() if key[0] not in _NOT_NEEDED))
         targets = tuple(dict.fromkeys(job_of(id) for role, id in crew if role == "planner"))
-        plan = RunPlan(targets, crew, 0, self.model.plan.started_ns)
-        return alarms_of(self.observed, self.model.tracked, plan, targets, now_ns)
+        plan = RunPlan(targets, crew, 0, self.observed.plan.started_ns)
+        return alarms_of(self.observed, plan, targets, now_ns)
 
     def report(self, *, run_id: str, seconds: float, startup_s: float | None) -> dict[str, Any]:
         """For programs: these processes, and that all else is told by another launcher."""
-        loads = self._loads.lines(self.up())
+        loads = self.observed.loads.lines(self.up())
         return {
             "run_id": run_id,
             "recorded": False,

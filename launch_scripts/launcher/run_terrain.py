@@ -8,7 +8,7 @@ import logging
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from launch_scripts.launcher.watcher import ask_run
+from launch_scripts.observe.run_observer import ask_run
 from shared_map.keeper.base_map import NEEDED
 from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
 from shared_map.terrain.prepared import load_prepared, save_prepared, scenario_key

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from launch_scripts.launcher.busy_line import busy_line
 from launch_scripts.launcher.lasting_output import make_output_last
-from launch_scripts.observe.certified_gap import gap_text
+from launch_scripts.observe.counts import gap_text
 from launch_scripts.plain_text import plain
 
 log = logging.getLogger(__name__)

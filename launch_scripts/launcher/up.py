@@ -26,12 +26,12 @@ from launch_scripts.launcher.supervisor import Ending, LocalSwarm
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
-from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
+from launch_scripts.launcher.watcher import Watcher, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.observe import facts
-from launch_scripts.observe.disk_watch import DiskWatch
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import begin_run
+from launch_scripts.observe.run_folder import DiskWatch, begin_run
+from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec
 from shared_map.arrays import Floats
@@ -266,7 +266,7 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
-        self._book = watcher.known.book
+        self._book = watcher.known.observed.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
             ordered.look(self._book, set(watcher.known.observed.up()), time.monotonic())

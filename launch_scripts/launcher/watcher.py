@@ -6,23 +6,18 @@ import time
 from collections.abc import Collection
 
 from launch_scripts.launcher.own_part import OwnPart
-from launch_scripts.observe.recorder import RECORDED, Recorder
-from launch_scripts.observe.run_model import HEARD
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_observer import HEARD, RECORDED, RunObserver
 from launch_scripts.process_table import ProcessSpec
-from launch_scripts.report.paced_reading import PacedReading
-from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
+from swarm.bus.bus import Bus, Event, Heard
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.membership import NO_RUN
-from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.vehicles import Followed
-from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, RUN, STATS, STATUS
+from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, STATS, STATUS
 
-_TAG, _GONE_TAG = "launcher-run", "launcher-gone"
-_ASK_TIMEOUT_S = 1.0
 _OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}
 """What a launcher hears of all processes where another records the run: routes until one is served."""
 _READ_S = 0.1
@@ -47,14 +42,12 @@ class Watcher:
         # The first route tells that routes are served, sooner than any figures do.
         hears = _OF_PART if isinstance(known, OwnPart) else {**RECORDED, FOLLOWED: 0.0}
         self._everywhere = list(hears)
-        self._reading = PacedReading(bus, {STATS: 0.0, NOTE: 0.0, **hears})
+        self._observer = RunObserver(bus, self._inbox.post, known, {STATS: 0.0, NOTE: 0.0, **hears})
 
     def begin(self) -> None:
-        for topic in self._everywhere:
-            self._bus.collect(topic)
-        self._bus.watch_alive(self._inbox.post)
+        self._observer.collect(self._everywhere)
         if not isinstance(self.known, OwnPart):
-            self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG)  # of a run that this is a part of
+            self._observer.ask_gone()  # of a run that this is a part of
 
     def look_after(self, processes: Collection[ProcessSpec]) -> None:
         """Hear these processes and no others, where another launcher records the run; call it again whenever they
@@ -67,13 +60,13 @@ class Watcher:
         for spec in own - self.known.own:
             self._bus.collect(STATS, role=spec.role, id=spec.id)
             self._bus.collect(NOTE, role=spec.role, id=spec.id)
-            self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG, role=spec.role, id=spec.id)
+            self._observer.ask_gone(role=spec.role, id=spec.id)
         self.known.own = own
 
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
         time.sleep(for_s)
-        for heard in self._reading.take(self._clock.now_ns()):
+        for heard in self._observer.due(self._clock.now_ns()):
             self._inbox.post(heard)
         until_s = time.monotonic() + _READ_S
         while (event := self._inbox.take(0.0)) is not None:
@@ -83,7 +76,7 @@ class Watcher:
 
     def finish(self) -> None:
         """Takes in what has arrived and was not due yet: nobody speaks any more."""
-        for heard in self._reading.take_all():
+        for heard in self._observer.due(self._clock.now_ns(), all=True):
             self._take(heard)
 
     def now_ns(self) -> int:
@@ -95,25 +88,16 @@ class Watcher:
         return notes
 
     def _take(self, event: Event) -> None:
-        now_ns = self._clock.now_ns()
         match event:
-            case Heard(message=message, fields=fields):
-                match message:
-                    case Note():
-                        self.notes.append(message)
-                    case Stats(role="monitor", web_port=port) if port:
-                        self.web_port = port
-                    case Followed():
-                        self._served()
-                    case PlannerStatus(routes_served=served) if served:
-                        self._served()
-                self.known.heard(message, fields, now_ns)
-            case Replied(tag=tag, message=Stats() as stats) if tag == _GONE_TAG:
-                self.known.heard(stats, {}, now_ns)
-            case Appeared(peer):
-                self.known.alive(peer, True, now_ns)
-            case Disappeared(peer):
-                self.known.alive(peer, False, now_ns)
+            case Heard(message=Note() as note):
+                self.notes.append(note)
+            case Heard(message=Stats(role="monitor", web_port=port)) if port:
+                self.web_port = port
+            case Heard(message=Followed()):
+                self._served()
+            case Heard(message=PlannerStatus(routes_served=served)) if served:
+                self._served()
+        self._observer.take(event, self._clock.now_ns())
 
     def _served(self) -> None:
         """Routes are served: from now on they are heard as they are recorded, or not at all."""
@@ -121,26 +105,10 @@ class Watcher:
             return
         self.routes_served = True
         if not isinstance(self.known, OwnPart):
-            self._reading.pace(FOLLOWED, RECORDED[FOLLOWED], self._clock.now_ns())
+            self._observer.pace(FOLLOWED, RECORDED[FOLLOWED], self._clock.now_ns())
             return
         for topic in (FOLLOWED, STATUS):
             self._bus.unsubscribe(topic)
-
-
-def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
-    """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
-    inbox = Inbox()
-    bus.ask(RUN, Nothing(), inbox.post, tag=_TAG, timeout_s=timeout_s)
-    found: list[RunInfo] = []
-    deadline_s = time.monotonic() + timeout_s + 1.0
-    while time.monotonic() < deadline_s:
-        match inbox.take(0.1):
-            case Replied(message=RunInfo() as info):
-                if routers or info.run_id != NO_RUN:
-                    found.append(info)
-            case AskEnded():
-                break
-    return found
 
 
 def check_vacant(found: list[RunInfo], role: str, id: str) -> None:

@@ -15,7 +15,7 @@ import rerun as rr
 from launch_scripts.monitor.movers.looks import HUES
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.monitor.shown_text import shown
-from launch_scripts.observe.samples import Sample
+from launch_scripts.observe.history import Sample
 from swarm.wire.messages.vehicles import VehicleState
 
 

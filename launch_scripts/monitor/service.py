@@ -20,10 +20,8 @@ from launch_scripts.monitor.ground.zones import Area
 from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
-from launch_scripts.observe.recorder import ROUTES_S
-from launch_scripts.observe.run_figures import RunFigures
-from launch_scripts.observe.run_model import HEARD
-from launch_scripts.report.paced_reading import PacedReading
+from launch_scripts.observe.recorder import RunFigures
+from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.web.loopback_guard import Audience
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
@@ -36,16 +34,13 @@ from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED, Counters
-from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, NOTE, SIGHTED, STATS, Topic
+from swarm.wire.topics import BELIEVED, BODY, COST, FLEET, FOLLOWED, NOTE, SIGHTED, Topic
 
 log = logging.getLogger(__name__)
 
-_GONE = "gone"
-"""Tag of the question what processes that are gone have counted."""
 _READ: dict[Topic, float] = {
     **HEARD, NOTE: 0.0, FLEET: 0.0, FOLLOWED: ROUTES_S, SIGHTED: 0.0, BODY: 0.0, BELIEVED: 0.5
 }  # fmt: skip
@@ -128,7 +123,7 @@ class MonitorService:
             legend,
             list(class_numbers(setup.scenario)),
         )
-        self._reading = PacedReading(bus, _READ)
+        self._observer = RunObserver(bus, post, self.figures, _READ)
         self._audience = audience
         self._watched = False
         self._drawn_for = 0
@@ -154,10 +149,8 @@ class MonitorService:
         self._started_ns = now_ns
         if self._joins:
             self._member.join()
-        for topic in _READ:
-            self._bus.collect(topic)
-        self._bus.watch_alive(self._post)
-        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE)
+        self._observer.collect()
+        self._observer.ask_gone()
         self.figures.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
@@ -170,8 +163,8 @@ class MonitorService:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         match event:
-            case Replied(message=Stats() as stats):
-                self.figures.heard(stats, {}, now_ns)
+            case Replied(message=Stats()):
+                self._observer.take(event, now_ns)
             case Replied(message=CostReply() as costs):
                 self._ground.hear_costs(costs, now_ns)
             case Heard():
@@ -184,12 +177,12 @@ class MonitorService:
         audience = self._audience()
         if self._watched != (watched := audience.now > 0):
             self._watched = watched
-            self._reading.pace(FOLLOWED, _ROUTES_SEEN_S if watched else ROUTES_S, now_ns)
+            self._observer.pace(FOLLOWED, _ROUTES_SEEN_S if watched else ROUTES_S, now_ns)
         if watched or self._turn % _UNSEEN == 0:
             self._draw_frame(now_ns, audience.ever)
 
     def stop(self, now_ns: int) -> None:
-        for heard in self._reading.take_all():
+        for heard in self._observer.due(now_ns, all=True):
             self._hear(heard, now_ns)
         self._tell_gone(now_ns)
         self.figures.finish(now_ns)
@@ -207,7 +200,7 @@ class MonitorService:
     # --- in -----------------------------------------------------------------------------------------------------
 
     def _hear(self, heard: Heard, now_ns: int) -> None:
-        self.figures.heard(heard.message, heard.fields, now_ns)
+        self._observer.take(heard, now_ns)
         self._movers.hear(heard.message, now_ns)
         match heard.message:
             case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
@@ -262,7 +255,7 @@ class MonitorService:
     def _draw_frame(self, now_ns: int, viewers: int) -> None:
         """viewers  how many have ever come"""
         self._sync.tick(now_ns)
-        for heard in self._reading.take(now_ns):
+        for heard in self._observer.due(now_ns):
             self._hear(heard, now_ns)
         self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
@@ -282,10 +275,10 @@ class MonitorService:
             self._rec.flush(timeout_sec=0)  # else rerun packs what is logged within a second together
 
     def _draw_plots(self, now_ns: int) -> None:
-        samples = self.figures.samples.newest
-        if samples and samples[-1].time_s != self._last_sample_s:
-            self._last_sample_s = samples[-1].time_s
-            self._drawing.plots(samples[-1], samples[-1].messages_per_s)
+        sample = self.figures.samples.last
+        if sample is not None and sample.time_s != self._last_sample_s:
+            self._last_sample_s = sample.time_s
+            self._drawing.plots(sample, sample.messages_per_s)
         if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
             return
         self._figures_due_ns = now_ns + NS_PER_S

@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from launch_scripts.observe.latest_state import Observed
+from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.plan import RunPlan
-from launch_scripts.observe.tracked_targets import TrackedTargets
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -130,17 +129,18 @@ class Alarm:
         }  # fmt: skip
 
 
-def alarms_of(
-    observed: Observed, tracked: TrackedTargets, plan: RunPlan, targets: Iterable[str], now_ns: int
-) -> tuple[Alarm, ...]:
-    """All alarms of a run at an instant: what lasts, the serious first, then what is over, the newest first."""
+def alarms_of(latest: LatestState, plan: RunPlan, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
+    """All alarms of a run at an instant: what lasts, the serious first, then what is over, the newest first.
+
+    plan  the processes that are looked at; the launcher of a part of a run has one of its own
+    """
     began_ns = plan.started_ns or 0
     wanted = list(targets)
     found = [
-        *_missing(observed, plan, wanted, now_ns),
-        *_silent(observed, now_ns),
-        *_lost(observed, tracked, wanted, now_ns),
-        *_told(observed),
+        *_missing(latest, plan, wanted, now_ns),
+        *_silent(latest, now_ns),
+        *_lost(latest, wanted, now_ns),
+        *_told(latest),
     ]
     alarms = [_in_run(each, known, began_ns) for each, known in found]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
@@ -167,26 +167,26 @@ def _in_run(told: Told, known: bool, began_ns: int) -> Alarm:
     )
 
 
-def _told(observed: Observed) -> Iterator[Found]:
+def _told(latest: LatestState) -> Iterator[Found]:
     """What processes say. What lasted when one went is not said any more."""
-    for (role, id), stats in observed.newest().items():
+    for (role, id), stats in latest.newest().items():
         for alarm in stats.alarms:
-            if alarm.over_ns is not None or observed.is_well(role, id):
+            if alarm.over_ns is not None or latest.is_well(role, id):
                 yield alarm, True
 
 
-def starts(observed: Observed, plan: RunPlan, role: str, id: str, now_ns: int) -> bool:
+def starts(latest: LatestState, plan: RunPlan, role: str, id: str, now_ns: int) -> bool:
     """Whether a process has not been seen yet, and has not been waited for for long."""
     began = plan.started_ns is not None and now_ns - plan.started_ns < STARTING_S * NS_PER_S
-    return began and not observed.knows(role, id)
+    return began and not latest.knows(role, id)
 
 
-def _missing(observed: Observed, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Found]:
+def _missing(latest: LatestState, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Found]:
     for role, id in plan.crew_now(targets):
-        if observed.fills(role, id) or starts(observed, plan, role, id, now_ns):
+        if latest.fills(role, id) or starts(latest, plan, role, id, now_ns):
             continue
-        stats = observed.newest_stats(role, id)
-        leads = next((ranked for ranked in observed.ids_up(role) if job_of(ranked) == job_of(id)), None)
+        stats = latest.newest_stats(role, id)
+        leads = next((ranked for ranked in latest.ids_up(role) if job_of(ranked) == job_of(id)), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
         text = f"{role}-{id} is gone{instead}"
         target = job_of(id) if role == "planner" else None
@@ -197,18 +197,18 @@ def _missing(observed: Observed, plan: RunPlan, targets: list[str], now_ns: int)
         )
 
 
-def _silent(observed: Observed, now_ns: int) -> Iterator[Found]:
-    for role, id, heard_ns in observed.silent(now_ns - SILENT_NS):
+def _silent(latest: LatestState, now_ns: int) -> Iterator[Found]:
+    for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
         text = f"{role}-{id} is there, but tells nothing"
         target = job_of(id) if role == "planner" else None
-        stats = observed.newest_stats(role, id)
+        stats = latest.newest_stats(role, id)
         since_ns = heard_ns if stats is None else stats.stamp_ns
         yield Told(kind="silent", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target), True
 
 
-def _lost(observed: Observed, tracked: TrackedTargets, targets: list[str], now_ns: int) -> Iterator[Found]:
-    for id in sorted(tracked.lost(now_ns).intersection(targets)):
-        status, pose = observed.told_by_planner(id), observed.poses.get(id)
+def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Found]:
+    for id in sorted(latest.lost(now_ns).intersection(targets)):
+        status, pose = latest.told_by_planner(id), latest.poses.get(id)
         since_ns, cell = None, None if pose is None else pose.cell
         if status is not None and status.pose_age_s is not None:
             # When the planner heard the last pose: the same whenever it is asked.

@@ -1,13 +1,27 @@
-"""What the processes of a run have counted, all together. Pure."""
+"""The counts of all processes of a run, summed; and the certified gap, which is made of them. Pure.
+
+This is the one place which makes the certified gap from what agents count, for the live table, the report, the view
+and `swarm status`.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
 
 from swarm.liveness import job_of
-from swarm.runtime.stats import Histogram, merged
+from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO, Histogram, merged
 from swarm.wire.messages.processes import Stats
+
+Number = TypeVar("Number", int, float)
+
+
+def sum_of(values: Iterable[Number | None]) -> Number | None:
+    """The sum of what is known; None if nothing is."""
+    told = [value for value in values if value is not None]
+    return sum(told) if told else None
 
 
 class Counts:
@@ -20,8 +34,8 @@ class Counts:
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
 
-    def count(self, stats: Stats) -> tuple[str, str, int]:
-        """Take in what a process says; returns whose incarnation it is."""
+    def count(self, stats: Stats) -> None:
+        """Takes in what a process says."""
         key = (stats.role, stats.id, stats.incarnation)
         known = self._stats.get(key)
         if known is None or stats.stamp_ns >= known.stamp_ns:
@@ -30,7 +44,6 @@ class Counts:
             newest = self._newest.get((stats.role, stats.id))
             if newest is None or stats.incarnation >= newest.incarnation:
                 self._newest[stats.role, stats.id] = stats
-        return key
 
     def newest_stats(self, role: str, id: str) -> Stats | None:
         """What the newest incarnation of a process has said last."""
@@ -54,25 +67,17 @@ class Counts:
 
     def total(self, name: str) -> int | None:
         """A count, summed over processes and incarnations; None if no process has published it."""
-        told = [stats.counts[name] for stats in self._summed() if name in stats.counts]
-        return sum(told) if told else None
+        return sum_of(stats.counts.get(name) for stats in self._summed())
 
     def of_job(self, role: str, job: str, *names: str) -> int | None:
         """Counts of the processes with one job, such as a target's planner and its standbys, summed; None if none
         of them has published any."""
-        told = [
-            stats.counts[name]
-            for stats in self._summed()
-            if stats.role == role and job_of(stats.id) == job
-            for name in names
-            if name in stats.counts
-        ]
-        return sum(told) if told else None
+        of = [stats.counts for stats in self._summed() if stats.role == role and job_of(stats.id) == job]
+        return sum_of(counts.get(name) for counts in of for name in names)
 
     def gauge(self, name: str) -> float | None:
         """A gauge, summed over the newest incarnation of each process; None if no process has published it."""
-        told = [stats.gauges[name] for _, stats in self.newest().items() if name in stats.gauges]
-        return sum(told) if told else None
+        return sum_of(stats.gauges.get(name) for stats in self.newest().values())
 
     def counts_by(self, name: str) -> dict[str, int]:
         """Counts per target or vehicle, summed as `total`."""
@@ -92,3 +97,71 @@ class Counts:
     def histogram(self, name: str) -> Histogram:
         """Histogram of a name, over all incarnations of all processes."""
         return merged(stats.histograms.get(name, {}) for stats in self._summed())
+
+
+# --- the certified gap --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CertifiedGap:
+    """How far above the optimum some routes can be at most: 1.05 is proven to be at most 5 % above it.
+
+    mean, p95, max  cost over proven lower bound; None without a proven route
+    routes          that vehicles began
+    unproven        of these, routes without a lower bound; they are in no mean
+    """
+
+    mean: float | None = None
+    p95: float | None = None
+    max: float | None = None
+    routes: int = 0
+    unproven: int = 0
+
+    def fields(self) -> dict[str, float | None]:
+        """The gap for a report."""
+        return {"mean": self.mean, "p95": self.p95, "max": self.max, "unproven": self.unproven}
+
+
+def gap_text(fields: Mapping[str, float | None]) -> str:
+    """The fields of a `CertifiedGap` for people."""
+    unproven = f"{fields['unproven']:g} unproven" if fields.get("unproven") else ""
+    if fields.get("mean") is None:
+        return unproven or "-"
+    proven = ", ".join(f"{name} {percent(fields[name])}" for name in ("mean", "p95", "max"))
+    return f"{proven}, {unproven}" if unproven else proven
+
+
+def certified_gap(counted: Counts) -> CertifiedGap:
+    """The gap of all routes of a run."""
+    return gap_of(counted.histogram("followed_gap_excess"), counted.total("followed_unproven") or 0)
+
+
+def gaps_to(counted: Counts) -> dict[str, CertifiedGap]:
+    """The gap per target, of the routes to it."""
+    return _gaps(counted.histograms_by(GAPS_TO), counted.counts_by(UNPROVEN_TO))
+
+
+def gaps_of(counted: Counts) -> dict[str, CertifiedGap]:
+    """The gap per vehicle, of the routes which it began."""
+    return _gaps(counted.histograms_by(GAPS_OF), counted.counts_by(UNPROVEN_OF))
+
+
+def _gaps(proven: Mapping[str, Histogram], unproven: Mapping[str, int]) -> dict[str, CertifiedGap]:
+    ids = sorted({*proven, *unproven})
+    return {id: gap_of(proven.get(id, Histogram()), unproven.get(id, 0)) for id in ids}
+
+
+def gap_of(excess: Histogram, unproven: int) -> CertifiedGap:
+    """The gap from a histogram of gap - 1."""
+    return CertifiedGap(**of_excess(excess), routes=excess.count + unproven, unproven=unproven)
+
+
+def of_excess(histogram: Histogram) -> dict[str, float | None]:
+    """Mean, p95 and max of gaps, from a histogram of gap - 1."""
+    values = {"mean": histogram.mean(), "p95": histogram.quantile(0.95), "max": histogram.quantile(1.0)}
+    return {name: None if value is None else 1.0 + value for name, value in values.items()}
+
+
+def percent(gap: float | None) -> str:
+    """The excess of a gap over 1, for people."""
+    return "-" if gap is None else f"{max(gap - 1, 0):.2%}"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from launch_scripts.observe.alarms import Alarm
-from launch_scripts.observe.certified_gap import CertifiedGap, gap_text, percent
+from launch_scripts.observe.counts import CertifiedGap, gap_text, percent
 from launch_scripts.observe.state import RunState, TargetLine
 from swarm.config.classes import GROUND
 from swarm.grid import GridSpec

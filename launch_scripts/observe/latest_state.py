@@ -1,32 +1,102 @@
-"""Newest message of every sender of a run: positions, counts, marks.
+"""The newest message of every sender of a run: what processes counted, who is alive, where everything is, marks.
 
-Pure: the launcher, the monitor and the simulation pass it what they heard on `RECORDED`.
+Pure: time is an argument. The launcher, the live view, the simulation and the commands pass it what they heard on
+`HEARD` or `RECORDED` (`run_observer.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.counts import Counts
-from launch_scripts.observe.vehicle_columns import VehicleColumns, gathered
+from launch_scripts.observe.counts import Counts, sum_of
+from launch_scripts.observe.plan import RunPlan
+from launch_scripts.observe.process_load import ProcessLoads
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import HIGHEST_RANK, Peer, ranked_id, split_rank
+from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
+from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.orders import Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Beat, Stats
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 
 _VEHICLES_LAST_NS = 3 * NS_PER_S
-"""Vehicles of whoever raises no liveliness token are there for so long after the last word."""
+"""A vehicle whose agent raises no liveliness token is there for this long after its last word."""
+_ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
+"""Counts of planners: poses which do not count, or look wrong."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleColumns:
+    """Last reported places of vehicles, in order of id.
+
+    east_m      float32, from the grid's west border; south_m from its north border
+    states      uint8, VehicleState
+    targets     int64, index into `target_ids`, -1 for none
+    target_ids  in order
+    """
+
+    ids: list[str]
+    east_m: NDArray[np.float32]
+    south_m: NDArray[np.float32]
+    states: NDArray[np.uint8]
+    targets: NDArray[np.int64]
+    target_ids: list[str]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def chasing(self, target: str) -> NDArray[np.intp]:
+        """Which of them go for a target."""
+        if target not in self.target_ids:
+            return np.empty(0, np.intp)
+        return np.flatnonzero(self.targets == self.target_ids.index(target))
+
+    def only(self, kept: NDArray[np.bool_]) -> VehicleColumns:
+        """Some of them."""
+        ids = [self.ids[n] for n in np.flatnonzero(kept).tolist()]
+        return VehicleColumns(
+            ids, self.east_m[kept], self.south_m[kept], self.states[kept], self.targets[kept], self.target_ids
+        )
+
+    def count_states(self) -> tuple[int, ...]:
+        """Number of vehicles in each VehicleState, in its order."""
+        return tuple(np.bincount(self.states, minlength=len(VehicleState)).tolist())
+
+
+def gathered(fleets: Iterable[Fleet]) -> VehicleColumns:
+    """All vehicles of these messages. One that is in several, as when it crosses into another region, is where the
+    newest puts it."""
+    told = sorted(fleets, key=lambda fleet: (fleet.stamp_ns, fleet.seq))
+    target_ids = sorted({target for fleet in told for target in fleet.target_ids})
+    last = {id: n for n, id in enumerate(id for fleet in told for id in fleet.ids)}
+    ids = sorted(last)
+    rows = np.fromiter((last[id] for id in ids), np.intp, len(ids))
+    place = {target: n for n, target in enumerate(target_ids)}
+    targets = np.full((len(told), NO_TARGET + 1), -1, np.int64)
+    for n, fleet in enumerate(told):
+        targets[n, : len(fleet.target_ids)] = [place[target] for target in fleet.target_ids]
+    of = np.repeat(np.arange(len(told)), [len(fleet.ids) for fleet in told])
+    chased = np.frombuffer(b"".join(fleet.targets for fleet in told), np.uint8)
+    return VehicleColumns(
+        ids,
+        np.frombuffer(b"".join(fleet.east_m for fleet in told), "<f4")[rows],
+        np.frombuffer(b"".join(fleet.south_m for fleet in told), "<f4")[rows],
+        np.frombuffer(b"".join(fleet.states for fleet in told), np.uint8)[rows],
+        targets[of, chased][rows],
+        target_ids,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,17 +109,34 @@ class MarkedCells:
     stamps_ns: NDArray[np.int64]
 
 
-class Observed(Counts):
-    """Keeps the newest message per sender, so that its memory does not grow with time."""
+class LatestState(Counts):
+    """The newest message per sender of a run, so that its memory does not grow with time.
 
-    def __init__(self, grid: GridSpec) -> None:
+    plan    what the run should be
+    book    what operators have ordered
+    status  target -> the newest status of the planner that leads
+    poses   target -> its newest pose that counts
+    leads   (role, id) -> whether the process leads, where there are standbys
+    loads   what each process takes up
+    """
+
+    def __init__(self, plan: RunPlan, grid: GridSpec) -> None:
         super().__init__()
+        self.plan = plan
         self.grid = grid
+        self.book = OrderBook()
+        self.first_ns: int | None = None
+        """When the first message was heard; None before."""
+        self.moved_ns = 0
+        """When a vehicle or a target was last heard of. What comes later are the words of a run that ends."""
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
+        self.leads: dict[tuple[str, str], bool] = {}
+        self.loads = ProcessLoads()
+        self._trackings = Trackings(grid)
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._vehicles: VehicleColumns | None = None
-        """What `_fleets` say, once somebody has asked; None since the last that was new."""
+        """The vehicles of `_fleets`, once asked for; None since the last news."""
         self._marks: dict[tuple[str, int], MarkSet] = {}
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
@@ -60,19 +147,24 @@ class Observed(Counts):
         self._fleet_told_ns: dict[str, int] = {}
         """Agent -> when it told of vehicles last."""
 
-    def heard(self, message: Message, now_ns: int) -> None:
-        """Take in a message; of poses those only that count."""
+    def heard(self, message: Message, now_ns: int) -> Message | None:
+        """Takes in a message; returns it, a pose with its cell, and None for a pose that does not count."""
+        self._touch(now_ns)
         match message:
             case Stats():
                 self.count(message)
+                self.loads.hear(message)
                 self._told_ns[message.role, message.id] = now_ns
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 self.status[message.target] = message
-            case Beat(leads=True):
-                job, rank = split_rank(message.id)
-                self._ranks[message.role, job] = rank
+            case Beat(leads=leads):
+                self.leads[message.role, message.id] = leads
+                if leads:
+                    job, rank = split_rank(message.id)
+                    self._ranks[message.role, job] = rank
             case Fleet():
+                self.moved_ns = max(self.moved_ns, now_ns)
                 fleet = self._fleets.get((message.author, message.region))
                 if fleet is None or message.seq >= fleet.seq:
                     self._fleets[message.author, message.region] = message
@@ -80,20 +172,37 @@ class Observed(Counts):
                 if message.ids:
                     self._fleet_told_ns[agent_of(message.ids[0])] = now_ns
             case TargetPose():
-                self.poses[message.target] = message
+                self.moved_ns = max(self.moved_ns, now_ns)
+                pose = self._trackings.hear(message, now_ns)
+                if pose is not None:
+                    self.poses[pose.target] = pose
+                return pose
             case MarkSet():
                 marks = self._marks.get((message.author, message.tile))
                 if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
                     self._marks[message.author, message.tile] = message
+            case Orders():
+                self.book.merge(message.orders, now_ns)
+        return message
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
+        self._touch(now_ns)
         key = (peer.role, peer.id)
         if up:
             self._alive.setdefault(key, set()).add(peer.incarnation)
             self._told_ns[key] = now_ns
         elif key in self._alive:
             self._alive[key].discard(peer.incarnation)
+
+    def _touch(self, now_ns: int) -> None:
+        if self.first_ns is None:
+            self.first_ns = now_ns
+
+    @property
+    def began_ns(self) -> int | None:
+        """When the run began; None before the first message of one whose beginning is not known."""
+        return self.first_ns if self.plan.started_ns is None else self.plan.started_ns
 
     # --- processes ------------------------------------------------------------------------------------------------
 
@@ -149,16 +258,39 @@ class Observed(Counts):
 
     def now_of(self, name: str) -> float | None:
         """A gauge, summed over the processes which are alive; None if none of them has published it."""
-        told = [
-            stats.gauges[name]
-            for key, stats in self.newest().items()
-            if name in stats.gauges and self._alive.get(key)
-        ]
-        return sum(told) if told else None
+        return sum_of(stats.gauges.get(name) for key, stats in self.newest().items() if self._alive.get(key))
 
     def rank(self, role: str, job: str) -> int:
         """Rank of the process that leads."""
         return self._ranks.get((role, job), 0)
+
+    def missing(self) -> list[str]:
+        """Processes that the run needs which are not alive, as `role id`."""
+        crew = self.plan.crew_now(self.plan.targets_now(self.book))
+        return [f"{role} {id}" for role, id in crew if not self.fills(role, id)]
+
+    # --- trackers -------------------------------------------------------------------------------------------------
+
+    def lost(self, now_ns: int) -> set[str]:
+        """The targets that nobody tracks now; those without a tracker as their planners tell."""
+        told = {id for id, status in self.status.items() if status.tracker_lost and self._trackings.of(id) is None}
+        return self._trackings.lost(now_ns) | told
+
+    def pose_age_s(self, target: str, now_ns: int) -> float | None:
+        """Time since the target's last pose; None before the first."""
+        tracking, status = self._trackings.of(target), self.status.get(target)
+        if tracking is None:
+            return None if status is None else status.pose_age_s
+        age_ns = tracking.age_ns(now_ns)
+        return None if age_ns is None else age_ns / NS_PER_S
+
+    def tracking(self) -> dict[str, Any]:
+        """How often targets were lost, which still are, and what was odd about poses: for a report."""
+        return {
+            "lost": self.total("trackers_lost"),
+            "lost_at_end": sorted(self.lost(self.moved_ns)),
+            **{name: self.total(name) for name in _ODD_POSES},
+        }
 
     # --- places ---------------------------------------------------------------------------------------------------
 
@@ -184,6 +316,10 @@ class Observed(Counts):
         if self.newest_stats("agent", agent) is not None or self.was_up("agent", agent):
             return of_crew and self.is_well("agent", agent)
         return now_ns - self._fleet_told_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
+
+    def tells_of_vehicles(self, agent: str) -> bool:
+        """Whether the agent has said where it drives."""
+        return agent in self._fleet_told_ns
 
     def groups(self) -> dict[str, str]:
         """Vehicle -> its group."""

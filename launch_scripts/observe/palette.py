@@ -1,6 +1,12 @@
-"""The colours of pictures and live view."""
+"""The look of pictures and of the live view: colours, matplotlib's settings, shade of the relief, round lengths."""
 
 from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -30,3 +36,54 @@ def rgb(colour: str) -> tuple[int, int, int]:
     """`#rrggbb` as numbers from 0 to 255."""
     red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
     return red, green, blue
+
+
+STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5,
+    "axes.edgecolor": "#9aa3ad",
+    "axes.linewidth": 0.8,
+    "axes.labelcolor": FAINT,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e9ec",
+    "grid.linewidth": 0.8,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "text.color": INK,
+    "axes.titlecolor": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+}
+"""Settings of matplotlib, for `with mpl.rc_context(STYLE)`."""
+
+
+def hillshade(elevation_m: NDArray[np.float32], resolution_m: float) -> NDArray[np.float32]:
+    """Light of a low sun in the north-west on each cell, 0 to 1; 0.7 in voids."""
+    if min(elevation_m.shape) < 2:
+        return np.full(elevation_m.shape, 0.7, np.float32)
+    south, east = np.gradient(elevation_m.astype(np.float64), resolution_m)
+    steep = np.nanpercentile(np.hypot(south, east), 98) if np.isfinite(south).any() else 0.0
+    stretch = 0.9 / steep if steep > 0 else 0.0  # gentle land would look flat, and mountains black and white
+    south, east = south * stretch, east * stretch
+    sun = np.array([-1.0, -1.0, 1.4]) / math.sqrt(1 + 1 + 1.4**2)
+    light = (-east * sun[0] - south * sun[1] + sun[2]) / np.sqrt(1 + east**2 + south**2)
+    shade: NDArray[np.float32] = np.nan_to_num(np.clip(light, 0, 1), nan=0.7).astype(np.float32)
+    return shade
+
+
+def said_length(length_m: float) -> str:
+    """In the unit that people use."""
+    return f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+
+
+def round_length(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above the value."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= value * 1.0001))

@@ -1,29 +1,38 @@
-"""Records a run: takes messages, returns numbers. Launcher and simulation share it.
+"""The recorder of a run: takes messages, returns numbers. Launcher and simulation share it.
 
-Pure: time is an argument, and the owner of a bus passes it what comes on `RECORDED`.
+`RunFigures` keeps the figures of a run at successive instants, which is all that the live view needs. `Recorder`
+keeps tracks, routes, captures and notes, too, and makes the report. Pure: time is an argument, and the owner of a
+bus passes it what comes on `HEARD` or `RECORDED`.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from launch_scripts.observe.begun_routes import BegunRoutes
-from launch_scripts.observe.certified_gap import of_excess
+from launch_scripts.observe.counts import of_excess
 from launch_scripts.observe.facts import for_report
-from launch_scripts.observe.latest_state import MarkedCells
+from launch_scripts.observe.history import (
+    BegunRoute,
+    Sample,
+    Thinned,
+    TrackKey,
+    Tracks,
+    at_once,
+    begun_routes,
+    buckets_of,
+    certified_gaps,
+)
+from launch_scripts.observe.latest_state import LatestState, VehicleColumns
+from launch_scripts.observe.plan import plan_of
 from launch_scripts.observe.results import Driven, results
-from launch_scripts.observe.run_figures import RunFigures
-from launch_scripts.observe.run_model import HEARD
-from launch_scripts.observe.samples import Sample, at_once, certified_gaps, messages_per_s
-from launch_scripts.observe.state import RunState
-from launch_scripts.observe.tracks import TrackKey, Tracks
-from launch_scripts.observe.vehicle_columns import VehicleColumns
+from launch_scripts.observe.run_observer import TRACK_S
+from launch_scripts.observe.state import RunState, state_of
 from swarm.clock import NS_PER_S
 from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
@@ -34,16 +43,79 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.vehicles import Followed, VehicleState
-from swarm.wire.topics import FOLLOWED, MARKS, NOTE, Topic
 
-TRACK_S = 0.5
-"""Places are sampled so often."""
-ROUTES_S = 2.0
-"""Of the routes that a vehicle begins within this time, the newest is kept."""
-RECORDED: dict[Topic, float] = {
-    **HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S
-}  # fmt: skip
-"""What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
+_SAMPLE_NS = NS_PER_S
+_MOST_SAMPLES = 1024
+_SHOWN_NS = 5 * NS_PER_S // 4
+"""So old may be what is shown: a sample is taken with the first message after its second."""
+
+
+class RunFigures:
+    """Samples of a run, in memory which does not grow with the rate of messages."""
+
+    def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
+        """started_ns  when the run began; None: with the first message"""
+        self.scenario = scenario
+        self.grid = grid
+        self.observed = LatestState(plan_of(scenario, started_ns), grid)
+        self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
+        self._sample_due_ns: int | None = None
+        self._sampled: tuple[int, RunState] | None = None
+        """When the last sample was taken or shown, and of which state."""
+
+    def heard(self, message: Message, now_ns: int) -> None:
+        """Takes in one message."""
+        if self.observed.heard(message, now_ns) is not None:
+            self._look(now_ns)
+
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        """A liveliness token rose or fell."""
+        self.observed.alive(peer, up, now_ns)
+        self._look(now_ns)
+
+    def finish(self, now_ns: int) -> None:
+        """The run is over: its last sample is of its end."""
+        self._add_sample(now_ns)
+
+    def summary(self, now_ns: int) -> RunState:
+        """What the run is at a time."""
+        return state_of(self.observed, now_ns)
+
+    def shown(self, now_ns: int) -> RunState:
+        """What people are shown: the state of the last sample, so that it is made once a second for all. Anew where
+        the swarm has said nothing since, as that is news, too."""
+        if self._sampled is None or not 0 <= now_ns - self._sampled[0] <= _SHOWN_NS:
+            self._sampled = now_ns, self.summary(now_ns)
+        return self._sampled[1]
+
+    def _look(self, now_ns: int) -> None:
+        if self._sample_due(now_ns):
+            self._add_sample(now_ns)
+
+    def _sample_due(self, now_ns: int) -> bool:
+        return self._sample_due_ns is None or now_ns >= self._sample_due_ns
+
+    def _add_sample(self, now_ns: int) -> None:
+        self._sample_due_ns = now_ns + _SAMPLE_NS
+        state = self.summary(now_ns)
+        self._sampled = now_ns, state
+        self.samples.add(self._sample(state))
+
+    def _sample(self, state: RunState) -> Sample:
+        return Sample(
+            time_s=state.elapsed_s,
+            states=tuple(state.states.values()),
+            captures=state.captures,
+            marks=state.marks,
+            reroute_requests=state.reroute_requests,
+            routes_served=state.routes_served,
+            messages_per_s=state.messages_per_s,
+            alive=state.alive,
+            gaps={line.id: line.gap.mean for line in state.targets if line.gap and line.gap.mean is not None},
+            growth_ms={line.id: line.growth_ms for line in state.targets if line.growth_ms is not None},
+            gap_excess=buckets_of(self.observed.histogram("followed_gap_excess").buckets),
+        )
+
 
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
@@ -73,7 +145,7 @@ class Recorder(RunFigures):
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Where and when targets were captured; how often, `Observed` counts."""
-        self.routes = BegunRoutes()
+        self.routes = begun_routes()
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
@@ -84,14 +156,14 @@ class Recorder(RunFigures):
         """Of the vehicles heard of last."""
         self._gap_max: float | None = None
 
-    def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
-        """Records one message; `fields` are the chunks of its key."""
+    def heard(self, message: Message, now_ns: int) -> None:
+        """Records one message."""
         self._touch(now_ns)
-        if self.model.heard(message, now_ns) is None:
+        if self.observed.heard(message, now_ns) is None:
             return
         match message:
             case Followed():
-                self.routes.add(now_ns, message)
+                self.routes.add(BegunRoute(now_ns, message))
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
@@ -110,14 +182,7 @@ class Recorder(RunFigures):
 
     def seconds(self, now_ns: int) -> float:
         """Time of the run."""
-        return 0.0 if self.model.began_ns is None else (now_ns - self.model.began_ns) / NS_PER_S
-
-    def missing(self) -> list[str]:
-        """Processes that the run needs which are not alive, as `role id`."""
-        return self.model.missing()
-
-    def marked(self) -> MarkedCells:
-        return self.observed.marked()
+        return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
 
     def _touch(self, now_ns: int) -> None:
         self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
@@ -136,7 +201,7 @@ class Recorder(RunFigures):
         if tracks_due:
             self._sample_tracks(now_ns, self.observed.vehicles())
         super()._look(now_ns)
-        if (tracks_due or sample_due) and self.ready_ns is None and self.routed and not self.missing():
+        if (tracks_due or sample_due) and self.ready_ns is None and self.routed and not self.observed.missing():
             self.ready_ns = now_ns
 
     def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
@@ -164,12 +229,12 @@ class Recorder(RunFigures):
         startup_s: float | None = None,
     ) -> dict[str, Any]:
         """The numbers of the run, None where not measured. The caller gives what it knows better."""
-        if seconds is None and self.model.first_ns is not None and self.last_ns is not None:
-            seconds = (self.last_ns - self.model.first_ns) / NS_PER_S
+        if seconds is None and self.observed.first_ns is not None and self.last_ns is not None:
+            seconds = (self.last_ns - self.observed.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
         # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
-        state = self.summary(self.tracked.moved_ns or self.last_ns or 0)
-        rates = [rate for _, rate in messages_per_s(self.samples.all())]
+        state = self.summary(self.observed.moved_ns or self.last_ns or 0)
+        rates = [sample.messages_per_s for sample in self.samples.all() if sample.messages_per_s is not None]
         fields = {
             "scenario": self.scenario.name,
             "run_id": run_id,
@@ -183,10 +248,10 @@ class Recorder(RunFigures):
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
             **for_report(state),
-            "tracking": self.tracked.report(observed),
+            "tracking": observed.tracking(),
             "stranded": state.states["stranded"] if observed.any_vehicles else None,
             "lost": state.states["lost"] if observed.any_vehicles else None,
-            "marked_cells": len(self.marked().cells) if observed.any_marks else None,
+            "marked_cells": len(self.observed.marked().cells) if observed.any_marks else None,
             "routes_received": total("routes_received"),
             "growths": total("growths"),
             "window_growths": total("window_growths"),
@@ -208,7 +273,6 @@ class Recorder(RunFigures):
         samples = self.samples.all()
         samples = samples[:: max(1, -(-len(samples) // points))]
         names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
-        rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
         gaps = certified_gaps(samples)
         fields: dict[str, list[Any]] = {
             "t_s": [sample.time_s for sample in samples],
@@ -219,7 +283,7 @@ class Recorder(RunFigures):
             "waiting_at_once": at_once(samples, lambda sample: sample.waiting_s),
             "standing_at_once": at_once(samples, lambda sample: sample.standing_s),
             "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
-            "messages_per_s": [rates.get(round(sample.time_s, 6)) for sample in samples],
+            "messages_per_s": [sample.messages_per_s for sample in samples],
         }
         return {name: [_rounded(value) for value in values] for name, values in fields.items()}
 

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.certified_gap import gap_of, gaps_of, gaps_to
-from launch_scripts.observe.latest_state import Observed
-from launch_scripts.observe.vehicle_columns import VehicleColumns
+from launch_scripts.observe.counts import gap_of, gaps_of, gaps_to
+from launch_scripts.observe.latest_state import LatestState, VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, plan_agents
 from swarm.config.classes import GROUND
@@ -76,39 +75,39 @@ class Driven:
         return np.array([n for n, id in enumerate(ids) if id in self._rows], np.intp)
 
 
-def results(observed: Observed, driven: Driven, scenario: Scenario) -> dict[str, Any]:
+def results(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
     """`by_target`, `by_group` and `by_vehicle` of the report."""
-    by_vehicle = _by_vehicle(observed, driven, scenario)
+    by_vehicle = _by_vehicle(latest, driven, scenario)
     return {
-        "by_target": _by_target(observed, scenario),
-        "by_group": _by_group(observed, by_vehicle, scenario),
+        "by_target": _by_target(latest, scenario),
+        "by_group": _by_group(latest, by_vehicle, scenario),
         "by_vehicle": by_vehicle,
     }
 
 
-def _by_target(observed: Observed, scenario: Scenario) -> dict[str, Any]:
-    captures, gaps = observed.counts_by(CAPTURES_OF), gaps_to(observed)
-    vehicles = observed.vehicles()
+def _by_target(latest: LatestState, scenario: Scenario) -> dict[str, Any]:
+    captures, gaps = latest.counts_by(CAPTURES_OF), gaps_to(latest)
+    vehicles = latest.vehicles()
     rows: dict[str, Any] = {}
-    for id in _all(scenario.target_ids, captures, gaps, observed.status):
+    for id in _all(scenario.target_ids, captures, gaps, latest.status):
         gap = gaps.get(id)
         rows[id] = {
             "captures": captures.get(id, 0),
             "routes": 0 if gap is None else gap.routes,
             "certified_gap": None if gap is None else gap.fields(),
-            "growths": observed.of_job("planner", id, "growths"),
-            "window_growths": observed.of_job("planner", id, "window_growths"),
+            "growths": latest.of_job("planner", id, "growths"),
+            "window_growths": latest.of_job("planner", id, "window_growths"),
             "chased_by_at_end": len(vehicles.chasing(id)),
         }
     return rows
 
 
-def _by_vehicle(observed: Observed, driven: Driven, scenario: Scenario) -> dict[str, Any]:
+def _by_vehicle(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
     planned = {plan.id: plan.group.name for plan in plan_agents(scenario)}
     classes = {group.name: group.vehicle_class for group in scenario.groups}
-    captures, gaps = observed.counts_by(CAPTURES_BY), gaps_of(observed)
-    row_of, told = {id: n for n, id in enumerate(driven.ids)}, observed.classes()
-    vehicles = observed.vehicles()
+    captures, gaps = latest.counts_by(CAPTURES_BY), gaps_of(latest)
+    row_of, told = {id: n for n, id in enumerate(driven.ids)}, latest.classes()
+    vehicles = latest.vehicles()
     last = {id: n for n, id in enumerate(vehicles.ids)}
     rows: dict[str, Any] = {}
     for id in _all([], sorted(driven.ids), captures, gaps):
@@ -130,8 +129,8 @@ def _by_vehicle(observed: Observed, driven: Driven, scenario: Scenario) -> dict[
     return rows
 
 
-def _by_group(observed: Observed, by_vehicle: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
-    proven, unproven = observed.histograms_by(GAPS_OF), observed.counts_by(UNPROVEN_OF)
+def _by_group(latest: LatestState, by_vehicle: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    proven, unproven = latest.histograms_by(GAPS_OF), latest.counts_by(UNPROVEN_OF)
     members: dict[str, list[str]] = {group.name: [] for group in scenario.groups}
     classes = {group.name: group.vehicle_class for group in scenario.groups}
     for id, row in by_vehicle.items():

@@ -1,18 +1,21 @@
-"""What a run folder holds from its first second on: scenario as run, versions, machine. And which run was last."""
+"""The folder of a run: its scenario, versions and machine from its first second on, its report at its end.
+
+Files are written whole or not at all (`write_file`), and a `DiskWatch` says when the folder takes no more data.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import importlib.metadata
 import json
 import math
 import os
 import platform
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.observe.files import write_file
-from launch_scripts.observe.machine import processor
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
@@ -168,3 +171,79 @@ def _version(package: str) -> str | None:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def processor() -> str:
+    """Name of the processor, as far as the system says it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Replace a file at one instant. Raises OSError."""
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space."""
+    partial = path.with_name(path.name + ".part")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+LOOK_EVERY_S = 5.0
+SAY_EVERY_S = 60.0
+_PROBE_BYTES = 1 << 16
+
+
+class DiskWatch:
+    """Tries now and then to write to a folder: the processes that write there cannot say so in their logs."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._due_s = 0.0
+        self._said_s: float | None = None
+        """When it was last said that there is no space; None while there is."""
+
+    def look(self, now_s: float) -> str | None:
+        """A sentence for the user; None if there is nothing new to say. Call it often."""
+        if now_s < self._due_s:
+            return None
+        self._due_s = now_s + LOOK_EVERY_S
+        try:
+            can_write(self._folder)
+        except OSError as error:
+            if self._said_s is not None and now_s - self._said_s < SAY_EVERY_S:
+                return None
+            self._said_s = now_s
+            return f"cannot write to {self._folder}: {error.strerror or error}; all goes on but logs and recording"
+        if self._said_s is None:
+            return None
+        self._said_s = None
+        return f"{self._folder} can be written again"
+
+
+def can_write(folder: Path, size: int = _PROBE_BYTES) -> None:
+    """Write a file of some bytes and remove it. Raises OSError."""
+    probe = folder / ".space"
+    try:
+        probe.write_bytes(bytes(size))
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()

@@ -9,16 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.observe.alarms import Alarm, alarms_of, starts
-from launch_scripts.observe.certified_gap import CertifiedGap, certified_gap, gaps_to
-from launch_scripts.observe.latest_state import Observed
-from launch_scripts.observe.plan import RunPlan
-from launch_scripts.observe.tracked_targets import TrackedTargets
-from launch_scripts.observe.vehicle_columns import VehicleColumns
+from launch_scripts.observe.counts import CertifiedGap, certified_gap, gaps_to
+from launch_scripts.observe.latest_state import LatestState, VehicleColumns
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND
 from swarm.grid import GridSpec
-from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -119,47 +115,43 @@ def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int
     return {name: counts[name] for name in sorted(counts, key=lambda name: (name != GROUND, name))}
 
 
-def state_of(
-    observed: Observed, tracked: TrackedTargets, plan: RunPlan, book: OrderBook, now_ns: int, began_ns: int | None
-) -> RunState:
-    """What a run is at a time.
+_TOTALS = (
+    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_bodies", "reroute_requests", "routes_served",
+    "marks", "payloads_dropped",
+)  # fmt: skip
+"""Fields of a `RunState` which are counts of that name, summed over all processes."""
 
-    began_ns  when it began, as far as that is known
-    """
-    targets = plan.targets_now(book)
-    crew = plan.crew_now(targets)
-    vehicles = observed.driven(set(crew), now_ns)
-    total = observed.total
-    well = [observed.fills(role, id) for role, id in crew]
-    lines = _lines(observed, tracked, plan, targets, vehicles, now_ns)
+
+def state_of(latest: LatestState, now_ns: int) -> RunState:
+    """The run at a time."""
+    targets = latest.plan.targets_now(latest.book)
+    crew = latest.plan.crew_now(targets)
+    vehicles = latest.driven(set(crew), now_ns)
+    well = [latest.fills(role, id) for role, id in crew]
+    began_ns = latest.began_ns
+    expected, alive = Counter(role for role, _ in crew), Counter[str]()
+    for (role, _), is_well in zip(crew, well, strict=True):
+        alive[role] += is_well
     return RunState(
         elapsed_s=0.0 if began_ns is None else max(now_ns - began_ns, 0) / NS_PER_S,
-        targets=lines,
+        targets=_lines(latest, targets, vehicles, now_ns),
         states=by_state(vehicles.count_states()),
-        classes=_by_class(vehicles.ids, observed.classes()),
+        classes=_by_class(vehicles.ids, latest.classes()),
         vehicles=len(vehicles),
-        vehicles_planned=plan.vehicles,
+        vehicles_planned=latest.plan.vehicles,
         following=int(np.count_nonzero(vehicles.targets >= 0)),
-        captures=total("captures"),
-        collisions=total("collisions"),
-        lethal_entries=total("lethal_entries"),
-        driven_into=total("driven_into"),
-        hit_by_bodies=total("hit_by_bodies"),
-        reroute_requests=total("reroute_requests"),
-        routes_served=total("routes_served"),
-        marks=total("marks"),
-        messages_per_s=observed.now_of(MESSAGES_PER_S),
-        payloads_dropped=total("payloads_dropped"),
+        messages_per_s=latest.now_of(MESSAGES_PER_S),
         alive=sum(well),
         expected=len(crew),
-        restarts=round(observed.gauge(RESTARTS) or 0),
-        crew=_by_role(crew, well),
-        beside=_beside(observed, set(crew)),
-        certified_gap=certified_gap(observed),
-        learned=_learned(observed),
-        alarms=alarms_of(observed, tracked, plan, targets, now_ns),
-        orders=tuple(map(plain, book.standing)),
-        grid=observed.grid,
+        restarts=round(latest.gauge(RESTARTS) or 0),
+        crew={role: (alive[role], expected[role]) for role in expected},
+        beside=dict(Counter(role for role, id in latest.up() if (role, id) not in set(crew))),
+        certified_gap=certified_gap(latest),
+        learned=_learned(latest),
+        alarms=alarms_of(latest, latest.plan, targets, now_ns),
+        orders=tuple(map(plain, latest.book.standing)),
+        grid=latest.grid,
+        **{name: latest.total(name) for name in _TOTALS},
     )
 
 
@@ -168,67 +160,46 @@ def by_state(counts: Sequence[int]) -> dict[str, int]:
     return {state.name.lower(): n for state, n in zip(VehicleState, counts, strict=True)}
 
 
-def _by_role(crew: Sequence[tuple[str, str]], well: Sequence[bool]) -> dict[str, tuple[int, int]]:
-    roles: dict[str, tuple[int, int]] = {}
-    for (role, _), is_well in zip(crew, well, strict=True):
-        alive, expected = roles.get(role, (0, 0))
-        roles[role] = (alive + is_well, expected + 1)
-    return roles
-
-
-def _beside(observed: Observed, crew: Collection[tuple[str, str]]) -> dict[str, int]:
-    roles: dict[str, int] = {}
-    for role, id in observed.up():
-        if (role, id) not in crew:
-            roles[role] = roles.get(role, 0) + 1
-    return roles
-
-
 def _lines(
-    observed: Observed,
-    tracked: TrackedTargets,
-    plan: RunPlan,
-    targets: Sequence[str],
-    vehicles: VehicleColumns,
-    now_ns: int,
+    latest: LatestState, targets: Sequence[str], vehicles: VehicleColumns, now_ns: int
 ) -> tuple[TargetLine, ...]:
-    lost = tracked.lost(now_ns)
-    captures, gaps = observed.counts_by(CAPTURES_OF), gaps_to(observed)
+    lost = latest.lost(now_ns)
+    captures, gaps = latest.counts_by(CAPTURES_OF), gaps_to(latest)
     lines = []
     for id in targets:
-        pose, status = observed.poses.get(id), observed.told_by_planner(id)
+        pose, status = latest.poses.get(id), latest.told_by_planner(id)
         nearest_m = None
         if pose is not None and len(vehicles):
-            east_m, south_m = observed.place_m(pose)
+            east_m, south_m = latest.place_m(pose)
             nearest_m = float(np.hypot(vehicles.east_m - east_m, vehicles.south_m - south_m).min())
         lines.append(
             TargetLine(
                 id=id,
-                planner_up=observed.is_up("planner", id) or observed.is_well("planner", id),
-                rank=observed.rank("planner", id),
+                planner_up=latest.is_up("planner", id) or latest.is_well("planner", id),
+                rank=latest.rank("planner", id),
                 following=len(vehicles.chasing(id)),
                 nearest_m=nearest_m,
-                growths=observed.of_job("planner", id, "growths", "window_growths"),
+                growths=latest.of_job("planner", id, "growths", "window_growths"),
                 # It is 0 as long as no tree has been grown.
                 growth_ms=None if status is None else status.growth_ms or None,
                 captures=captures.get(id, 0),
                 gap=gaps.get(id),
-                pose_age_s=tracked.age_s(id, now_ns),
+                pose_age_s=latest.pose_age_s(id, now_ns),
                 lost=id in lost,
-                routes_served=observed.of_job("planner", id, "routes_served"),
+                routes_served=latest.of_job("planner", id, "routes_served"),
                 strategy=None if status is None else status.strategy,
                 tracker=None if status is None else status.tracker,
-                starting=starts(observed, plan, "planner", id, now_ns),
+                starting=starts(latest, latest.plan, "planner", id, now_ns),
             )
         )
     return tuple(lines)
 
 
-def _learned(observed: Observed) -> dict[str, float]:
+def _learned(latest: LatestState) -> dict[str, float]:
     """As the planner says that has learned most: those of other groups may have been told less."""
     told = [
         {name.removeprefix(LEARNED): value for name, value in stats.gauges.items() if name.startswith(LEARNED)}
-        for (role, _), stats in observed.newest().items()
+        for (role, _), stats in latest.newest().items()
         if role == "planner"
     ]
     return dict(sorted(max(told, key=len, default={}).items()))

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.files import replacing, write_file
 from launch_scripts.observe.ground_pace import GROUND_PACE_FILE, packed_ground
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import REPORT_FILE, ended
+from launch_scripts.observe.run_folder import REPORT_FILE, ended, replacing, write_file
 from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, tracks_in
 from launch_scripts.report.results.result_tables import TABLES, csv_of
 from shared_map.learning.learned import factors_in, learned_kinds

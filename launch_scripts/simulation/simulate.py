@@ -15,14 +15,15 @@ from typing import Any, TextIO
 
 import msgspec
 
-from launch_scripts.observe.recorder import RECORDED, Recorder
+from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_observer import RECORDED, RunObserver
 from launch_scripts.process_table import ENTRIES, STOP_ORDER, ProcessSpec, planner_spec, processes_of
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
-from swarm.bus.bus import Appeared, AskEnded, Disappeared, Event, Heard, Replied
+from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
@@ -206,20 +207,9 @@ class Simulation:
     def _watch(self) -> None:
         """Subscribes the recorder to its topics."""
         bus = self.network.bus(OBSERVER, self.scenario.network.namespace, self.authenticator)
-        clock, recorder = self.scheduler.clock, self.recorder
-
-        def post(event: Event) -> None:
-            match event:
-                case Heard(_, fields, message):
-                    recorder.heard(message, fields, clock.now_ns())
-                case Appeared(peer):
-                    recorder.alive(peer, True, clock.now_ns())
-                case Disappeared(peer):
-                    recorder.alive(peer, False, clock.now_ns())
-
-        for topic, every_s in RECORDED.items():
-            bus.subscribe(topic, post, every_s=every_s)
-        bus.watch_alive(post)
+        clock = self.scheduler.clock
+        observer = RunObserver(bus, lambda event: observer.take(event, clock.now_ns()), self.recorder, RECORDED)
+        observer.subscribe()
 
     def twin(self, name: str) -> None:
         """Starts a second life of an agent now, on another machine: with another file, and a clock of its own."""

@@ -21,11 +21,12 @@ from prometheus_client.metrics_core import (
 )
 
 from launch_scripts.observe.counts import Counts
+from launch_scripts.observe.latest_state import LatestState
 from shared_map.keeper.service import THROTTLED
 from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, LEARNED, Histogram
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.processes import RunInfo, Stats
 
 PREFIX = "swarm_"
 _PROCESS, _TARGET = ("role", "id"), ("target",)
@@ -118,6 +119,13 @@ class Run(NamedTuple):
     run_id: str
     scenario: str
     started_ns: int
+
+
+def figures_of(run: RunInfo | None, latest: LatestState | None) -> Figures:
+    """The figures of a run which is observed from outside; none before it is found."""
+    if run is None or latest is None:
+        return Figures(None, Counts(), {}, [])
+    return Figures(Run(run.run_id, run.scenario, run.started_ns), latest, latest.status, latest.up())
 
 
 class Figures(NamedTuple):

@@ -7,7 +7,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.observe.machine import processor
+from launch_scripts.observe.run_folder import processor
 
 
 def machine() -> dict[str, Any]:

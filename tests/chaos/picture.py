@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from chaos.tally import QUICK_S, Tally
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import STYLE
 from swarm.errors import StoreError
 
 _COLOURS = {"calm": "#9aa3ad", "kill": "#c44e52", "hang": "#dd8452", "messages": "#4c72b0"}

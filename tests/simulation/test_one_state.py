@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
+from launch_scripts.commands.running.status import print_status, status_fields, status_of
 from launch_scripts.launcher.live_table import live_table
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.details import _DOES
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.observe import facts
+from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.state import RunState
 from launch_scripts.simulation.node import EPOCH_NS
 from launch_scripts.simulation.simulate import Simulation
@@ -184,17 +185,18 @@ class Watched:
     def now_ns(self) -> int:
         return self.simulation.scheduler.clock.now_ns()
 
-    def status(self) -> StatusWatch:
+    def status(self) -> OutsideObserver:
         """Somebody who comes now and asks."""
         simulation = self.simulation
         bus = simulation.network.bus("status", simulation.scenario.network.namespace, simulation.authenticator)
-        watch: StatusWatch
+        observer: OutsideObserver
 
         def post(event: Event) -> None:
-            watch.take(event, self.now_ns)
+            observer.take(event, self.now_ns)
 
-        watch = StatusWatch(bus, post)
-        return watch
+        observer = OutsideObserver(bus, post)
+        observer.tick(self.now_ns)
+        return observer
 
     def draw_all(self, now_ns: int) -> None:
         """One frame in which nothing waits for the next, the figures first."""
@@ -255,7 +257,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     simulation = watched.simulation
     plan(simulation)
     simulation.run_until(_SHOWN_S - 1.6)
-    watch = watched.status()
+    observer = watched.status()
     simulation.run_until(_SHOWN_S)
     watched.hush()
 
@@ -263,7 +265,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     watched.watching = False
     watched.draw_all(now_ns)
     state = simulation.recorder.summary(now_ns)
-    status = watch.status(now_ns)
+    status = status_of(observer, now_ns)
     assert status is not None
     console = Console(file=io.StringIO(), width=250)
     print_status(status, console)

@@ -128,7 +128,7 @@ def kinds(simulation: Simulation) -> list[str]:
 
 def receivers(simulation: Simulation) -> dict[str, Tracking | None]:
     """What everybody who hears poses knows of the trackers of x."""
-    found: dict[str, Tracking | None] = {"recorder": simulation.recorder.tracked._trackings.of("x")}
+    found: dict[str, Tracking | None] = {"recorder": simulation.recorder.observed._trackings.of("x")}
     for node in simulation.nodes.values():
         service: Any = node.service
         match service:

@@ -131,7 +131,7 @@ def gone(
 
 def _members(network: NetworkConfig, where: Where) -> tuple[list[RunInfo], RunInfo]:
     """The processes of the run, and one of them."""
-    from launch_scripts.launcher.watcher import ask_run
+    from launch_scripts.observe.run_observer import ask_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.errors import BusError
 

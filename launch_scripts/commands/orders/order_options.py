@@ -43,7 +43,7 @@ def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool, at: Pla
     """
     import msgspec
 
-    from launch_scripts.commands.run_frame import frame_of_run
+    from launch_scripts.observe.run_observer import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.places import cell_of, fields_of, written
     from swarm.runtime.operator import Operator

@@ -121,7 +121,7 @@ def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 
     swarm zone list
     """
-    from launch_scripts.commands.run_frame import frame_of_run
+    from launch_scripts.observe.run_observer import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.runtime.operator import Operator
 
@@ -135,7 +135,7 @@ def _give(order: ZoneOrder, where: Where, tls: Tls, as_json: bool, corners: Sequ
     """corners  of the area, if it is given by places"""
     from msgspec.structs import replace
 
-    from launch_scripts.commands.run_frame import frame_of_run
+    from launch_scripts.observe.run_observer import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.places import corners_of
     from swarm.runtime.operator import Operator
@@ -154,7 +154,7 @@ def _give_file(
     file: Path, layer: str | None, crs: str | None, fields: dict[str, object], where: Where, tls: Tls, as_json: bool
 ) -> None:
     """Order a zone for each area of a file."""
-    from launch_scripts.commands.run_frame import frame_of_run
+    from launch_scripts.observe.run_observer import frame_of_run
     from shared_map.importers.zones.zone_outlines import outlines_of
     from swarm.bus.zenoh_bus import open_bus
     from swarm.runtime.operator import Acknowledged, Operator

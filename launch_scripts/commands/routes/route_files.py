@@ -242,8 +242,7 @@ def _png(route: DescribedRoute, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from launch_scripts.observe.palette import BLUE, INK, RED
-    from launch_scripts.observe.plot_style import STYLE
+    from launch_scripts.observe.palette import BLUE, INK, RED, STYLE
 
     grid = route.grid
     x_m, y_m = route.metres()
@@ -282,7 +281,7 @@ def _png(route: DescribedRoute, path: Path) -> None:
 def _relief(terrain: Terrain) -> tuple[Floats, tuple[float, float]]:
     """Colours of the relief, lethal ground dark; and (metres from west to east, metres from north to south)."""
     from launch_scripts.commands.terrain.terrain_picture import MOST_CELLS
-    from launch_scripts.report.pictures.hillshade import hillshade
+    from launch_scripts.observe.palette import hillshade
     from shared_map.terrain.pyramid import level_of
 
     level = level_of(terrain, MOST_CELLS)

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, write_route
-from launch_scripts.commands.run_frame import frame_of_run
+from launch_scripts.observe.run_observer import frame_of_run
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import AskEnded, Replied
 from swarm.bus.zenoh_bus import open_bus

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.commands.run_frame import frame_of_run
+from launch_scripts.observe.run_observer import frame_of_run
 from shared_map.learning.learned import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile

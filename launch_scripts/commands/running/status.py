@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,30 +9,20 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.commands.run_frame import frame_of_members
 from launch_scripts.launcher.live_table import columns, targets_table
 from launch_scripts.observe import facts
-from launch_scripts.observe.certified_gap import gaps_to
-from launch_scripts.observe.plan import plan_of_members, run_of_most
-from launch_scripts.observe.run_model import HEARD, RunModel
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.counts import gaps_to
+from launch_scripts.observe.latest_state import LatestState
+from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
+from launch_scripts.observe.state import RunState, state_of
 from launch_scripts.plain_text import plain
 from shared_map.terrain.places import MapFrame
-from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
-from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
-from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat, RunInfo, Stats
-from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import RUN, STATS
+from swarm.wire.messages.processes import RunInfo
 from swarm.wire.versions import are_neighbours
 
-_TAG, _GONE = "status-run", "status-gone"
-_ASK_S = 1.0
-_NO_GRID = GridSpec(1, 1, 1.0)
 _SHOWN_ALARMS = 12
 
 
@@ -47,81 +36,21 @@ class Status:
 
     members: list[RunInfo]
     strangers: list[RunInfo]
-    model: RunModel
-    leads: dict[tuple[str, str], bool]
+    latest: LatestState
     frame: MapFrame | None
     now_ns: int
 
     @property
     def state(self) -> RunState:
-        return self.model.state(self.now_ns)
+        return state_of(self.latest, self.now_ns)
 
 
-class StatusWatch:
-    """Listens to a swarm and asks who takes part. Whoever owns it passes it what comes in (`take`)."""
-
-    def __init__(self, bus: Bus, post: Post) -> None:
-        self._told: list[tuple[int, Event]] = []
-        self._found: list[RunInfo] = []
-        self.answered = False
-        """Whether all who would answer have."""
-        for topic, every_s in HEARD.items():
-            bus.subscribe(topic, post, every_s=every_s)
-        bus.watch_alive(post)
-        bus.ask(RUN, Nothing(), post, tag=_TAG, timeout_s=_ASK_S)
-        self._bus, self._post = bus, post
-        self._ask_gone()
-
-    def _ask_gone(self) -> None:
-        """Ask what processes that are gone have said last."""
-        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_S)
-
-    def take(self, event: Event, now_ns: int) -> None:
-        """Take in one event."""
-        match event:
-            case Replied(tag=tag, message=RunInfo() as info) if tag == _TAG:
-                self._found.append(info)
-            case AskEnded(tag=tag) if tag == _TAG:
-                self.answered = True
-            case Heard() | Appeared() | Disappeared() | Replied(message=Stats()):
-                self._told.append((now_ns, event))
-                if isinstance(event, Disappeared):  # perhaps before it said anything to us
-                    self._ask_gone()
-
-    @property
-    def whole(self) -> bool:
-        """Whether every process that has answered has also said what it counts, and every agent where it drives."""
-        told = [event.message for _, event in self._told if isinstance(event, Heard)]
-        counted = {(each.role, each.id) for each in told if isinstance(each, Stats)}
-        drives = {agent_of(each.ids[0]) for each in told if isinstance(each, Fleet) and each.ids}
-        return self.answered and all(
-            (info.role, info.id) in counted and (info.role != "agent" or info.id in drives) for info in self._found
-        )
-
-    def status(self, now_ns: int) -> Status | None:
-        """What was told so far; None if nobody has answered."""
-        if not self._found:
-            return None
-        run = run_of_most(self._found)  # whoever answers with another is a stranger
-        found = sorted(self._found, key=lambda info: (not info.run_id, info.role, info.id))
-        of_run = [info for info in found if (info.run_id, info.terrain) == run]
-        [(wire, _)] = Counter(info.wire_version for info in of_run).most_common(1)
-        strangers = [info for info in found if info.run_id and not _belongs(info, run, wire)]
-        members = [info for info in found if info not in strangers]
-        frame = frame_of_members(members)
-        model = RunModel(plan_of_members(members), _NO_GRID if frame is None else frame.grid)
-        leads: dict[tuple[str, str], bool] = {}
-        for told_ns, event in self._told:
-            match event:
-                case Heard(message=message) | Replied(message=message):
-                    if isinstance(message, Beat):
-                        leads[message.role, message.id] = message.leads
-                    model.heard(message, told_ns)
-                case Appeared(peer):
-                    model.alive(peer, True, told_ns)
-                case Disappeared(peer):
-                    model.alive(peer, False, told_ns)
-        return Status(members, strangers, model, leads, frame, now_ns)
+def status_of(observer: OutsideObserver, now_ns: int) -> Status | None:
+    """What was heard so far; None if nobody has answered."""
+    if observer.latest is None:
+        return None
+    members, strangers = observer.members()
+    return Status(members, strangers, observer.latest, frame_of_members(members), now_ns)
 
 
 def print_status(status: Status, console: Console) -> None:
@@ -146,7 +75,7 @@ def print_status(status: Status, console: Console) -> None:
     if state.targets:
         console.print(targets_table(state, len(state.targets)))
         console.print(_planning(state))
-    for id, planner in sorted(status.model.observed.status.items()):
+    for id, planner in sorted(status.latest.status.items()):
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
             was = "was" if planner.tracker_lost else "is"
@@ -178,11 +107,11 @@ def _wire_versions(status: Status) -> str | None:
 def _processes(status: Status) -> Table:
     crew = columns("process", "up", "messages out", "in", "dropped")
     for info in status.members:
-        stats = status.model.observed.newest_stats(info.role, info.id)
+        stats = status.latest.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
         told = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
         up_s = max(status.now_ns - info.incarnation, 0) / NS_PER_S
-        leading = {True: ", leads", False: ", stands by", None: ""}[status.leads.get((info.role, info.id))]
+        leading = {True: ", leads", False: ", stands by", None: ""}[status.latest.leads.get((info.role, info.id))]
         crew.add_row(f"{info.role}-{info.id}{leading}", facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
 
@@ -198,16 +127,16 @@ def _planning(state: RunState) -> Table:
 
 def status_fields(status: Status) -> dict[str, Any]:
     """For programs."""
-    observed, first, frame = status.model.observed, status.members[0], status.frame
+    latest, first, frame = status.latest, status.members[0], status.frame
 
     def process_fields(info: RunInfo) -> dict[str, Any]:
-        stats = observed.newest_stats(info.role, info.id)
+        stats = latest.newest_stats(info.role, info.id)
         return {
             "role": info.role,
             "id": info.id,
             "incarnation": info.incarnation,
             "wire_version": info.wire_version,
-            "leads": status.leads.get((info.role, info.id)),
+            "leads": status.latest.leads.get((info.role, info.id)),
             "counts": None if stats is None else stats.counts,
             "gauges": None if stats is None else stats.gauges,
         }
@@ -224,8 +153,8 @@ def status_fields(status: Status) -> dict[str, Any]:
         **facts.for_report(status.state),
         "processes": [process_fields(info) for info in status.members],
         "crs": None if frame is None else frame.grid.crs,
-        "planners": [planner_fields(planner) for _, planner in sorted(observed.status.items())],
-        "certified_gap_to": {id: gap.fields() for id, gap in gaps_to(observed).items()},
+        "planners": [planner_fields(planner) for _, planner in sorted(latest.status.items())],
+        "certified_gap_to": {id: gap.fields() for id, gap in gaps_to(latest).items()},
         "orders": list(status.state.orders),
         "strangers": [f"{info.role}-{info.id}" for info in status.strangers],
     }

@@ -16,23 +16,21 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from launch_scripts.commands.running.observer import RunObserver
 from launch_scripts.launcher.lasting_output import make_output_last
 from launch_scripts.launcher.live_table import fitted
 from launch_scripts.launcher.loads_table import loads_table
-from launch_scripts.launcher.watcher import ask_run
 from launch_scripts.observe import facts
-from launch_scripts.observe.plan import run_of_most
+from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.process_load import ProcessLoad, by_role
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.run_observer import OutsideObserver
+from launch_scripts.observe.state import RunState, state_of
 from launch_scripts.process_table import ROLES
 from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import MonotonicClock
+from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError
 from swarm.wire.messages.processes import RunInfo
 
 if TYPE_CHECKING:
-    from swarm.bus.bus import Bus
     from swarm.config.scenario import NetworkConfig
 
 EVERY_S = 1.0
@@ -48,28 +46,29 @@ def top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_jso
     console = Console(highlight=False)
     moving = console.is_terminal and not as_json and not once
     with open_bus(network) as bus, _quietly(), _keys() if moving else contextlib.nullcontext():
-        observer = RunObserver(bus, MonotonicClock(), _members(bus, where))
+        clock, observer = MonotonicClock(), OutsideObserver(bus)
+        run, latest = _run_of(observer, clock, where)
         due_s = time.monotonic() + _FIRST_S
         with Live(console=console, auto_refresh=False) if moving else contextlib.nullcontext() as live:
             while True:
-                observer.listen(due_s)
+                observer.listen(clock, due_s - time.monotonic())
                 due_s = max(due_s + EVERY_S, time.monotonic())
-                state, processes = observer.state(), observer.processes()
+                state, processes = state_of(latest, clock.now_ns()), latest.loads.lines(latest.up())
                 if as_json:
-                    print(json.dumps(fields_of(observer.run, state, processes)), flush=True)
+                    print(json.dumps(fields_of(run, state, processes)), flush=True)
                 else:
-                    shown = table_of(observer.run, state, processes, console, each=each)
+                    shown = table_of(run, state, processes, console, each=each)
                     if live is None:
                         console.print(shown)
                     else:
                         live.update(shown, refresh=True)
                 if once:
                     return
-                if observer.over or not observer.answers:
+                if observer.over or all(role == "router" for role, _ in latest.up()):
                     break
                 if moving and _asked_to_end():
                     return
-    Console(stderr=as_json, highlight=False).print(f"run {observer.run.run_id} is over, or cannot be reached")
+    Console(stderr=as_json, highlight=False).print(f"run {run.run_id} is over, or cannot be reached")
 
 
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
@@ -107,17 +106,15 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 2)
 
 
-def _members(bus: Bus, where: object) -> list[RunInfo]:
-    """The members of the run that most answers belong to. Waits for one that is just starting."""
+def _run_of(observer: OutsideObserver, clock: Clock, where: object) -> tuple[RunInfo, LatestState]:
+    """The run that is observed, and what is heard of it. Waits for one that is just starting."""
     until_s = time.monotonic() + _ANSWER_WITHIN_S
-    while True:
-        found = ask_run(bus, routers=True)
-        run_id, _ = run_of_most(found)
-        if run_id:
-            return [info for info in found if info.run_id == run_id]
-        if not found or time.monotonic() > until_s:
-            who = "nobody answers" if not found else "only routers answer"
+    while observer.run is None or observer.latest is None:
+        if observer.answered and (observer.latest is None or time.monotonic() > until_s):
+            who = "nobody answers" if observer.latest is None else "only routers answer"
             raise BusError(f"{who} {where}: is the swarm running?")
+        observer.listen(clock, 0.1)
+    return observer.run, observer.latest
 
 
 @contextlib.contextmanager

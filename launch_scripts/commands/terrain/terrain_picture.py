@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from launch_scripts.report.pictures.hillshade import hillshade
+from launch_scripts.observe.palette import hillshade
 from shared_map.arrays import Floats
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.pyramid import Level, level_of

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import palette
-from launch_scripts.observe.palette import rgb
-from launch_scripts.report.pictures.hillshade import hillshade
+from launch_scripts.observe.palette import hillshade, rgb
 from shared_map.arrays import Bools
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.pyramid import any_in_blocks

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.report.pictures.scale_bar import round_length, said_length
+from launch_scripts.observe.palette import round_length, said_length
 
 _BAR_SHARE = 0.25
 """Of the terrain's width, at most."""

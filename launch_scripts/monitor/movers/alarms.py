@@ -10,7 +10,7 @@ import numpy as np
 from launch_scripts.monitor.movers.looks import ALARM_COLOUR, Colour
 from launch_scripts.monitor.movers.points import Places
 from launch_scripts.observe.alarms import Alarm
-from launch_scripts.observe.vehicle_columns import VehicleColumns
+from launch_scripts.observe.latest_state import VehicleColumns
 from swarm.config.agents import agent_of
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from launch_scripts.monitor.movers.routes import RouteNow
-from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import TARGET_FACTS
+from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.state import TargetLine
-from launch_scripts.observe.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.vehicles import Body, VehicleState
 

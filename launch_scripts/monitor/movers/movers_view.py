@@ -18,9 +18,9 @@ from launch_scripts.monitor.movers.strips import poles
 from launch_scripts.monitor.movers.targets_view import TargetsView
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.serving.sinks import Streams
-from launch_scripts.observe.run_figures import RunFigures
+from launch_scripts.observe.latest_state import VehicleColumns
+from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.state import RunState
-from launch_scripts.observe.vehicle_columns import VehicleColumns
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.config.scenario import Scenario
@@ -102,8 +102,8 @@ class MoversView:
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say, so that all places say the same; draws alarms where they are."""
         self._details = {line.id: target_details(line) for line in summary.targets}
-        plan, observed = self._figures.model.plan, self._figures.observed
-        self._crew = frozenset(plan.crew_now(plan.targets_now(self._figures.book)))
+        observed = self._figures.observed
+        self._crew = frozenset(observed.plan.crew_now(observed.plan.targets_now(observed.book)))
         marks = alarm_marks(
             summary.alarms, summary.elapsed_s, observed.targets(), observed.vehicles(), self._mesh.grid
         )
@@ -125,7 +125,7 @@ class MoversView:
             self._vehicles.draw(vehicles, observed.groups, observed.classes, now_ns, slower)
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
-        lost = self._figures.tracked.lost(now_ns)
+        lost = self._figures.observed.lost(now_ns)
         # A target that an operator removed is in no table either.
         places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
         self._targets.draw(places_m, lost, self._sightings.best(now_ns), self._details, now_ns, slower)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.observe.vehicle_columns import VehicleColumns
+from launch_scripts.observe.latest_state import VehicleColumns
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.vehicles import Body

@@ -17,7 +17,7 @@ from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
 from launch_scripts.monitor.movers.points import Points, cell_at, vehicle_points
 from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along
 from launch_scripts.monitor.movers.strips import Strips, Trails
-from launch_scripts.observe.vehicle_columns import VehicleColumns
+from launch_scripts.observe.latest_state import VehicleColumns
 from swarm.config.agents import plan_agents
 from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from launch_scripts.monitor.serving.sinks import new_recording_path
-from launch_scripts.observe.disk_watch import SAY_EVERY_S, can_write
+from launch_scripts.observe.run_folder import SAY_EVERY_S, can_write
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 

@@ -9,10 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from launch_scripts.observe.files import replacing
 from launch_scripts.observe.ground_pace import GROUND_PACE_FILE, read_ground
 from launch_scripts.observe.palette import GROUPS, rgb
-from launch_scripts.observe.run_folder import REPORT_FILE, read_report
+from launch_scripts.observe.run_folder import REPORT_FILE, read_report, replacing
 from launch_scripts.report.geo.run_export import free_places, groups_of, tracks_of_run
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec

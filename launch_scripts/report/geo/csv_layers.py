@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from launch_scripts.observe.files import replacing
+from launch_scripts.observe.run_folder import replacing
 from launch_scripts.report.geo.geo_layers import Feature, Layer, iso_time
 from launch_scripts.report.geo.geo_shapes import Ring, in_degrees
 from shared_map.terrain.places import MapFrame

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.files import replacing
+from launch_scripts.observe.run_folder import replacing
 from launch_scripts.report.geo.geo_shapes import Ring, areas_of, line, point, polygon, turns_of
 from launch_scripts.report.geo.track_file import RunTracks, Track
 from shared_map.terrain.places import MapFrame, middles_of

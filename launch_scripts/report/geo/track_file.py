@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.array_archive import arrays_in, packed
+from launch_scripts.observe.history import Tracks
 from launch_scripts.observe.latest_state import MarkedCells
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -79,7 +79,7 @@ class RunTracks:
 def packed_tracks(recorder: Recorder) -> bytes:
     """The content of the file."""
     grid = recorder.grid
-    began_ns = recorder.model.began_ns or 0
+    began_ns = recorder.observed.began_ns or 0
     arrays: dict[str, NDArray[Any]] = {
         "grid": np.array(json.dumps(asdict(grid))),
         "began_ns": np.array(began_ns, np.int64),
@@ -91,7 +91,7 @@ def packed_tracks(recorder: Recorder) -> bytes:
     arrays["captures_time_ns"] = np.array([began_ns + int(each.time_s * NS_PER_S) for each in captures], np.int64)
     places = [(each.east_m, each.south_m) for each in captures]
     arrays["captures_place_m"] = np.array(places, np.float32).reshape(-1, 2)
-    marked = recorder.marked()
+    marked = recorder.observed.marked()
     arrays |= {f"marks_{name}": getattr(marked, name) for name in _MARKS}
     arrays |= _route_columns([(each.time_ns, each.route) for each in recorder.routes.kept])
     return packed(arrays)
@@ -115,14 +115,14 @@ def _route_columns(routes: list[tuple[int, Followed]]) -> dict[str, NDArray[Any]
 
 def _columns(tracks: Tracks) -> dict[str, NDArray[Any]]:
     """One row per track: its id, its piece, how many samples; and all samples, track by track."""
-    lines, times = tracks.lines(), tracks.times_ns()
+    lines = tracks.lines()
     keys = sorted(lines)
     return {
         "id": np.array([id for id, _ in keys], np.str_),
         "piece": np.array([piece for _, piece in keys], np.int64),
-        "samples": np.array([len(lines[key]) for key in keys], np.int64),
-        "time_ns": np.concatenate([times[key] for key in keys]) if keys else np.zeros(0, np.int64),
-        "place_m": np.concatenate([lines[key] for key in keys]) if keys else np.zeros((0, 2), np.float32),
+        "samples": np.array([len(lines[key][0]) for key in keys], np.int64),
+        "time_ns": np.concatenate([lines[key][0] for key in keys]) if keys else np.zeros(0, np.int64),
+        "place_m": np.concatenate([lines[key][1] for key in keys]) if keys else np.zeros((0, 2), np.float32),
     }
 
 

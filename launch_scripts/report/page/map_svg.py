@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from launch_scripts.observe.palette import GROUPS
+from launch_scripts.observe.palette import GROUPS, round_length, said_length
 from launch_scripts.report.geo.track_file import RunTracks
 from launch_scripts.report.pictures.ground_picture import GROUND_FILE
 from launch_scripts.report.pictures.learned_picture import LEARNED_FILE
@@ -21,7 +21,6 @@ from launch_scripts.report.pictures.map_picture import (
     in_km,
     mark_overlay,
 )
-from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from swarm.config.input_files import FileKind, read_bytes
 
 WIDTH = 1000

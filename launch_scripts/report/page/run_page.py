@@ -10,10 +10,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
 
 from launch_scripts.observe.alarms import Alarm
-from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact, grouped, together
-from launch_scripts.observe.files import write_file
-from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
+from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
 from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
 from launch_scripts.report.page.map_svg import map_parts
 from launch_scripts.report.page.theme import themed_svg

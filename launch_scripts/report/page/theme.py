@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from launch_scripts.observe import palette
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import STYLE
 
 WIDTH_IN, HEIGHT_IN = 4.1, 1.8
 _THEMED = {

@@ -15,8 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from launch_scripts.observe.palette import BLACK, FORBIDDEN, LETHAL_GROUND
-from launch_scripts.report.pictures.hillshade import hillshade
+from launch_scripts.observe.palette import BLACK, FORBIDDEN, LETHAL_GROUND, hillshade
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain, build_truth
 from shared_map.terrain.zones import zone_mask

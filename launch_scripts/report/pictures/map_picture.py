@@ -23,11 +23,12 @@ from launch_scripts.observe.palette import (
     MARKED_SLOW,
     RED,
     YELLOW,
+    round_length,
+    said_length,
 )
 from launch_scripts.report.geo.track_file import RunTracks, Track
 from launch_scripts.report.pictures.ground_picture import GroundPicture
 from launch_scripts.report.pictures.plots import halo
-from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from shared_map.terrain.places import MapFrame
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind

@@ -10,10 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact
-from launch_scripts.observe.palette import FAINT, GREEN, INK, RED, RULE
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import FAINT, GREEN, INK, RED, RULE, STYLE
 from launch_scripts.report.geo.track_file import RunTracks
 from launch_scripts.report.pictures.ground_picture import GroundPicture
 from launch_scripts.report.pictures.map_picture import draw_map

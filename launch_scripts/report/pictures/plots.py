@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import duration
 from launch_scripts.observe.palette import (
     BLUE,

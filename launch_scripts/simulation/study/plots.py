@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from launch_scripts.observe.palette import BLUE, FAINT, ORANGE
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLUE, FAINT, ORANGE, STYLE
 from launch_scripts.simulation.study.summary import CaseSummary, Summary
 
 MOST_ROWS = 60

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 from distributed import Client
 
-from launch_scripts.observe.files import write_file
+from launch_scripts.observe.run_folder import write_file
 from launch_scripts.simulation.study import page, plots
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.plan import PlannedCase, plan, trials_of

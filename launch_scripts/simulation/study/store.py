@@ -14,7 +14,7 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from launch_scripts.observe.files import write_file
+from launch_scripts.observe.run_folder import write_file
 from launch_scripts.simulation.study.trial import Result
 from swarm.errors import StoreError
 

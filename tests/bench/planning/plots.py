@@ -16,8 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 
 from bench.planning.chase import Tally
 from bench.tables import label_of, on_machine
-from launch_scripts.observe.palette import BLUE, FAINT, INK, ORANGE, PINK, SKY, VIOLET
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLUE, FAINT, INK, ORANGE, PINK, SKY, STYLE, VIOLET
 from launch_scripts.report.pictures.plots import halo
 from swarm.config.values import Strategy
 

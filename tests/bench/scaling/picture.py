@@ -16,8 +16,7 @@ from bench.scaling.check import Compared
 from bench.scaling.model import ROLES, Model, Row
 from bench.scaling.needs import needs
 from bench.whole_swarm.size import size_of
-from launch_scripts.observe.palette import BLUE, FAINT, INK, ORANGE, PINK, SKY, VIOLET
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import BLUE, FAINT, INK, ORANGE, PINK, SKY, STYLE, VIOLET
 from swarm.errors import StoreError
 
 _COLOURS = dict(zip(ROLES, (BLUE, ORANGE, VIOLET, SKY, PINK, FAINT, "#8a6d3b"), strict=True))

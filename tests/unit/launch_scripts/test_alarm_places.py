@@ -6,8 +6,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from launch_scripts.observe.alarms import Alarm
+from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.plan import RunPlan
-from launch_scripts.observe.run_model import RunModel
+from launch_scripts.observe.state import state_of
 from swarm.grid import GridSpec
 from swarm.wire.messages.processes import Alarm as Told
 from swarm.wire.messages.processes import Stats
@@ -35,13 +36,13 @@ def test_an_alarm_is_told_wherever_it_says_that_it_is_and_has_a_place_if_that_is
 def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
     kind: str, about: str, text: str
 ) -> None:
-    model = RunModel(RunPlan((), (), 0, 1), GRID)
+    latest = LatestState(RunPlan((), (), 0, 1), GRID)
     told = Told(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
-    model.heard(
+    latest.heard(
         Stats(role="agent", id="a0", incarnation=1, stamp_ns=2, counts={}, gauges={}, histograms={}, alarms=[told]),
         2,
     )
-    [alarm] = model.state(3).alarms
+    [alarm] = state_of(latest, 3).alarms
     assert alarm.line(GRID).isprintable()
     if text.isprintable():
         assert alarm.text == text

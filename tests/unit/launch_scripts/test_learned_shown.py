@@ -98,7 +98,7 @@ def test_everybody_who_shows_a_run_says_what_was_learned_and_nothing_while_nothi
     stats = Stats(
         role="planner", id="t", incarnation=1, stamp_ns=1, counts={}, gauges={"learned.grass": 2.853}, histograms={}
     )
-    recorder.heard(stats, {}, 1)
+    recorder.heard(stats, 1)
     assert "learned grass x 2.9" in facts.lines(recorder.summary(1))
     assert facts.for_report(recorder.summary(1))["learned"] == {"grass": 2.853}
 
@@ -107,7 +107,7 @@ def test_a_report_tells_each_kind_of_ground_and_has_a_picture(tmp_path: Path) ->
     _, sets = learned(flat=3.0, steep=1.0)
     recorder = Recorder(small(), GROUND.grid)
     for each in sets:
-        recorder.heard(each, {}, 1)
+        recorder.heard(each, 1)
     write_report(tmp_path, make_report(recorder, GROUND), recorder, GROUND)
     flat, steep = json.loads((tmp_path / "report.json").read_text())["learned_kinds"]
     assert (flat["kind"], flat["cells"], flat["authors"]) == ("unknown 0-5", 400, 1)

@@ -64,9 +64,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if isinstance(told, MarkSet):
                 stamps_ns = np.frombuffer(told.stamps_ns, "<i8") + BEGAN_NS
                 told = msgspec.structs.replace(told, stamps_ns=stamps_ns.tobytes())
-            recorder.heard(told, {}, BEGAN_NS + now_ns)
+            recorder.heard(told, BEGAN_NS + now_ns)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
-    recorder.heard(note, {}, BEGAN_NS + 3 * NS_PER_S)
+    recorder.heard(note, BEGAN_NS + 3 * NS_PER_S)
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
         patched.setattr("launch_scripts.report.pictures.picture.save_picture", lambda half, *_: half.touch())
         write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)

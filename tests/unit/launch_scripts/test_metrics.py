@@ -17,9 +17,9 @@ from support.exported_metrics import exported
 
 from launch_scripts.commands.metrics import dashboard
 from launch_scripts.observe.counts import Counts
-from launch_scripts.web.metric_families import HELP, Figures, Run, families, named
+from launch_scripts.observe.run_observer import OutsideObserver
+from launch_scripts.web.metric_families import HELP, Figures, Run, families, figures_of, named
 from launch_scripts.web.metrics_endpoint import MetricsEndpoint
-from launch_scripts.web.metrics_exporter import Exporter
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.memory_links import PerfectLinks
 from swarm.bus.scheduler import Scheduler
@@ -216,7 +216,7 @@ def test_the_dashboard_asks_for_what_is_exported() -> None:
     assert asked <= exported().keys()
 
 
-def test_an_exporter_goes_on_to_the_next_run() -> None:
+def test_whoever_follows_goes_on_to_the_next_run() -> None:
     scheduler = Scheduler(ManualClock(_BEGAN_NS))
     network = MemoryNetwork(scheduler, PerfectLinks())
     bus = network.bus("agent-a0")
@@ -230,22 +230,24 @@ def test_an_exporter_goes_on_to_the_next_run() -> None:
         event.answer(info, role="agent", id="a0")  # type: ignore[attr-defined]
 
     bus.serve(RUN, answer, role="agent", id="a0")
-    exporter = Exporter(network.bus("metrics"))
+    observer = OutsideObserver(network.bus("metrics"), topics={STATS: 0.0, STATUS: 0.0}, follows=True)
     bus.declare_alive(Peer("agent", "a0", 1))
 
     def turn(seconds: float) -> None:
         for _ in range(int(seconds * 10)):
-            exporter.listen(scheduler.clock.now_ns(), 0.0)
+            observer.listen(scheduler.clock, 0.0)
             scheduler.run_until(scheduler.clock.now_ns() + NS_PER_S // 10)
 
     bus.publish(STATS, _stats("agent", "a0", _agent(), 1), role="agent", id="a0")
     bus.publish(STATUS, _status("t0"), target="t0")
     turn(8)
-    figures = exporter.figures()
-    assert exporter.run == Run("r1", "demo", _BEGAN_NS)
+    figures = figures_of(observer.run, observer.latest)
+    assert figures.run == Run("r1", "demo", _BEGAN_NS)
     assert list(figures.up) == [("agent", "a0")]
     assert figures.counts.total("messages_out") == 40
     run_id = "r2"
     turn(8)
-    assert exporter.figures().run == Run("r2", "demo", _BEGAN_NS)
-    assert exporter.figures().counts.total("messages_out") is None, "another run's counts are no part of this one"
+    figures = figures_of(observer.run, observer.latest)
+    assert figures.run == Run("r2", "demo", _BEGAN_NS)
+    assert list(figures.up) == [("agent", "a0")]
+    assert figures.counts.total("messages_out") is None, "another run's counts are no part of this one"

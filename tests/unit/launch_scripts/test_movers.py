@@ -24,9 +24,9 @@ from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_alo
 from launch_scripts.monitor.movers.searches import SILENT_NS, Searches, searched_points
 from launch_scripts.monitor.movers.strips import Trails, poles, rings
 from launch_scripts.observe.alarms import KINDS, Alarm
-from launch_scripts.observe.certified_gap import CertifiedGap
+from launch_scripts.observe.counts import CertifiedGap
+from launch_scripts.observe.latest_state import VehicleColumns, gathered
 from launch_scripts.observe.state import TargetLine
-from launch_scripts.observe.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

@@ -65,7 +65,7 @@ def large_run() -> tuple[RunState, ProcessLoads, set[tuple[str, str]]]:
     loads = ProcessLoads()
     now_ns = 4000 * NS_PER_S
     up = set()
-    for role, id in [*recorder.model.plan.crew, ("monitor", "0"), ("router", "0")][1:]:
+    for role, id in [*recorder.observed.plan.crew, ("monitor", "0"), ("router", "0")][1:]:
         recorder.alive(Peer(role, id, 1), True, now_ns)
         up.add((role, id))
         for at_s in (1.0, 2.0):

@@ -11,11 +11,10 @@ import pytest
 
 from launch_scripts.launcher.live_table import plain_line
 from launch_scripts.observe import facts
-from launch_scripts.observe.certified_gap import CertifiedGap
+from launch_scripts.observe.counts import CertifiedGap
+from launch_scripts.observe.history import Sample, Thinned, Tracks
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.samples import Sample, Samples
 from launch_scripts.observe.state import RunState
-from launch_scripts.observe.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
@@ -48,7 +47,7 @@ def recorder() -> Recorder:
 
 def hear(recorder: Recorder, *messages: Message, at_s: float = 0.0) -> None:
     for message in messages:
-        recorder.heard(message, {}, int(at_s * NS_PER_S))
+        recorder.heard(message, int(at_s * NS_PER_S))
 
 
 def stats(
@@ -280,8 +279,8 @@ def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> Non
     for n in range(4):
         hear(recorder, pose("t0", 100.0 + n, 200.0, n, captures=int(n >= 2)), at_s=float(n))
     lines = recorder.target_tracks.lines()
-    assert lines[("t0", 0)].tolist() == [[100.0, 200.0], [101.0, 200.0]]
-    assert lines[("t0", 1)].tolist() == [[102.0, 200.0], [103.0, 200.0]]
+    assert lines[("t0", 0)][1].tolist() == [[100.0, 200.0], [101.0, 200.0]]
+    assert lines[("t0", 1)][1].tolist() == [[102.0, 200.0], [103.0, 200.0]]
 
 
 def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recorder: Recorder) -> None:
@@ -290,7 +289,7 @@ def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recor
         marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10), 40: (MarkKind.LETHAL, 0.0, 10)}),
         marks("a1.1", 1, {33: (MarkKind.PACE, 0.5, 20), 40: (MarkKind.CLEAR, 0.0, 20)}),
     )
-    marked = recorder.marked()
+    marked = recorder.observed.marked()
     assert marked.cells.tolist() == [1 * GRID.cols + 1]
     assert marked.kinds.tolist() == [MarkKind.PACE]
     assert marked.paces.tolist() == [0.5]
@@ -299,13 +298,13 @@ def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recor
 
 def test_an_authors_older_set_does_not_replace_its_newer_one(recorder: Recorder) -> None:
     hear(recorder, marks("a0.1", 2, {}), marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10)}))
-    assert recorder.marked().cells.tolist() == []
+    assert recorder.observed.marked().cells.tolist() == []
 
 
 def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> None:
     standing_by = msgspec.structs.replace(scenario(), standbys=StandbyConfig(planner=1))
     recorder = Recorder(standing_by, GRID)
-    assert "planner t0.r1" in recorder.missing()
+    assert "planner t0.r1" in recorder.observed.missing()
 
     def titles() -> list[str]:
         return [line.title for line in recorder.summary(0).targets]
@@ -389,11 +388,11 @@ def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route
     for n, (role, id) in enumerate(peers):
         assert recorder.ready_ns is None
         recorder.alive(Peer(role, id, 1), True, n)
-    assert recorder.missing() == []
+    assert recorder.observed.missing() == []
     hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}, 1.0), at_s=1.0)
     assert recorder.ready_ns == NS_PER_S
     recorder.alive(Peer("planner", "t1", 1), False, 100)
-    assert recorder.missing() == ["planner t1"]
+    assert recorder.observed.missing() == ["planner t1"]
     assert recorder.ready_ns == NS_PER_S
 
 
@@ -419,29 +418,28 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
     for now_ns in range(1000):
         if tracks.due(now_ns):
             tracks.add(now_ns, [("a", 0), ("b", 0)], np.full((2, 2), now_ns, np.float32))
-    lines = tracks.lines()
-    assert 25 <= len(lines["a", 0]) <= 51
-    assert lines["a", 0][0, 0] == 0
-    assert lines["a", 0][-1, 0] > 900
-    assert (np.diff(lines["a", 0][:, 0]) > 0).all()
+    times_ns, places = tracks.lines()["a", 0]
+    assert 25 <= len(places) <= 51
+    assert (times_ns == places[:, 0]).all()
+    assert (places[0, 0], places[-1, 0] > 900) == (0, True)
+    assert (np.diff(places[:, 0]) > 0).all()
 
 
 def test_the_keys_of_a_track_are_kept_once() -> None:
     tracks = Tracks(interval_ns=1)
     for now_ns in range(100):
         tracks.add(now_ns, [(f"v{n}", 0) for n in range(50)], np.zeros((50, 2), np.float32))
-    assert len({id(keys) for _, keys, _ in tracks._samplings}) == 1
+    assert len({id(keys) for _, keys, _ in tracks._samplings.kept}) == 1
 
 
 def test_samples_thin_out_over_a_long_run_and_keep_its_beginning_and_its_end() -> None:
-    samples = Samples(limit=64)
+    samples = Thinned[Sample](64)
     for second in range(10_000):
         samples.add(sample(float(second)))
     times = [each.time_s for each in samples.all()]
     assert 32 <= len(times) <= 65
     assert (times[0], times[-1]) == (0.0, 9999.0)
     assert len(set(np.diff(times[:-1]))) == 1
-    assert [each.time_s for each in samples.newest] == [9998.0, 9999.0]
 
 
 def sample(time_s: float) -> Sample:
@@ -455,10 +453,10 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
         for at_s in range(from_s, until_s, step_s):
             places = {f"a0-{n:02d}": (float(at_s % 900), 5.0) for n in range(4)}
             hear(recorder, fleet("a0.1", places, at_s), pose("t0", 1.0, 2.0, at_s), capture("t0", 7), at_s=at_s)
-        recorder.vehicle_tracks._limit = recorder.target_tracks._limit = 2000
-        return len(
-            pickle.dumps([recorder.samples, recorder.captures, recorder.vehicle_tracks, recorder.target_tracks])
-        )
+        kept = [recorder.vehicle_tracks._samplings, recorder.target_tracks._samplings]
+        for each in kept:
+            each._limit = 2000
+        return len(pickle.dumps([recorder.captures, *(each.kept for each in (recorder.samples, *kept))]))
 
     hour = record(0, 12_000, 2)
     day = record(12_000, 20_000, 2)
@@ -477,7 +475,7 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     recorder = Recorder(scenario(), GRID, 0)
     at_s = 60.0
     hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}, at_s), at_s=at_s)
-    for role, id in recorder.model.plan.crew:
+    for role, id in recorder.observed.plan.crew:
         recorder.alive(Peer(role, id, 1), True, int(at_s * NS_PER_S))
         late = [told("behind", f"{role}-{id}", 12.0)]
         hits = [told("collision", "a0-00 a0-01", 31.0, 31.0), told("x", "y", 3.0)] if role == "targets" else []
@@ -493,7 +491,7 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     assert facts.alarm_lines(gone, 9)[0] == "down: planner-t1 is gone, since 60 s"
     silent = recorder.summary(int((at_s + 5) * NS_PER_S))
     assert {alarm.about for alarm in silent.alarms if alarm.kind == "silent"} == {
-        f"{role}-{id}" for role, id in recorder.model.plan.crew if id != "t1"
+        f"{role}-{id}" for role, id in recorder.observed.plan.crew if id != "t1"
     }
     ended = msgspec.structs.replace(stats("planner", "t1", at_s=at_s, gauges={"ended": 1.0}))
     hear(recorder, ended, at_s=at_s + 1)
@@ -510,16 +508,16 @@ def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_
     recorder: Recorder,
 ) -> None:
     made: list[int] = []
-    state = recorder.model.state
+    summary = recorder.summary
 
     def counted(now_ns: int) -> RunState:
         made.append(now_ns)
-        return state(now_ns)
+        return summary(now_ns)
 
-    recorder.model.state = counted  # type: ignore[method-assign]
+    recorder.summary = counted  # type: ignore[method-assign]
     for tick in range(100):
         now_ns = tick * NS_PER_S // 10
-        recorder.heard(status("t0", None), {}, now_ns)
+        recorder.heard(status("t0", None), now_ns)
         shown = [recorder.shown(now_ns) for _ in range(3)]
         assert shown[0] is shown[1] is shown[2]
         assert 0 <= now_ns / NS_PER_S - shown[0].elapsed_s < 1.0

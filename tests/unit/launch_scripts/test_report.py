@@ -16,12 +16,11 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from support.fake_run import fake_run
 
-from launch_scripts.observe.plot_style import STYLE
+from launch_scripts.observe.palette import STYLE, hillshade
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.geo.track_file import packed_tracks, tracks_in
 from launch_scripts.report.pictures import picture, plots
 from launch_scripts.report.pictures.ground_picture import ground_picture
-from launch_scripts.report.pictures.hillshade import hillshade
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.load import parse_scenario
@@ -74,7 +73,7 @@ def played(scenario: Scenario, ground: tuple[Terrain, NDArray[np.float32]]) -> R
         if isinstance(told, Peer):
             recorder.alive(told, True, now_ns)
         else:
-            recorder.heard(told, {}, now_ns)
+            recorder.heard(told, now_ns)
     return recorder
 
 

@@ -22,7 +22,7 @@ from support.fake_run import fake_run
 from support.map_strategies import set_of
 
 from launch_scripts.cli import main
-from launch_scripts.observe.begun_routes import BegunRoute
+from launch_scripts.observe.history import BegunRoute
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.geo.geo_layers import mark_layer, track_layers
 from launch_scripts.report.geo.geo_shapes import in_degrees
@@ -55,7 +55,7 @@ def recorder() -> Recorder:
         if isinstance(told, Peer):
             recorder.alive(told, True, BEGAN_NS + now_ns)
         else:
-            recorder.heard(told, {}, BEGAN_NS + now_ns)
+            recorder.heard(told, BEGAN_NS + now_ns)
     return recorder
 
 
@@ -105,16 +105,14 @@ def test_a_geojson_has_every_place_and_time_in_wgs84(
     for feature in layers["vehicle_tracks"]:
         said = feature["properties"]
         points = np.array(feature["geometry"]["coordinates"])
-        east_m, south_m = lines[said["vehicle"], 0][[0, -1]].astype(float).T
+        east_m, south_m = lines[said["vehicle"], 0][1][[0, -1]].astype(float).T
         xy_m = np.stack([GRID.west_m + east_m, GRID.north_m - south_m], axis=1)
         assert points[[0, -1]] == pytest.approx(in_degrees(xy_m, MapFrame(GRID)), abs=1e-7)
         times = [datetime.datetime.fromisoformat(time) for time in said["times"]]
         assert len(times) == len(points) <= said["samples"]
         assert times == sorted(times)
-        assert times[0].timestamp() * NS_PER_S == pytest.approx(
-            recorder.vehicle_tracks.times_ns()[said["vehicle"], 0][0]
-        )
-    marked = recorder.marked()
+        assert times[0].timestamp() * NS_PER_S == pytest.approx(lines[said["vehicle"], 0][0][0])
+    marked = recorder.observed.marked()
     assert sum(each["properties"]["cells"] for each in layers["marks"]) == len(marked.cells) > 0
     lethal = sum(each["properties"]["cells"] for each in layers["marks"] if each["properties"]["kind"] == "lethal")
     assert lethal == (marked.kinds == MarkKind.LETHAL).sum() > 0
@@ -223,7 +221,7 @@ def test_another_program_reads_the_same_from_a_geopackage(
             assert np.frombuffer(shape, "<f8", offset=5) == pytest.approx(track.xy_m[at], abs=1e-6)
     meta, _, shapes, values = raw.read(out, layer="marks")
     cells = dict(zip(meta["fields"].tolist(), values, strict=True))["cells"]
-    assert cells.sum() == len(recorder.marked().cells)
+    assert cells.sum() == len(recorder.observed.marked().cells)
     assert len(raw.read(out, layer="routes")[2]) == len(recorder.routes.kept)
     assert len(raw.read(out, layer="captures")[2]) == len(recorder.captures)
     assert swarm(monkeypatch, "map", "export", run / "map.sqlite", tmp_path / "marks.gpkg") == 0

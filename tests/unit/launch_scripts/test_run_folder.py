@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from support.fake_run import fake_run
 
 from launch_scripts.launcher.options import SCENARIOS, find_scenario
+from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.results import Driven
 from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
-from launch_scripts.observe.vehicle_columns import VehicleColumns
 from launch_scripts.report.results.result_tables import TABLES
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
@@ -184,7 +184,7 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recorder]:
         if isinstance(told, Peer):
             recorder.alive(told, True, now_ns)
         else:
-            recorder.heard(told, {}, now_ns)
+            recorder.heard(told, now_ns)
     write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain)
     return folder, recorder
 

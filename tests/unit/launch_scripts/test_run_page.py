@@ -13,7 +13,7 @@ import pytest
 from support.fake_run import fake_run
 
 from launch_scripts.cli import main
-from launch_scripts.observe.certified_gap import percent
+from launch_scripts.observe.counts import percent
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
@@ -44,9 +44,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if isinstance(told, Peer):
             recorder.alive(told, True, now_ns)
         else:
-            recorder.heard(told, {}, now_ns)
+            recorder.heard(told, now_ns)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
-    recorder.heard(note, {}, recorder.last_ns or 0)
+    recorder.heard(note, recorder.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
         patched.setattr("launch_scripts.report.pictures.picture.save_picture", lambda half, *_: half.touch())

@@ -9,7 +9,8 @@ from rich.console import Console
 from support.client_rig import run_info
 from support.swarm_model import SwarmModel
 
-from launch_scripts.commands.running.status import Status, StatusWatch, print_status, status_fields
+from launch_scripts.commands.running.status import Status, print_status, status_fields, status_of
+from launch_scripts.observe.run_observer import OutsideObserver
 from swarm.bus.bus import AskEnded, Replied
 from swarm.grid import GridSpec
 from swarm.wire.topics import RUN
@@ -17,14 +18,14 @@ from swarm.wire.topics import RUN
 INFO = run_info(GridSpec(4, 5, 90.0))
 
 
-def status_of(**wire_versions: int) -> Status:
+def told_by(**wire_versions: int) -> Status:
     """What is told once agents with these wire versions have answered."""
-    watch = StatusWatch(SwarmModel().bus("status"), lambda _: None)
+    observer = OutsideObserver(SwarmModel().bus("status"), lambda _: None)
     for id, wire in wire_versions.items():
         info = msgspec.structs.replace(INFO, role="agent", id=id, wire_version=wire)
-        watch.take(Replied("status-run", RUN, {}, info), 0)
-    watch.take(AskEnded("status-run", RUN, len(wire_versions), None), 0)
-    status = watch.status(0)
+        observer.take(Replied("observer-run", RUN, {}, info), 0)
+    observer.take(AskEnded("observer-run", RUN, len(wire_versions), None), 0)
+    status = status_of(observer, 0)
     assert status is not None
     return status
 
@@ -37,7 +38,7 @@ def printed(status: Status) -> str:
 
 
 def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version() -> None:
-    status = status_of(a0=8, a1=9, a2=9)
+    status = told_by(a0=8, a1=9, a2=9)
     assert "an upgrade is under way: wire version 9, but 8 of agent-a0" in printed(status)
     assert {each["id"]: each["wire_version"] for each in status_fields(status)["processes"]} == {
         "a0": 8, "a1": 9, "a2": 9,
@@ -45,11 +46,11 @@ def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version()
 
 
 def test_where_all_speak_one_version_nothing_is_said_of_it() -> None:
-    assert "wire version" not in printed(status_of(a0=9, a1=9))
+    assert "wire version" not in printed(told_by(a0=9, a1=9))
 
 
 def test_a_process_whose_version_is_no_neighbour_of_the_run_s_is_a_stranger() -> None:
-    status = status_of(a0=10, a1=8, a2=8)
+    status = told_by(a0=10, a1=8, a2=8)
     assert [info.id for info in status.strangers] == ["a0"]
     assert "stranger agent-a0 answers for run run, terrain" in printed(status)
     assert "wire version 10" in printed(status)

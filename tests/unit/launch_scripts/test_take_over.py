@@ -21,7 +21,8 @@ from launch_scripts.launcher.options import common_run_id
 from launch_scripts.launcher.supervisor import Running
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.launcher.up_options import UpOptions
-from launch_scripts.observe.latest_state import Observed
+from launch_scripts.observe.latest_state import LatestState
+from launch_scripts.observe.plan import RunPlan
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -240,7 +241,7 @@ def test_who_writes_a_file_is_found_and_who_reads_it_is_not(tmp_path: Path, mode
 
 @pytest.mark.network
 def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_path: Path) -> None:
-    observed = Observed(GridSpec(4, 5, 30.0))
+    observed = LatestState(RunPlan((), (), 0), GridSpec(4, 5, 30.0))
     before = MachineSignals(UpOptions(Scenario(), tmp_path, metrics_port=0), "run-1", list)
     options = UpOptions(Scenario(), tmp_path, metrics_port=int(before.url.split(":")[2].partition("/")[0]))
     with pytest.raises(BusError, match="Address already in use"):

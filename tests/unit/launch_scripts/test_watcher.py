@@ -182,7 +182,7 @@ def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_a
     keeper.publish(ORDERS, Orders(role="keeper", id="0", orders=(order,)), role="keeper", id="0")
     part.swarm.run(1.0)
     part.watcher.listen(0.0)
-    assert "late" in part.known.book.targets(SCENARIO)
+    assert "late" in part.known.observed.book.targets(SCENARIO)
 
 
 def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machine_is_not() -> None:
@@ -192,7 +192,7 @@ def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machin
     now_ns = 100 * NS_PER_S
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), True, now_ns)
-        known.heard(figures(spec, now_ns), {}, now_ns)
+        known.heard(figures(spec, now_ns), now_ns)
     assert known.alarms(now_ns) == ()
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), False, now_ns)
@@ -209,7 +209,7 @@ def test_its_table_has_a_line_for_each_process_or_where_room_lacks_for_each_role
     for spec in known.own:
         known.alive(Peer(spec.role, spec.id, 7), True, 0)
         for stamp_ns in (1, NS_PER_S):
-            known.heard(figures(spec, stamp_ns), {}, stamp_ns)
+            known.heard(figures(spec, stamp_ns), stamp_ns)
     console = Console(width=80, height=height, record=True)
     console.print(known.table("x", NS_PER_S, console))
     text = console.export_text()

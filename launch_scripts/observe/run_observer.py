@@ -1,0 +1,299 @@
+"""The one observer of a running swarm: hears it on the bus, and keeps what it hears in a `LatestState` or recorder.
+
+`RunObserver` is for those who know the run: launcher, live view, simulation. `OutsideObserver` is for commands
+which know the namespace alone: `status`, `top`, `metrics`. It asks who takes part, goes by the run that most of the
+answers name, and makes the state from what they say. Both only listen: nothing in the swarm waits for them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Protocol
+
+from launch_scripts.observe.latest_state import LatestState
+from launch_scripts.observe.plan import plan_of_members, run_of_most
+from shared_map.terrain.places import MapFrame
+from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.client.frame import Frame
+from swarm.clock import NS_PER_S, Clock
+from swarm.errors import BusError, ConfigError
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.membership import NO_RUN
+from swarm.wire.messages import Message, Nothing
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import FLEET, FOLLOWED, LEAD, MARKS, NOTE, ORDERS, POSE, RUN, STATS, STATUS, Topic
+from swarm.wire.versions import are_neighbours
+
+TRACK_S = 0.5
+"""Places are sampled so often."""
+ROUTES_S = 2.0
+"""Of the routes that a vehicle begins within this time, the newest is kept."""
+HEARD: Mapping[Topic, float] = {STATS: 0.0, STATUS: 0.0, POSE: 0.0, LEAD: 0.5, ORDERS: 0.5, FLEET: 0.4}
+"""The topics of a `LatestState`, and how often the newest of each key is taken, in seconds; 0 for all that comes.
+Places are sampled every 0.5 s, and each sample must find newer ones: else all vehicles seem to stand at times."""
+RECORDED: Mapping[Topic, float] = {**HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S}
+"""The topics of a `Recorder`, likewise."""
+
+_GONE, _RUN = "observer-gone", "observer-run"
+"""Tags of two questions: what processes that are gone have said last, and who takes part."""
+_ASK_EVERY_NS, _ASK_TIMEOUT_S = 5 * NS_PER_S, 1.0
+_EVENTS_AT_ONCE = 5000
+"""Taken in at most when the time to listen is over: the caller has something to show."""
+_EARLY = 100_000
+"""Messages kept at most until a run is known."""
+
+
+class Known(Protocol):
+    """A keeper of what is heard, such as `LatestState` or `Recorder`."""
+
+    def heard(self, message: Message, now_ns: int) -> object:
+        """Takes in a message."""
+
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        """A liveliness token rose or fell."""
+
+
+class RunObserver:
+    """Hears a run for one keeper. The owner of the bus passes on the events that `post` is given (`take`).
+
+    topics  topic -> how often the newest of each key is taken, in seconds; 0: all that comes
+    """
+
+    def __init__(self, bus: Bus, post: Post, known: Known, topics: Mapping[Topic, float] = HEARD) -> None:
+        self._bus, self._post = bus, post
+        self._known = known
+        self._topics = {topic.name: topic for topic in topics}  # by name: a topic is slow to hash
+        self._every_ns = {topic.name: int(seconds * NS_PER_S) for topic, seconds in topics.items()}
+        self._due_ns = dict.fromkeys(self._topics, 0)
+
+    def subscribe(self) -> None:
+        """Has each sample posted as it comes."""
+        for name, topic in self._topics.items():
+            self._bus.subscribe(topic, self._post, every_s=self._every_ns[name] / NS_PER_S)
+        self._bus.watch_alive(self._post)
+
+    def collect(self, topics: Iterable[Topic] = ()) -> None:
+        """Has samples kept until they are `due`: none wakes a thread, and what is passed over is not decoded.
+
+        topics  if given, only these: the owner collects the others, from some senders
+        """
+        for topic in topics or self._topics.values():
+            self._bus.collect(topic)
+        self._bus.watch_alive(self._post)
+
+    def ask_gone(self, **of: str) -> None:
+        """Asks what processes that are gone have said last; `of` names one of them."""
+        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_TIMEOUT_S, **of)
+
+    def pace(self, topic: Topic, every_s: float, now_ns: int) -> None:
+        """Takes a topic so often from now on."""
+        self._every_ns[topic.name] = int(every_s * NS_PER_S)
+        self._due_ns[topic.name] = now_ns + self._every_ns[topic.name]
+
+    def due(self, now_ns: int, *, all: bool = False) -> Iterator[Heard]:
+        """What was collected and is due, to be taken in (`take`): one topic after the other, as the bus keeps no
+        order between topics either.
+
+        all  also what is not due yet
+        """
+        for name, topic in self._topics.items():
+            if all or now_ns >= self._due_ns[name]:
+                self._due_ns[name] = now_ns + self._every_ns[name]
+                yield from self._bus.collected(topic)
+
+    def take(self, event: Event, now_ns: int) -> None:
+        """Takes in one event."""
+        match event:
+            case Heard(message=message) | Replied(tag="observer-gone", message=message):
+                self._known.heard(message, now_ns)
+            case Appeared(peer):
+                self._known.alive(peer, True, now_ns)
+            case Disappeared(peer):
+                self._known.alive(peer, False, now_ns)
+
+
+class OutsideObserver(RunObserver):
+    """Observes whatever run is in a namespace, without its scenario. What comes before its members have answered is
+    kept, and taken in then: only they know on which terrain poses are.
+
+    latest   the newest of the run; None before its members have answered
+    answers  what each process has answered last, of whatever run; routers belong to none
+    follows  goes on to the next run in the namespace; else it is `over` with the first
+    post     is given the events of the bus; None: they wait for `listen`
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        post: Post | None = None,
+        topics: Mapping[Topic, float] = HEARD,
+        *,
+        follows: bool = False,
+    ) -> None:
+        self._inbox = Inbox()
+        super().__init__(bus, post or self._inbox.post, self, topics)
+        self.latest: LatestState | None = None
+        self.run: RunInfo | None = None
+        """The first answer of a process of the run that is observed; None before one is found."""
+        self.answered = False
+        """Whether all who would answer a question have."""
+        self.over = False
+        """Whether all who answer belong to another run by now. Set for good."""
+        self.answers: dict[tuple[str, str], RunInfo] = {}
+        self._follows = follows
+        self._early: deque[Callable[[LatestState], object]] = deque(maxlen=_EARLY)
+        self._up: set[Peer] = set()
+        self._round: list[RunInfo] = []
+        self._ask_due_ns = 0
+        self._asking = False
+        self.subscribe()
+        self.ask_gone()
+
+    def tick(self, now_ns: int) -> None:
+        """Asks who takes part, if it is time to. Call it often."""
+        if now_ns >= self._ask_due_ns and not self._asking:
+            self._asking = True
+            self._bus.ask(RUN, Nothing(), self._post, tag=_RUN, timeout_s=_ASK_TIMEOUT_S)
+
+    def listen(self, clock: Clock, for_s: float) -> None:
+        """Takes in what arrives within some seconds, and what came before."""
+        until_s = time.monotonic() + for_s
+        for taken in itertools.count():
+            self.tick(clock.now_ns())
+            left_s = until_s - time.monotonic()
+            event = self._inbox.take(min(max(left_s, 0.0), 0.2))
+            if event is not None:
+                self.take(event, clock.now_ns())
+            if left_s <= 0 and (event is None or taken > _EVENTS_AT_ONCE):
+                return
+
+    def take(self, event: Event, now_ns: int) -> None:
+        """Takes in one event."""
+        match event:
+            case Replied(tag="observer-run", message=RunInfo() as info):
+                self._round.append(info)
+            case AskEnded(tag="observer-run"):
+                self._go_by(self._round, now_ns)
+                self._round, self._asking, self.answered = [], False, True
+                self._ask_due_ns = now_ns + (_ASK_EVERY_NS if self.run is not None else 0)
+            case _:
+                super().take(event, now_ns)
+
+    def heard(self, message: Message, now_ns: int) -> None:
+        """Takes in a message, also later if the run is not known yet."""
+        self._learn(lambda latest: latest.heard(message, now_ns))
+
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        """A liveliness token rose or fell; of a process that is gone its last words are asked for, as it may have
+        gone before it said anything to us."""
+        (self._up.add if up else self._up.discard)(peer)
+        if not up:
+            self.ask_gone()
+        self._learn(lambda latest: latest.alive(peer, up, now_ns))
+
+    def _learn(self, told: Callable[[LatestState], object]) -> None:
+        if self.run is None:
+            self._early.append(told)
+        if self.latest is not None:
+            told(self.latest)
+
+    def members(self) -> tuple[list[RunInfo], list[RunInfo]]:
+        """The answers of the processes of the run, routers last, which belong to none; and those of strangers: of
+        another run, on other terrain, or of a build that is too old or too new for the run."""
+        run = run_of_most(self.answers.values())
+        found = sorted(self.answers.values(), key=lambda info: (not info.run_id, info.role, info.id))
+        of_run = [info for info in found if (info.run_id, info.terrain) == run]
+        [(wire, _)] = Counter(info.wire_version for info in of_run or found).most_common(1)
+        strangers = [
+            info
+            for info in found
+            if info.run_id and not (info in of_run and are_neighbours(info.wire_version, wire))
+        ]
+        return [info for info in found if info not in strangers], strangers
+
+    @property
+    def whole(self) -> bool:
+        """Whether each process that has answered has also said what it counts, and each agent where it drives."""
+        latest = self.latest
+        return self.answered and all(
+            latest is not None
+            and latest.newest_stats(info.role, info.id) is not None
+            and (info.role != "agent" or latest.tells_of_vehicles(info.id))
+            for info in self.answers.values()
+        )
+
+    def _go_by(self, answers: list[RunInfo], now_ns: int) -> None:
+        """Goes by the answers of one round: by those of the run that is observed, or else of the run of most."""
+        of_run = [info for info in answers if info.run_id]
+        if self.run is not None:
+            mine = [info for info in of_run if info.run_id == self.run.run_id]
+            if mine and self.latest is not None:
+                self.answers |= {(info.role, info.id): info for info in mine}
+                self.latest.plan = plan_of_members(self.members()[0])
+                return
+            if not of_run or not self._follows:
+                self.over = self.over or bool(of_run)
+                return
+        if not answers:
+            return
+        self.answers = {(info.role, info.id): info for info in answers}
+        members, _ = self.members()
+        frame = frame_of_members(members)
+        latest = LatestState(plan_of_members(members), GridSpec(1, 1, 1.0) if frame is None else frame.grid)
+        for told in self._early:
+            told(latest)
+        if self.run is not None:
+            for peer in self._up:
+                latest.alive(peer, True, now_ns)
+        if members[0].run_id:
+            self.run = members[0]
+            self._early.clear()
+        self.latest = latest
+
+
+# --- who takes part, and where ------------------------------------------------------------------------------------
+
+
+def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
+    """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
+    inbox = Inbox()
+    bus.ask(RUN, Nothing(), inbox.post, tag=_RUN, timeout_s=timeout_s)
+    found: list[RunInfo] = []
+    deadline_s = time.monotonic() + timeout_s + 1.0
+    while time.monotonic() < deadline_s:
+        match inbox.take(0.1):
+            case Replied(message=RunInfo() as info):
+                if routers or info.run_id != NO_RUN:
+                    found.append(info)
+            case AskEnded():
+                break
+    return found
+
+
+def frame_of_run(bus: Bus, where: object) -> MapFrame:
+    """The frame of the run in the namespace. Raises BusError if no process of one answers.
+
+    where  names the swarm in errors
+    """
+    frame = frame_of_members(ask_run(bus))
+    if frame is None:
+        raise BusError(f"nobody {where} says which terrain the swarm is on")
+    return frame
+
+
+def frame_of_members(members: Sequence[RunInfo]) -> MapFrame | None:
+    """The frame that most of the answers tell of; None if none does."""
+    grids = Counter(grid for info in members if (grid := _grid_of(info)) is not None)
+    return MapFrame(grids.most_common(1)[0][0]) if grids else None
+
+
+def _grid_of(info: RunInfo) -> GridSpec | None:
+    try:
+        return Frame.of(info).grid if info.rows else None
+    except ConfigError:
+        return None
