@@ -209,7 +209,7 @@ def _up(
     run_id: str | None = None,
     take_over: bool = False,
 ) -> None:
-    from launch_scripts.launcher.busy_line import busy_loading
+    from launch_scripts.launcher.console import busy_loading
     from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long. `entry` has done so where it could.
@@ -220,8 +220,8 @@ def _up(
         import msgspec
 
         from launch_scripts.launcher import options
+        from launch_scripts.launcher.options import UpOptions, chosen_processes
         from launch_scripts.launcher.up import run_swarm
-        from launch_scripts.launcher.up_options import UpOptions, chosen_processes
         from launch_scripts.process_table import ROLES
 
     scenario = options.find_scenario(name)

@@ -13,8 +13,8 @@ from rich.text import Text
 
 from launch_scripts.check import ground, needs, settings
 from launch_scripts.check.findings import STYLES, Finding, as_fields, counted, failure, warning
+from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import scenario_path, with_port
-from launch_scripts.launcher.progress import progress
 from launch_scripts.ports import check_ports
 from launch_scripts.process_table import ROLES
 from swarm.config.input_files import FileKind, read_text, size

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.launcher.terminal import REPORTED
+from launch_scripts.launcher.console import REPORTED
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
 from launch_scripts.report.results.compare import (

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from launch_scripts.launcher.progress import progress
+from launch_scripts.launcher.console import progress
 from launch_scripts.observe.run_folder import find_run
 from launch_scripts.plain_text import plain
 from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run, unreadable

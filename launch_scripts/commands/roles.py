@@ -190,9 +190,9 @@ def run_role(
 
     from launch_scripts.launcher import options
     from launch_scripts.launcher.child import load_entry
-    from launch_scripts.launcher.lives import next_life
+    from launch_scripts.launcher.console import progress
     from launch_scripts.launcher.log_file import Speaker, log_to
-    from launch_scripts.launcher.progress import progress
+    from launch_scripts.launcher.options import next_incarnation
     from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import ENTRIES, processes_of
@@ -244,7 +244,7 @@ def run_role(
     if role != "router":
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
-    life = next_life(run_dir, role, id)
+    life = next_incarnation(run_dir, role, id)
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(
         scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health

@@ -21,8 +21,8 @@ def simulate_once(
     """Run a scenario without faults, print its report and leave a run's folder in `runs`."""
     import msgspec
 
+    from launch_scripts.launcher.console import Terminal
     from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
-    from launch_scripts.launcher.terminal import Terminal
     from launch_scripts.observe.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
     from launch_scripts.simulation.simulate import simulate as run_simulation

@@ -1,29 +1,46 @@
-"""Turns command-line options into a scenario: names, overrides, endpoints, ports."""
+"""What a run is started with: a scenario by name, options of the command line, which processes, in which folder."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import fcntl
 import hashlib
 import os
 import secrets
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
 
+from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
-from launch_scripts.process_table import certificate_name
+from launch_scripts.process_table import (
+    ENTRIES,
+    RECORDED_BESIDE,
+    ROLES,
+    ProcessSpec,
+    certificate_name,
+    processes_of,
+)
+from launch_scripts.web.loopback_guard import LOOPBACK
 from shared_map.importers.sources import is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
-from swarm.config.explain import explain, nearest
+from swarm.config.explain import choice, explain, nearest
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes, shown
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
+from swarm.liveness import split_rank
 from swarm.wire.fields import check_id
 
+_AS_MANY_AS_WANTED = ("router", "keeper")
+"""Roles of which a run may have more processes than its scenario says."""
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
@@ -163,6 +180,9 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
 
 
+_HIGHEST = 1 << 61
+_DIGITS = 20
+"""Of the number in a file of incarnations, which is always as long."""
 _LATER_KEYS = (("map", "plot_regions"),)
 """Sections and keys that the version before does not know: at their default they change no id, so that parts of
 both versions agree on one."""
@@ -198,3 +218,129 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
         why = "it is not a folder" if runs.is_file() else error.strerror or error
         raise StoreError(f"cannot make a run folder in {runs}: {why}; choose another with --runs") from error
     return run_dir.resolve()
+
+
+def next_incarnation(run_dir: Path, role: str, id: str) -> int:
+    """The incarnation of a process that starts now: nanoseconds since 1970, and in any case higher than that of
+    every earlier start in this run's folder. Raises StoreError if the folder cannot be written.
+
+    So a restart is the later one although the clock was put back meanwhile.
+    """
+    path = run_dir / "lives" / f"{role}-{id}"
+    try:
+        path.parent.mkdir(exist_ok=True)
+        file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)  # of two that start at once each gets a number of its own
+            last = 0
+            with contextlib.suppress(ValueError):  # cut short by a full disk
+                last = min(int(os.pread(file, _DIGITS, 0) or b"0"), _HIGHEST)
+            incarnation = max(time.time_ns(), last + 1)
+            # In place and always as long: so a full disk keeps nobody from a second one.
+            if os.pwrite(file, b"%0*d" % (_DIGITS, incarnation), 0) != _DIGITS:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(file)
+        finally:
+            os.close(file)
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    return incarnation
+
+
+@dataclass(frozen=True, slots=True)
+class UpOptions:
+    """Options of a run.
+
+    joins          there is a router elsewhere: none is started here
+    rank           of planners and the targets process, start only those of this rank; if None all
+    run_id         the run to take part in; if None it is made or found
+    began_s        time.monotonic() at which the command was given
+    table          start these processes only; if None all of `roles`
+    metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
+    signals_address  of this machine, on which that port is opened
+    log_format     of all logs of this machine
+    record_inputs  of every process, for `swarm replay`
+    takes_over     from the launcher that runs this part of the run here
+    """
+
+    scenario: Scenario
+    runs: Path
+    roles: tuple[str, ...] = ROLES
+    joins: bool = False
+    rank: int | None = None
+    run_id: str | None = None
+    as_json: bool = False
+    plain: bool = False
+    began_s: float = field(default_factory=time.monotonic)
+    table: tuple[ProcessSpec, ...] | None = None
+    record_inputs: bool = False
+    metrics_port: int | None = None
+    takes_over: bool = False
+    signals_address: str = LOOPBACK
+    log_format: LogFormat = "text"
+
+    @property
+    def is_new(self) -> bool:
+        """Whether the run begins here, with all of its processes."""
+        return not self.joins and self.is_whole and self.run_id is None and not self.takes_over
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing but a router may be lacking."""
+        return set(ROLES[1:]) <= set(self.roles) and self.rank is None and self.table is None
+
+    @property
+    def records(self) -> bool:
+        """Whether this launcher, alone of all of the run, records and reports it. Raises ConfigError where there is
+        no process to start."""
+        return any(spec.name == RECORDED_BESIDE for spec in table_of(self))
+
+    @property
+    def asks_for_ground(self) -> bool:
+        """Whether files of the terrain may be missing here, as a keeper elsewhere hands the base map out."""
+        return self.joins or not (self.is_whole or "keeper" in self.roles)
+
+    @property
+    def ranks_of_added(self) -> list[int]:
+        """Which planners of a target that is added while the swarm runs are started here: as those of the
+        scenario's first target, so that each starts on one machine, and those of one target apart."""
+        if self.table is None:
+            ranks = range(self.scenario.standbys.planner + 1) if "planner" in self.roles else ()
+            return [rank for rank in ranks if self.rank in (None, rank)]
+        ids = [split_rank(spec.id) for spec in self.table if spec.role == "planner"]
+        return [rank for target, rank in ids if target == self.scenario.target_ids[0]]
+
+
+def table_of(options: UpOptions) -> list[ProcessSpec]:
+    """The processes to start here. Raises ConfigError if there are none."""
+    table = processes_of(options.scenario, options.roles, options.rank)
+    if options.table is not None:
+        table = list(options.table)
+    if not table:
+        of_rank = "" if options.rank is None else f" of rank {options.rank}"
+        raise ConfigError(
+            f"scenario {options.scenario.name} has no {' or '.join(options.roles)}{of_rank}; see standbys"
+        )
+    return table
+
+
+def chosen_processes(scenario: Scenario, words: Sequence[str], rank: int | None) -> list[ProcessSpec]:
+    """The processes that `--only` names, in order of start: of a role, or `ROLE.ID` alone. Routers and keepers may
+    have any id, as there may be more of them than in the scenario. Raises ConfigError where there is none."""
+    chosen: dict[str, ProcessSpec] = {}
+    for word in words:
+        role, _, id = word.partition(".")
+        if role not in ROLES:
+            raise ConfigError(f"--only: no role {role!r}{choice(role, ROLES, ' the roles are ')}")
+        every = processes_of(scenario, (role,), rank)
+        if id:
+            ids = [spec.id for spec in processes_of(scenario, (role,))]
+            if id not in ids and role not in _AS_MANY_AS_WANTED:
+                raise ConfigError(f"--only: no {role} {id!r} in scenario {scenario.name}; it has {', '.join(ids)}")
+            try:
+                check_id("--only", id)
+            except ValueError as error:
+                raise ConfigError(str(error)) from error
+            every = [ProcessSpec(role, id, ENTRIES[role])]
+        chosen |= {spec.name: spec for spec in every}
+    return sorted(chosen.values(), key=lambda spec: ROLES.index(spec.role))

@@ -8,8 +8,7 @@ from typing import Any
 from rich.console import Console, Group
 from rich.text import Text
 
-from launch_scripts.launcher.live_table import SHOWN_ALARMS
-from launch_scripts.launcher.loads_table import loads_table
+from launch_scripts.launcher.tables import SHOWN_ALARMS, loads_table
 from launch_scripts.observe.alarms import Alarm, alarms_of
 from launch_scripts.observe.facts import lines_of
 from launch_scripts.observe.latest_state import LatestState

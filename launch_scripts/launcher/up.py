@@ -2,38 +2,55 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from launch_scripts.check.ground import check_places
 from launch_scripts.check.settings import check_start
+from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
-from launch_scripts.launcher.leave_report import ELSEWHERE, leave_report
-from launch_scripts.launcher.live_table import live_table, plain_line
-from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.machine_signals import MachineSignals
-from launch_scripts.launcher.options import as_process, make_run_dir
+from launch_scripts.launcher.options import (
+    UpOptions,
+    as_process,
+    common_run_id,
+    make_run_dir,
+    new_run_id,
+    next_incarnation,
+    table_of,
+)
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.own_part import OwnPart
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.stop_signals import StopAsked
 from launch_scripts.launcher.supervisor import Ending, LocalSwarm
+from launch_scripts.launcher.tables import live_table, plain_line
 from launch_scripts.launcher.takeover import TakeOver
+<<<<<<< HEAD
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.watcher import Watcher, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.observe import facts
+=======
+from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
+from launch_scripts.observe import facts
+from launch_scripts.observe.disk_watch import DiskWatch
+from launch_scripts.observe.plan import plan_of_members
+>>>>>>> 6b5b5f01 (One console, one set of tables and one module of options for the launcher)
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.ports import check_ports, page_of
-from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec
+from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, ProcessSpec
+from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
 from shared_map.terrain.prepared import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
@@ -50,6 +67,7 @@ from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +76,8 @@ _CALM_TURN_S = 0.1
 """Once all processes are up: each turn takes a third of a millisecond."""
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
+_ELSEWHERE = f"the run is recorded and reported by the launcher that starts {RECORDED_BESIDE}"
+"""Said by all others."""
 
 
 class _RefusedError(SwarmError):
@@ -76,7 +96,7 @@ def run_swarm(options: UpOptions) -> int:
     check_plugins(options.scenario, options.roles)
     if not options.joins and not options.takes_over:
         check_ports(options.scenario, options.roles)
-    run_id, started_ns = run_id_of(options)
+    run_id, started_ns = _run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log", options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
@@ -92,6 +112,21 @@ def run_swarm(options: UpOptions) -> int:
 def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
     """The processes that are started here, in words."""
     return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
+
+
+def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
+    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario. With
+    the id comes when the run began, if it runs already."""
+    found: list[RunInfo] = []
+    if options.joins or options.takes_over:
+        log_to(None, options.log_format)  # it may have to wait, and says so
+        found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
+    run_id = options.run_id
+    if run_id is None and options.is_whole and not options.takes_over:
+        run_id = new_run_id()
+    elif run_id is None:
+        run_id = found[0].run_id if found else common_run_id(options.scenario)
+    return run_id, plan_of_members(info for info in found if info.run_id == run_id).started_ns
 
 
 class _Run:
@@ -228,7 +263,7 @@ class _Run:
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
-            incarnation=next_life(self._run_dir, spec.role, spec.id),
+            incarnation=next_incarnation(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,
@@ -407,17 +442,24 @@ class _Run:
         if self._options.records:
             self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
         else:
-            self._terminal.say(f"router at {router}; logs in {self._run_dir}; {ELSEWHERE}")
+            self._terminal.say(f"router at {router}; logs in {self._run_dir}; {_ELSEWHERE}")
 
     def _report(self, known: Recorder | OwnPart, seconds: float) -> bool:
-        leave_report(
-            known,
-            self._terminal,
-            self._run_dir,
-            (self._terrain, self._truth),
-            as_json=self._options.as_json,
-            run_id=self._run_id,
-            seconds=seconds,
-            startup_s=self._startup_s,
-        )
+        """Prints the numbers of the run and writes its report; of a part says where that is. Raises StoreError."""
+        measured: dict[str, Any] = {"run_id": self._run_id, "seconds": seconds, "startup_s": self._startup_s}
+        as_json = self._options.as_json
+        if isinstance(known, OwnPart):
+            if as_json:
+                self._terminal.print_json(json.dumps(known.report(**measured), indent=2))
+            else:
+                self._terminal.say(f"{_ELSEWHERE}; in {self._run_dir} are the logs of this machine's processes")
+            return True
+        report = make_report(known, self._terrain, **measured)
+        numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
+        if as_json:
+            self._terminal.print_json(json.dumps(numbers, indent=2))
+        else:
+            self._terminal.report(numbers)
+        # The figures come first: a full disk keeps nobody from them.
+        write_report(self._run_dir, report, known, self._terrain, truth=self._truth)
         return True

@@ -9,7 +9,7 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.launcher.live_table import columns, targets_table
+from launch_scripts.launcher.tables import columns, targets_table
 from launch_scripts.observe import facts
 from launch_scripts.observe.counts import gaps_to
 from launch_scripts.observe.latest_state import LatestState

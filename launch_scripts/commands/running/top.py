@@ -16,9 +16,9 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from launch_scripts.launcher.lasting_output import make_output_last
-from launch_scripts.launcher.live_table import fitted
-from launch_scripts.launcher.loads_table import loads_table
+from launch_scripts.launcher.console import make_output_outlive_readers
+from launch_scripts.launcher.tables import fitted
+from launch_scripts.launcher.tables import loads_table
 from launch_scripts.observe import facts
 from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.process_load import ProcessLoad, by_role
@@ -42,7 +42,7 @@ _SHOWN_ALARMS = 3
 
 def top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_json: bool) -> None:
     """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if nobody answers at the beginning."""
-    make_output_last()
+    make_output_outlive_readers()
     console = Console(highlight=False)
     moving = console.is_terminal and not as_json and not once
     with open_bus(network) as bus, _quietly(), _keys() if moving else contextlib.nullcontext():

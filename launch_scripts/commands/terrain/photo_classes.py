@@ -20,7 +20,7 @@ from launch_scripts.commands.terrain.terrain_options import (
     draw_terrain,
     print_shares,
 )
-from launch_scripts.launcher.progress import progress
+from launch_scripts.launcher.console import progress
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario

@@ -30,7 +30,7 @@ from launch_scripts.commands.terrain.terrain_options import (
     draw_terrain,
     print_shares,
 )
-from launch_scripts.launcher.progress import progress
+from launch_scripts.launcher.console import progress
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario

@@ -21,7 +21,7 @@ from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
 from launch_scripts.deploy.plan import Plan, make_plan
 from launch_scripts.deploy.revocations import revoke
 from launch_scripts.deploy.service_files import UNIT, systemd_files
-from launch_scripts.launcher.up_options import chosen_processes
+from launch_scripts.launcher.options import chosen_processes
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.errors import StoreError
 

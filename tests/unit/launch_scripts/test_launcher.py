@@ -17,10 +17,10 @@ from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.forkserver import WarmUp, _find_missing, _find_nothing
+from launch_scripts.launcher.options import UpOptions, chosen_processes
 from launch_scripts.launcher.supervisor import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.takeover import has_ended
 from launch_scripts.launcher.up import run_swarm
-from launch_scripts.launcher.up_options import UpOptions, chosen_processes
 from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig

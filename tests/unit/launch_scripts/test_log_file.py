@@ -14,8 +14,8 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
+from launch_scripts.launcher.console import Terminal
 from launch_scripts.launcher.log_file import FORMAT, JsonLines, Speaker
-from launch_scripts.launcher.terminal import Terminal
 
 WRITER = """
 import logging, os, resource, signal, sys

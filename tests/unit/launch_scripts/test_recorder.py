@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from launch_scripts.launcher.live_table import plain_line
+from launch_scripts.launcher.tables import plain_line
 from launch_scripts.observe import facts
 from launch_scripts.observe.counts import CertifiedGap
 from launch_scripts.observe.history import Sample, Thinned, Tracks

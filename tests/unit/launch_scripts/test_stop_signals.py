@@ -91,7 +91,7 @@ _TALKER = """
 import logging, sys, time
 from pathlib import Path
 from launch_scripts.launcher.stop_signals import StopAsked
-from launch_scripts.launcher.terminal import Terminal
+from launch_scripts.launcher.console import Terminal
 
 asked, terminal, out = StopAsked(), Terminal(False, sys.argv[2] == "plain"), Path(sys.argv[1])
 with terminal.busy("driving"):

@@ -12,8 +12,8 @@ from rich.console import Console
 from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
+from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.own_part import OwnPart
-from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.launcher.watcher import Watcher
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of

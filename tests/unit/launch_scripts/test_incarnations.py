@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from launch_scripts.launcher import lives
-from launch_scripts.launcher.lives import next_life
+from launch_scripts.launcher import options
+from launch_scripts.launcher.options import next_incarnation
 from swarm.errors import StoreError
 
 
@@ -18,16 +18,17 @@ def test_every_start_is_a_later_life_though_the_clock_goes_back_forward_and_to_1
     hour_ns, now_ns = 3600 * 10**9, 1_800_000_000 * 10**9
     found = []
     for clock_ns in (now_ns, now_ns - hour_ns, 0, now_ns + hour_ns, now_ns):
-        monkeypatch.setattr(lives.time, "time_ns", lambda clock_ns=clock_ns: clock_ns)
-        found.append(next_life(tmp_path, "agent", "a0"))
+        monkeypatch.setattr(options.time, "time_ns", lambda clock_ns=clock_ns: clock_ns)
+        found.append(next_incarnation(tmp_path, "agent", "a0"))
     assert found == sorted(set(found))
-    assert next_life(tmp_path, "agent", "a1") == now_ns, "each process has lives of its own"
+    assert next_incarnation(tmp_path, "agent", "a1") == now_ns, "each process has lives of its own"
 
 
 def test_of_many_that_start_at_once_each_gets_a_number_of_its_own(tmp_path: Path) -> None:
     found: list[int] = []
     threads = [
-        threading.Thread(target=lambda: found.append(next_life(tmp_path, "planner", "t0"))) for _ in range(20)
+        threading.Thread(target=lambda: found.append(next_incarnation(tmp_path, "planner", "t0")))
+        for _ in range(20)
     ]
     for thread in threads:
         thread.start()
@@ -39,10 +40,10 @@ def test_of_many_that_start_at_once_each_gets_a_number_of_its_own(tmp_path: Path
 def test_a_file_that_holds_no_number_is_written_anew(tmp_path: Path) -> None:
     (tmp_path / "lives").mkdir()
     (tmp_path / "lives" / "agent-a0").write_text("garbage")
-    first = next_life(tmp_path, "agent", "a0")
-    assert next_life(tmp_path, "agent", "a0") > first
+    first = next_incarnation(tmp_path, "agent", "a0")
+    assert next_incarnation(tmp_path, "agent", "a0") > first
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence() -> None:
     with pytest.raises(StoreError, match="cannot write /proc/nowhere/lives/agent-a0"):
-        next_life(Path("/proc/nowhere"), "agent", "a0")
+        next_incarnation(Path("/proc/nowhere"), "agent", "a0")

@@ -1,0 +1,297 @@
+"""What a command shows on the terminal while it runs: lines, one table that is drawn anew, progress, and at the end
+where what it left is to be seen.
+
+Output outlives its reader: no run ends because a terminal is closed or `head` has enough.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import shutil
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from launch_scripts.plain_text import plain
+
+log = logging.getLogger(__name__)
+
+Tell = Callable[[str, float], None]
+"""Called with what is done and the share of it that is."""
+_PATIENCE_S = 1.0
+"""What takes less is not told of."""
+_PLAIN_EVERY_S = 5.0
+_BUSY_EVERY_S = 0.2
+_TABLE_EVERY_S = 1.0
+"""What the table shows is made once a second (`Recorder.shown`)."""
+_READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))
+"""Of a pipe, and of a terminal."""
+
+_FILES = (("report", "report.json"), ("report", "report.html"), ("picture", "report.png"))
+_LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
+REPORTED = {
+    "seconds": "seconds",
+    "startup_s": "start-up, s",
+    "processes": "processes",
+    "restarts": "restarts",
+    "vehicles_routed": "vehicles that had a route",
+    "captures": "captures",
+    "marks": "marks",
+    "reroute_requests": "re-route requests",
+    "routes_served": "routes served",
+    "stranded": "stranded at the end",
+    "lost": "lost at the end",
+    "collisions": "collisions",
+    "lethal_entries": "lethal cells entered",
+    "driven_into": "bodies driven into",
+    "hit_by_bodies": "vehicles hit by bodies",
+    "certified_gap": "certified gap",
+    "learned": "learned, times the prior pace",
+    "growth_ms": "growing a tree, ms",
+    "route_query_ms": "asking for a route, ms",
+    "mark_to_tree_ms": "from mark to tree, ms",
+    "body_ms": "from a body's report to being avoided, ms",
+    "messages_per_s": "messages/s",
+    "payloads_dropped": "payloads dropped",
+}
+
+
+class Terminal:
+    """Shows the progress of a run. With `as_json`, standard output stays free for the report.
+
+    lines  format of the lines that programs read instead of people; None: people read them
+    """
+
+    def __init__(self, as_json: bool, plain: bool, lines: logging.Formatter | None = None) -> None:
+        make_output_outlive_readers()
+        self._console = Console(stderr=as_json, highlight=False)
+        self._lines = lines
+        self._table = self._console.is_terminal and not plain and lines is None
+        self._live: Live | None = None
+        self._due_s = 0.0
+
+    def say(self, text: str, style: str | None = None) -> None:
+        """Prints one line, above the table if there is one, and logs it."""
+        level = _LEVELS.get(style or "", logging.INFO)
+        log.log(level, "%s", text)
+        if self._lines is not None:
+            text, style = self._lines.format(logging.LogRecord(__name__, level, "", 0, "%s", (text,), None)), None
+        self.print(Text(plain(text), style=style or ""))
+
+    def print(self, what: Any) -> None:
+        """Prints, if that is possible: a full disk ends no run. For a reader who has left see `OutlivingOutput`."""
+        try:
+            self._console.print(what, soft_wrap=True)  # whoever copies a line gets it whole
+            self._console.file.flush()
+        except OSError as error:
+            log.warning("cannot write the output: %s", error.strerror or error)
+
+    def busy(self, text: Callable[[], str] | str) -> contextlib.AbstractContextManager[None]:
+        """Shows what goes on in this block, and for how long, once it has taken a second."""
+        now = (lambda: text) if isinstance(text, str) else text
+        return _busy_line(self._console, self.say, now, changes=self._table and self._live is None)
+
+    def print_json(self, text: str) -> None:
+        """Prints the report on standard output."""
+        try:
+            print(text, flush=True)
+        except OSError as error:
+            self.say(f"cannot write the output: {error.strerror or error}", "red")
+
+    def due(self) -> bool:
+        """Whether it is time to show the next summary."""
+        return time.monotonic() >= self._due_s
+
+    def show(self, line: Callable[[], str], table_on: Callable[[Console], RenderableType]) -> None:
+        """Draws the table anew, or says the line where there is no table."""
+        self._due_s = time.monotonic() + (_TABLE_EVERY_S if self._table else _PLAIN_EVERY_S)
+        if not self._table:
+            self.say(line())
+            return
+        table = table_on(self._console)
+        with contextlib.suppress(OSError):  # of a terminal that is gone
+            if self._live is None:
+                self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
+                self._live.start()
+            self._live.update(table, refresh=True)
+
+    def report(self, numbers: Mapping[str, Any]) -> None:
+        """Prints the numbers of a finished run, for people: programs find them in its report."""
+        if self._lines is not None:
+            return
+        from launch_scripts.observe.certified_gap import gap_text  # not before there is a report
+
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for name, value in numbers.items():
+            if name in REPORTED and value != {}:  # of what nobody has learned there is no line
+                table.add_row(REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
+        self.print(table)
+
+    def close(self) -> None:
+        """Ends the live table and leaves its last state on the terminal."""
+        if self._live is not None:
+            with contextlib.suppress(OSError):
+                self._live.stop()
+            self._live = None
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "not measured"
+    if isinstance(value, dict):
+        return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
+    return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
+
+
+def busy_loading(*, as_json: bool, plain: bool) -> contextlib.AbstractContextManager[None]:
+    """Says so while the modules of a launcher are loaded, before there is a run whose terminal could."""
+    console = Console(stderr=as_json, highlight=False)
+    return _busy_line(console, console.print, lambda: "loading", changes=console.is_terminal and not plain)
+
+
+@contextlib.contextmanager
+def _busy_line(
+    console: Console, say: Callable[[str], None], text: Callable[[], str], *, changes: bool
+) -> Iterator[None]:
+    """Tells on a thread what goes on beside it, as the one at work may be in native code for seconds. What takes
+    less than a second is not told of.
+
+    say      prints a line that stays
+    text     what goes on, with counts where there are any; the seconds are added here
+    changes  whether the terminal can show a line that changes; otherwise a line is said every 5 s
+    """
+    began_s = time.monotonic()
+    over = threading.Event()
+
+    def now() -> str:
+        return f"{text()}, {time.monotonic() - began_s:.0f} s"
+
+    def tell() -> None:
+        if over.wait(_PATIENCE_S):
+            return
+        if not changes:
+            say(f"{now()} ...")
+            while not over.wait(_PLAIN_EVERY_S):
+                say(f"{now()} ...")
+            return
+        with contextlib.suppress(OSError), Live(console=console, auto_refresh=False, transient=True) as live:
+            while True:
+                live.update(Text(f"{now()} ...", style="dim", overflow="ellipsis", no_wrap=True), refresh=True)
+                if over.wait(_BUSY_EVERY_S):
+                    return
+
+    thread = threading.Thread(target=tell, name="busy-line", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(1.0)
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Tell]:
+    """Yields what draws one bar per kind of work, on a terminal only and after the first second."""
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+    started_s = time.monotonic()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as shown:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(what: str, share: float) -> None:
+            if what not in tasks:
+                if time.monotonic() - started_s < _PATIENCE_S:
+                    return
+                tasks[what] = shown.add_task(what, total=1.0)
+            shown.update(tasks[what], completed=share)
+
+        yield tell
+
+
+class OutlivingOutput:
+    """A text stream as it is, until its reader is gone: from then on what is written goes nowhere. Other errors, as
+    of a full disk, are raised as ever."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        self._survive(lambda: self._stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        self._survive(self._stream.flush)
+
+    def __getattr__(self, name: str) -> Any:  # all else that the stream has
+        return getattr(self._stream, name)
+
+    def _survive(self, work: Callable[[], object]) -> None:
+        """Lets the descriptor lead nowhere, for all who write to it: what still waits in the stream is lost there,
+        and not an error again at each flush up to the interpreter's end."""
+        try:
+            work()
+        except OSError as error:
+            if error.errno not in _READER_GONE:
+                raise
+            log.info("nobody reads the output any more: %s", error.strerror or error)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
+
+
+def make_output_outlive_readers() -> None:
+    """Let standard output and standard error of this process outlive their readers."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, OutlivingOutput):
+            setattr(sys, name, OutlivingOutput(stream))
+
+
+def what_is_left(run_dir: Path) -> list[str]:
+    """A line for each thing to look at that is there."""
+    lines = [f"{name}: {_shown(run_dir / file)}" for name, file in _FILES if (run_dir / file).is_file()]
+    return [*lines, *(f"recording: {_rerun_command()} {_shown(path)}" for path in _recordings(run_dir))]
+
+
+def _recordings(run_dir: Path) -> list[Path]:
+    """The recordings of a run, oldest first: more than one where the monitor was started again."""
+    found = [path for path in run_dir.glob("run*.rrd") if path.stat().st_size]
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
+def _rerun_command() -> str:
+    """How to call rerun's viewer from where this command was called."""
+    beside = Path(sys.executable).with_name("rerun")
+    return "rerun" if shutil.which("rerun") or not beside.exists() else _shown(beside)
+
+
+def tunnel(port: int) -> str:
+    """How to reach a page of this machine from another one."""
+    return f"ssh -N -L {port}:127.0.0.1:{port} {os.environ.get('USER', 'USER')}@{socket.gethostname()}"
+
+
+def _shown(path: Path) -> str:
+    """A path as one would type it here: relative to the present folder if it is below that."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return str(path)
