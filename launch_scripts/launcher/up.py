@@ -33,18 +33,9 @@ from launch_scripts.launcher.stop_signals import StopAsked
 from launch_scripts.launcher.supervisor import Ending, LocalSwarm
 from launch_scripts.launcher.tables import live_table, plain_line
 from launch_scripts.launcher.takeover import TakeOver
-<<<<<<< HEAD
-from launch_scripts.launcher.terminal import Terminal
-from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.watcher import Watcher, check_vacant
-from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.observe import facts
-=======
-from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
-from launch_scripts.observe import facts
-from launch_scripts.observe.disk_watch import DiskWatch
 from launch_scripts.observe.plan import plan_of_members
->>>>>>> 6b5b5f01 (One console, one set of tables and one module of options for the launcher)
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run

@@ -12,13 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-<<<<<<< HEAD
 from launch_scripts.commands.running.status import print_status, status_fields, status_of
-from launch_scripts.launcher.live_table import live_table
-=======
-from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
 from launch_scripts.launcher.tables import live_table
->>>>>>> 6b5b5f01 (One console, one set of tables and one module of options for the launcher)
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.details import _DOES
 from launch_scripts.monitor.service import MonitorService

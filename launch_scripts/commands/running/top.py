@@ -17,8 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from launch_scripts.launcher.console import make_output_outlive_readers
-from launch_scripts.launcher.tables import fitted
-from launch_scripts.launcher.tables import loads_table
+from launch_scripts.launcher.tables import fitted, loads_table
 from launch_scripts.observe import facts
 from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.process_load import ProcessLoad, by_role

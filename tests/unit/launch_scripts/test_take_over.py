@@ -20,13 +20,8 @@ from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.options import UpOptions, common_run_id
 from launch_scripts.launcher.supervisor import Running
 from launch_scripts.launcher.takeover import TakeOver, writing
-<<<<<<< HEAD
-from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.plan import RunPlan
-=======
-from launch_scripts.observe.latest_state import Observed
->>>>>>> 6b5b5f01 (One console, one set of tables and one module of options for the launcher)
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
