@@ -17,7 +17,7 @@ import msgspec
 
 from docs.generate.docstrings import prose
 from docs.generate.wire_page import number
-from swarm.config.describe import bare, hints_of, is_several, meanings, section_in
+from swarm.config.explain import bare, hints_of, is_several, meanings, section_in
 from swarm.config.scenario import Scenario
 
 PATH = Path(__file__).parents[2] / "docs" / "reference" / "scenario.md"

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from launch_scripts.command_line.usage import kind_of
-from swarm.config.describe import UNBOUNDED
+from swarm.config.explain import UNBOUNDED
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Of every command: what it inherits from the first."""

@@ -8,8 +8,7 @@ from typing import Any
 
 from typer.exceptions import TyperException
 
-from swarm.config.describe import UNBOUNDED
-from swarm.config.explain import choice, nearest
+from swarm.config.explain import UNBOUNDED, choice, nearest
 from swarm.config.input_files import shown
 
 

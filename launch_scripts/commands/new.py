@@ -12,11 +12,11 @@ from typing import Any
 import typer
 
 from launch_scripts.check import settings
-from swarm.config.commented import commented
-from swarm.config.describe import expected
+from swarm.config.explain import expected
 from swarm.config.input_files import shown
 from swarm.config.load import BUILT_IN_TERRAINS, read_scenario
 from swarm.config.values import MOST_PER_AGENT
+from swarm.config.write import commented
 from swarm.errors import ConfigError, StoreError
 
 _HEAD = """A scenario of terrain-swarm, written by `swarm new`. Every setting that is not here has its default; what

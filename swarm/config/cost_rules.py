@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import tomllib
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,7 @@ import msgspec
 from swarm.config.explain import nearest
 from swarm.config.ground import CostConfig
 from swarm.config.input_files import FileKind, read_text, shown
-from swarm.config.values import Preset, Slope, SlopeFactor
+from swarm.config.values import Slope, SlopeFactor
 from swarm.errors import ConfigError
 
 
@@ -31,63 +32,11 @@ class PresetRow(NamedTuple):
     settings: Mapping[str, Any]
 
 
-PRESETS: Mapping[Preset, PresetRow] = {
-    "hiker": PresetRow(
-        "a person on foot",
-        "Tobler (1993): 5.04 km/h on level paths, three fifths of it off them. The steepest slope is a judgement:"
-        " beyond 40 degrees hands are needed",
-        {
-            "slope_rule": "tobler",
-            "flat_speed_m_per_s": 0.84,
-            "road_speed_m_per_s": 1.4,
-            "max_slope_deg": 40.0,
-        },
-    ),
-    "wheeled": PresetRow(
-        "a car or lorry with all wheels driven",
-        "60 % of grade and 40 % of side slope are what the HMMWV is built for (its class of military vehicles is"
-        " tested at 60 %); rolling resistance of grass and firm soil after Wong, Theory of Ground Vehicles. Speeds,"
-        " the power reserve and the cost of a side slope are judgements",
-        {
-            "slope_rule": "energy",
-            "flat_speed_m_per_s": 10.0,
-            "road_speed_m_per_s": 20.0,
-            "rolling_resistance": 0.08,
-            "power_reserve": 3.0,
-            "cross_slope_factor": 2.0,
-            "max_slope_deg": 30.0,
-        },
-    ),
-    "tracked": PresetRow(
-        "a vehicle on tracks",
-        "60 % of grade as the M113 is built for; soft and broken ground slows tracks less than wheels, by how much"
-        " is a judgement, as are the speeds and the power reserve",
-        {
-            "slope_rule": "energy",
-            "flat_speed_m_per_s": 8.0,
-            "road_speed_m_per_s": 14.0,
-            "rolling_resistance": 0.08,
-            "power_reserve": 3.0,
-            "cross_slope_factor": 1.5,
-            "max_slope_deg": 30.0,
-            "class_factor": {"forest": 1.5, "rock": 2.0, "soil": 1.0, "snow": 1.5},
-        },
-    ),
-    "quadruped": PresetRow(
-        "a walking robot with four legs",
-        "the maker's data of Spot: 1.6 m/s at most, slopes to 30 degrees, steps to 0.3 m. The speed on open ground"
-        " and half of it on the steepest slope are judgements",
-        {
-            "slope_rule": "quadratic",
-            "flat_speed_m_per_s": 1.0,
-            "road_speed_m_per_s": 1.6,
-            "steep_factor": 2.0,
-            "max_slope_deg": 30.0,
-            "class_factor": {"rock": 1.5},
-        },
-    ),
+PRESETS: Mapping[str, PresetRow] = {
+    name: PresetRow(**row)
+    for name, row in tomllib.loads(Path(__file__).with_name("presets.toml").read_text("utf-8")).items()
 }
-"""Every preset; a new one is a row here and its name in `swarm.config.values.Preset`."""
+"""Every preset, by name, as `presets.toml` has it."""
 
 
 def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
@@ -97,7 +46,7 @@ def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
     """
     cost = raw.get("cost")
     name = cost.get("preset") if isinstance(cost, dict) else None
-    row = next((row for preset, row in PRESETS.items() if preset == name), None)
+    row = PRESETS.get(name) if isinstance(name, str) else None
     if not isinstance(cost, dict) or row is None:
         return raw
     settings = {**row.settings, **cost}
@@ -112,8 +61,7 @@ def cost_of_preset(name: str | None) -> CostConfig:
     if name is None:
         return CostConfig()
     if name not in PRESETS:
-        names: list[str] = list(PRESETS)
-        raise ConfigError(f"no preset {shown(name)}{nearest(name, names)}; there are {', '.join(names)}")
+        raise ConfigError(f"no preset {shown(name)}{nearest(name, list(PRESETS))}; there are {', '.join(PRESETS)}")
     return msgspec.convert(with_preset({"cost": {"preset": name}})["cost"], CostConfig)
 
 

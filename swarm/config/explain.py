@@ -1,29 +1,139 @@
-"""Errors of a scenario in terms of TOML: the key, what was found, what is allowed, what was probably meant."""
+"""What each setting means, by the rows of its section's docstring, and what its type allows, in words.
+
+Errors of a scenario are said in these terms: the key, what was found, what is allowed, what was probably meant.
+"""
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import re
+import types
 import typing
-from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from swarm.config.describe import UNBOUNDED, bare, expected, hints_of, is_section, is_several, section_in
 from swarm.config.input_files import shown
+
+# --- what a setting means and may be ------------------------------------------------------------------------------
+
+_ROW = re.compile(r"(\w+(?:, \w+)*) {2,}(\S.*)")
+_WORDS = {str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false"}
+UNBOUNDED = 1e12
+"""Limits beyond this keep numbers finite; they say nothing to a reader."""
+
+
+def meanings(section: type[msgspec.Struct]) -> dict[str, str]:
+    """Setting -> meaning, in the order of the rows of a section's docstring.
+
+    A row is `key` or several, two or more spaces and the meaning; lines that begin with spaces continue it.
+    """
+    found: dict[str, str] = {}
+    keys: list[str] = []
+    for line in (inspect.getdoc(section) or "").splitlines():
+        if row := _ROW.fullmatch(line):
+            keys = row[1].split(", ")
+            found |= dict.fromkeys(keys, row[2])
+        elif line.startswith(" ") and keys:
+            found |= {key: f"{found[key]} {line.strip()}" for key in keys}
+        else:
+            keys = []
+    return found
+
+
+@cache
+def hints_of(section: Any) -> Mapping[str, Any]:
+    """Setting, as a file names it -> its type, with its bounds."""
+    hints = typing.get_type_hints(section, include_extras=True)
+    if not is_section(section):
+        return hints
+    return {each.encode_name: hints[each.name] for each in msgspec.structs.fields(section)}
+
+
+def expected(hint: Any) -> str:
+    """What a type allows, in words: "a whole number, 0 to 9"."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        bounds = [word for meta in args[1:] if isinstance(meta, msgspec.Meta) for word in _bounds(meta)]
+        return ", ".join([expected(args[0]), *bounds])
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(expected(arg) for arg in args if arg is not type(None))
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, args))}"
+    if origin is tuple and args[-1] is not Ellipsis:
+        return f"[{', '.join(expected(arg) for arg in args)}]"
+    if origin is tuple:
+        return "a list"
+    if origin is dict or is_section(hint):
+        return "a table"
+    return _WORDS.get(hint, "something else")
+
+
+def _bounds(meta: msgspec.Meta) -> list[str]:
+    low, high = _limit(meta.ge), _limit(meta.le)
+    if meta.description is not None:
+        return [meta.description]
+    if meta.pattern is not None:
+        return ["digits"] if meta.pattern.startswith("^[0-9]{") else ["of letters, digits, '_', '.' and '-'"]
+    if meta.min_length is not None:
+        return ["not empty" if meta.min_length == 1 else f"of at least {meta.min_length}"]
+    if low is not None and high is not None:
+        return [f"{low} to {high}"]
+    if high is not None and meta.gt is not None:
+        return [f"more than {_limit(meta.gt)}, up to {high}"]
+    limits = (("at least", low), ("more than", _limit(meta.gt)), ("at most", high), ("less than", _limit(meta.lt)))
+    return [f"{word} {limit}" for word, limit in limits if limit is not None]
+
+
+def _limit(bound: float | None) -> str | None:
+    return None if bound is None or abs(bound) >= UNBOUNDED else f"{bound:.12g}"
+
+
+def bare(hint: Any) -> Any:
+    """A type without Annotated and None around it."""
+    while True:
+        origin = typing.get_origin(hint)
+        if origin is Annotated:
+            hint = typing.get_args(hint)[0]
+        elif origin in (types.UnionType, typing.Union):
+            hint = next(arg for arg in typing.get_args(hint) if arg is not type(None))
+        else:
+            return hint
+
+
+def is_section(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, msgspec.Struct)
+
+
+def section_in(hint: Any) -> Any:
+    """The section that a key holds, or holds several of; None if it holds values."""
+    hint = bare(hint)
+    if typing.get_origin(hint) is tuple:
+        hint = bare(typing.get_args(hint)[0])
+    elif typing.get_origin(hint) is dict:
+        hint = bare(typing.get_args(hint)[1])
+    return hint if is_section(hint) else None
+
+
+def is_several(hint: Any) -> bool:
+    """Whether a key holds several sections."""
+    return typing.get_origin(bare(hint)) is tuple and section_in(hint) is not None
+
+
+# --- errors -------------------------------------------------------------------------------------------------------
 
 _LONGEST_LIST = 200
 """Characters of a list of allowed words; where one of them is near, a longer list says nothing more."""
+_SECONDS = {"s": 1, "sec": 1, "ms": 0.001, "m": 60, "min": 60, "h": 3600}
 _UNITS: tuple[tuple[str, dict[str, float]], ...] = (
-    ("_s_per_m", {"s/m": 1}),
-    ("_m_per_s", {"m/s": 1, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6}),
-    ("_hz", {"hz": 1, "khz": 1000}),
-    ("_deg", {"deg": 1, "degrees": 1, "°": 1}),
-    ("_m", {"m": 1, "metres": 1, "meters": 1, "km": 1000, "cm": 0.01}),
-    ("_s", {"s": 1, "sec": 1, "seconds": 1, "ms": 0.001, "m": 60, "min": 60, "minutes": 60, "h": 3600}),
-    ("seconds", {"s": 1, "sec": 1, "seconds": 1, "ms": 0.001, "m": 60, "min": 60, "minutes": 60, "h": 3600}),
-    ("", {"%": 0.01}),
+    ("_m_per_s", {"m/s": 1, "km/h": 1 / 3.6, "kmh": 1 / 3.6}),
+    ("_m", {"m": 1, "km": 1000}),
+    ("_s", _SECONDS),
+    ("seconds", _SECONDS),
+    ("", {}),
 )
 """Ending of a key -> the units that somebody may write after its number, in its own unit."""
 _MEANT = dict.fromkeys(
@@ -200,10 +310,8 @@ def _meant_number(key: str, value: Any, kind: Any) -> str:
     number, unit = float(match[1].replace(",", ".")), match[2]
     if unit is None:
         return f" without quotes: {key} = {number:g}"
-    units = next(units for ending, units in _UNITS if key.endswith(ending))
-    if unit.lower() not in units:
-        return ", without its unit"
-    return f" without its unit: {key} = {number * units[unit.lower()]:.6g}"
+    factor = next(units for ending, units in _UNITS if key.endswith(ending)).get(unit.lower())
+    return ", without its unit" if factor is None else f" without its unit: {key} = {number * factor:.6g}"
 
 
 def _as_toml(value: Any) -> str:

@@ -14,7 +14,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from swarm.config.toml_mistakes import toml_mistake
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
 from swarm.grid import MAX_CELLS
 
@@ -157,7 +156,35 @@ def parse_toml(text: str, source: str, error: type[SwarmError]) -> dict[str, Any
     try:
         return tomllib.loads(text.removeprefix("\ufeff"))
     except ValueError as fault:  # a TOMLDecodeError, or a number of more digits than Python reads
-        raise error(f"{source}: not TOML: {toml_mistake(str(fault), text)}") from fault
+        raise error(f"{source}: not TOML: {_toml_fault(str(fault), text)}") from fault
+
+
+_TOML_FAULTS = {
+    "Invalid value": "no value that TOML knows: text goes in quotes, true and false in small letters",
+    "Illegal character '\\n'": "a quote is missing at the end",
+    "Unterminated string": "a quote is missing at the end",
+    "Cannot overwrite a value": "a key is set twice, or a value would be a table",
+    "Cannot declare": "a section stands twice: put all of its keys below one",
+    "Expected newline or end of document": "nothing may follow a value; units are in the keys' names",
+    "Unclosed": "a bracket that is opened is not closed before the end of the file",
+    "Expected '=' after a key": "expected KEY = VALUE or [SECTION]",
+    "Exceeds the limit": "it holds a number of thousands of digits",
+}
+"""How the parser's message begins -> what it means to somebody who does not know TOML."""
+_TOML_PLACE = re.compile(r" \(at (?:line (\d+)(, column \d+)|end of document)\)\Z")
+
+
+def _toml_fault(reason: str, text: str) -> str:
+    """A sentence from the parser's message, such as "Invalid value (at line 2, column 8)", with the line itself."""
+    place = _TOML_PLACE.search(reason)
+    what = reason if place is None else reason[: place.start()]
+    meant = next((each for begin, each in _TOML_FAULTS.items() if what.startswith(begin)), what)
+    if place is None:
+        return meant
+    lines = text.rstrip().split("\n")
+    number = int(place[1]) if place[1] else len(lines)  # it ends too soon, so what is wrong began before
+    line = lines[min(number, len(lines)) - 1].strip()
+    return f"line {number}{place[2] or ''}: {meant}, found {line if len(line) <= 60 else f'{line[:57]}...'!r}"
 
 
 def shown(value: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ipaddress
 import re
 from collections import Counter
@@ -14,10 +15,9 @@ import msgspec
 
 from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
-from swarm.config.dotted import with_settings
 from swarm.config.explain import choice, explain, located, nearest
-from swarm.config.ground import ZoneConfig
-from swarm.config.input_files import FileKind, parse_toml, read_text
+from swarm.config.ground import CostConfig, HiddenConfig, ZoneConfig
+from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, read_text, shown
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
 from swarm.config.values import MOST_TARGETS, RESERVED_GROUP
@@ -57,7 +57,7 @@ def read_scenario(
     """The scenario of a text, and what is wrong with it: at most so many sentences. None where not all keys could
     be read.
 
-    settings  dotted key -> value, instead of what the text says (`swarm.config.dotted`)
+    settings  dotted key -> value, instead of what the text says (`with_settings`)
     """
     try:
         raw = with_settings(parse_toml(text, source, ConfigError), settings or {}, source)
@@ -151,10 +151,10 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
         yield from _said(_check_climbs, scenario.planner, f"class {aloft[0]}, which flies", source)
     yield from class_faults(scenario, source)
     yield from _group_faults(scenario, source)
-    shown = scenario.monitor.show_target
-    if shown and shown not in scenario.target_ids:
-        known = choice(shown, scenario.target_ids, " there are ")
-        yield f"{source}: monitor.show_target is {shown!r}, which is no target{known}"
+    marked = scenario.monitor.show_target
+    if marked and marked not in scenario.target_ids:
+        known = choice(marked, scenario.target_ids, " there are ")
+        yield f"{source}: monitor.show_target is {marked!r}, which is no target{known}"
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
             yield from _said(check_endpoint, endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
@@ -246,44 +246,91 @@ def is_loopback(host: str) -> bool:
 
 def anchored(scenario: Scenario, base: Path) -> Scenario:
     """The scenario with its relative paths made relative to the folder of its file."""
-    terrain = scenario.terrain
-    source = terrain.source
-    if source not in BUILT_IN_TERRAINS:
-        source = str(base / source)
-    photo = None if terrain.photo is None else str(base / terrain.photo)
-    labels = None if terrain.labels is None else str(base / terrain.labels)
-    cover = None if terrain.cover is None else str(base / terrain.cover)
-    codes = terrain.cover_codes
-    if codes is not None and codes not in COVER_TABLES:
-        codes = str(base / codes)
-    hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
-    cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
-    classes = tuple(
-        msgspec.structs.replace(each, cost=msgspec.structs.replace(each.cost, zones=cost.zones))
-        for each in scenario.classes
+
+    def beside(path: str | None, *names: str) -> str | None:
+        return path if path is None or path in names else str(base / path)
+
+    def zones_of(section: CostConfig | HiddenConfig) -> tuple[ZoneConfig, ...]:
+        return tuple(replace(zone, mask=beside(zone.mask), file=beside(zone.file)) for zone in section.zones)
+
+    replace = msgspec.structs.replace
+    terrain, network, tls = scenario.terrain, scenario.network, scenario.network.tls
+    terrain = replace(
+        terrain,
+        source=beside(terrain.source, *BUILT_IN_TERRAINS),
+        cover_codes=beside(terrain.cover_codes, *COVER_TABLES),
+        hidden=replace(terrain.hidden, zones=zones_of(terrain.hidden)),
+        **{key: beside(getattr(terrain, key)) for key in ("photo", "labels", "cover")},
     )
-    network = scenario.network
-    if network.tls is not None:
-        tls = network.tls
-        tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
-        network = msgspec.structs.replace(network, tls=tls)
-    files = {"source": source, "photo": photo, "labels": labels, "cover": cover, "cover_codes": codes}
-    terrain = msgspec.structs.replace(terrain, **files, hidden=hidden)
-    folder = str(base / scenario.plugin_folder)
-    changed = {"terrain": terrain, "cost": cost, "classes": classes, "network": network}
-    return msgspec.structs.replace(scenario, **changed, plugin_folder=folder)
-
-
-def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:
-    return tuple(
-        msgspec.structs.replace(
-            zone,
-            mask=zone.mask and str(base / zone.mask),
-            file=zone.file and str(base / zone.file),
-        )
-        for zone in zones
+    if tls is not None:
+        network = replace(network, tls=TlsConfig(**{key: str(base / getattr(tls, key)) for key in _TLS_FILES}))
+    zones = zones_of(scenario.cost)
+    return replace(
+        scenario,
+        terrain=terrain,
+        cost=replace(scenario.cost, zones=zones),
+        classes=tuple(replace(each, cost=replace(each.cost, zones=zones)) for each in scenario.classes),
+        network=network,
+        plugin_folder=str(base / scenario.plugin_folder),
     )
 
 
+_TLS_FILES = ("ca", "certificate", "key")
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
 COVER_TABLES = ("worldcover", "corine", "corine-level-3", "nlcd")
+
+
+# --- settings by dotted keys: `planner.routes`, `groups.0.assignment`, `groups.*.assignment` ---------------------
+
+EACH = "*"
+"""In a dotted key: each table of a list."""
+
+
+def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of whatever is no table, in the order of the file. A key in quotes may have dots."""
+    for key, value in table.items():
+        if isinstance(value, Mapping) and value:
+            yield from flat(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def with_settings(raw: Mapping[str, Any], settings: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """What was read of a file, with other values at dotted keys. Tables that are missing are made; what is no
+    setting is left to the check of types. Raises ConfigError, which begins with `source`."""
+    changed: dict[str, Any] = copy.deepcopy(dict(raw))
+    for key, value in settings.items():
+        if key.count(".") >= MAX_DEPTH:
+            raise ConfigError(f"{source}: {shown(key)}: a key has more than {MAX_DEPTH} parts")
+        _set(changed, key.split("."), value, f"{source}: {key}")
+    return changed
+
+
+def _set(at: dict[str, Any] | list[Any], steps: list[str], value: Any, where: str) -> None:
+    step, *rest = steps
+    if isinstance(at, list):
+        for index in _indices(at, step, where):
+            if rest:
+                _set(_inner(at[index], rest[0], where), rest, value, where)
+            else:
+                at[index] = copy.deepcopy(value)
+        return
+    if rest:
+        _set(_inner(at.setdefault(step, {}), rest[0], where), rest, value, where)
+    else:
+        at[step] = copy.deepcopy(value)
+
+
+def _inner(found: Any, step: str, where: str) -> dict[str, Any] | list[Any]:
+    if isinstance(found, dict | list):
+        return found
+    raise ConfigError(f"{where}: found {shown(found)} above {step!r}, expected a table")
+
+
+def _indices(items: list[Any], step: str, where: str) -> range:
+    if step == EACH:
+        return range(len(items))
+    if step.isdecimal() and len(step) < 10 and int(step) < len(items):
+        return range(int(step), int(step) + 1)
+    last = f"a number from 0 to {len(items) - 1}" if items else "nothing, as it is empty,"
+    raise ConfigError(f"{where}: found {shown(step)} in a list, expected {last} or {EACH!r} for each")

@@ -6,10 +6,9 @@ group, or `module:Name`. Only a scenario names a plug-in: it is the user's own f
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import shown
@@ -29,16 +28,16 @@ class PluginKind:
     role      the role that calls it; every role builds the map, if it is not prepared
     built_in  names of the kind's own table
     method    what a plug-in is asked for, as its `Protocol` names it
-    call_s    a call that takes longer hangs, and is broken off
     failing   what the process does without it, as the end of a sentence
+    call_s    a call that takes longer hangs, and is broken off
     """
 
     name: str
     role: str
     built_in: tuple[str, ...]
     method: str
-    call_s: float
     failing: str
+    call_s: float = 2.0
 
     @property
     def group(self) -> str:
@@ -48,32 +47,13 @@ class PluginKind:
 
 _KINDS = (
     PluginKind(
-        "sensor",
-        "agent",
-        typing.get_args(Sensor),
-        "look",
-        2.0,
-        "this agent's vehicles see only the cells next to them now",
+        "sensor", "agent", get_args(Sensor), "look", "this agent's vehicles see only the cells next to them now"
     ),
-    PluginKind("walk", "targets", typing.get_args(Walk), "choose", 2.0, "the target stands still now"),
-    PluginKind("cost_layer", "any", (), "cost", 300.0, "there is no map without it"),
-    PluginKind(
-        "assignment",
-        "agent",
-        typing.get_args(Assigner),
-        "assign",
-        2.0,
-        "this agent spreads its vehicles evenly now",
-    ),
-    PluginKind("strategy", "planner", typing.get_args(Strategy), "row", 2.0, "this planner keeps exact trees now"),
-    PluginKind(
-        "dynamics",
-        "agent",
-        typing.get_args(Dynamics),
-        "speed",
-        2.0,
-        "this agent's vehicles drive as the ground allows now",
-    ),
+    PluginKind("walk", "targets", get_args(Walk), "choose", "the target stands still now"),
+    PluginKind("cost_layer", "any", (), "cost", "there is no map without it", call_s=300.0),
+    PluginKind("assignment", "agent", get_args(Assigner), "assign", "this agent spreads its vehicles evenly now"),
+    PluginKind("strategy", "planner", get_args(Strategy), "row", "this planner keeps exact trees now"),
+    PluginKind("dynamics", "agent", get_args(Dynamics), "speed", "its vehicles drive as the ground allows now"),
 )
 PLUGIN_KINDS: Mapping[str, PluginKind] = {kind.name: kind for kind in _KINDS}
 """Every kind of plug-in, by its name."""

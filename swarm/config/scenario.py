@@ -1,7 +1,7 @@
 """A scenario: frozen settings, read once from a TOML file and handed down by section.
 
 Every setting is declared here, those of the ground in `swarm.config.ground`: its unit in its name, its range in its
-type, its meaning as one row of its section's docstring (`swarm.config.describe` reads the rows). A wrong key, type
+type, its meaning as one row of its section's docstring (`swarm.config.explain` reads the rows). A wrong key, type
 or value is rejected with the file, the key, what was found and what is allowed.
 """
 

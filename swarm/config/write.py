@@ -1,4 +1,4 @@
-"""Writing a scenario as TOML: every setting, so that the file says what a run was."""
+"""Writing TOML: a scenario with every setting, so that the file says what a run was; some settings, explained."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import datetime
 import json
 import math
 import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from swarm.config.explain import expected, hints_of, meanings, section_in
 from swarm.config.load import anchored
 from swarm.config.scenario import Scenario
 
 _DATES = (datetime.datetime, datetime.date, datetime.time)
+_WIDTH = 100
+"""Of a comment, in characters."""
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -23,22 +27,46 @@ def scenario_text(scenario: Scenario, base: Path) -> str:
     """TOML that `load_scenario` reads as the same scenario from any folder: relative paths become those below
     `base`, which is absolute. A setting that has no value is left out."""
     settings = msgspec.to_builtins(anchored(scenario, base), builtin_types=_DATES)
-    return "\n".join(_table(settings, ())).lstrip("\n") + "\n"
+    return "\n".join(_table(settings, (), None)).lstrip("\n") + "\n"
 
 
-def _table(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
-    """The lines of a table: its own values first, as TOML wants it, then the tables inside."""
-    inner: list[tuple[str, Any]] = []
+def commented(settings: Mapping[str, Any], head: str) -> str:
+    """The TOML of some settings for people to go on from: each below a comment that says what it means.
+
+    head  lines before the first setting, without their `#`
+    """
+    lines = [f"# {line}".rstrip() for line in head.splitlines()]
+    return "\n".join([*lines, *_table(settings, (), Scenario)]) + "\n"
+
+
+def _table(table: Mapping[str, Any], path: tuple[str, ...], section: Any) -> Iterator[str]:
+    """The lines of a table: its own values first, as TOML wants it, then the tables inside.
+
+    section  type of the table, whose docstring has the comments; None for none
+    """
+    inner = [key for key, value in table.items() if _is_table(value) or _is_tables(value)]
+    if section is not None:
+        meaning, hints = meanings(section), hints_of(section)
+        defaults = {field.encode_name: field.default for field in msgspec.structs.fields(section)}
+        inner = [key for key in table if section_in(hints[key]) is not None]
     for key, value in table.items():
-        if _is_table(value) or _is_tables(value):
-            inner.append((key, value))
-        elif value is not None:
+        if key not in inner and value is not None:
+            if section is not None:
+                default = defaults[key]
+                usual = "" if default in (None, msgspec.NODEFAULT) else f" (default {toml_value(default)})"
+                yield from _comment(f"{meaning[key]}; {expected(hints[key])}{usual}")
             yield f"{toml_key(key)} = {toml_value(value)}"
-    for key, value in inner:
-        name = ".".join(map(toml_key, (*path, key)))
-        for each in [value] if _is_table(value) else value:
-            yield f"\n[{name}]" if _is_table(value) else f"\n[[{name}]]"
-            yield from _table(each, (*path, key))
+    for key in inner:
+        name, value = ".".join(map(toml_key, (*path, key))), table[key]
+        for each in [value] if isinstance(value, Mapping) else value:
+            yield from [""] if section is None else _comment(meaning[key])
+            yield f"[{name}]" if each is value else f"[[{name}]]"
+            yield from _table(each, (*path, key), None if section is None else section_in(hints[key]))
+
+
+def _comment(text: str) -> list[str]:
+    lines = textwrap.wrap(text, _WIDTH - 2, break_long_words=False, break_on_hyphens=False)
+    return ["", *(f"# {line}" for line in lines)]
 
 
 def _is_table(value: Any) -> bool:

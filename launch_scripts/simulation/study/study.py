@@ -15,9 +15,9 @@ from msgspec import Meta
 
 from launch_scripts.simulation.campaign import MIX, parse_seeds
 from launch_scripts.simulation.worlds import WORLDS
-from swarm.config.dotted import flat
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, read_text, shown
+from swarm.config.load import flat
 from swarm.config.values import Name, Options, Positive, Section
 from swarm.errors import ConfigError
 

@@ -23,12 +23,12 @@ from launch_scripts.commands.new import Choices, _asked
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.agents import plan_agents
-from swarm.config.commented import commented
-from swarm.config.describe import expected, meanings
+from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.config.values import Preset, Walk
+from swarm.config.write import commented
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from vehicle_agent.placement import spawn_cells

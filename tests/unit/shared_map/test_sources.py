@@ -17,7 +17,7 @@ from shared_map.importers.rasters.degrees import metres_per_degree
 from shared_map.importers.sources import FILE_KINDS, Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.describe import meanings
+from swarm.config.explain import meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError

@@ -9,7 +9,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 from swarm.config.agents import plan_agents
-from swarm.config.describe import meanings
+from swarm.config.explain import meanings
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.values import Section
@@ -77,8 +77,8 @@ def refusal(text: str) -> str:
         ("[network]\nconnect = ['tls/host:7447']", ["needs network.tls with ca, certificate and key"]),
         ("[network]\nlease_s = 0.1", ["network.lease_s", "found 0.1", "0.5 to 60"]),
         ("[monitor]\nweb_port = 70000", ["monitor.web_port", "found 70000", "0 to 65535"]),
-        ("seed = ", ["demo.toml: not TOML: line 1: seed has no value"]),
-        ("seed = 1\nseed = 2", ["not TOML"]),
+        ("seed = ", ["demo.toml: not TOML: line 1", "no value that TOML knows", "found 'seed ='"]),
+        ("seed = 1\nseed = 2", ["not TOML: line 2", "set twice", "found 'seed = 2'"]),
         ("terrain = 3", ["terrain", "found 3, expected a table: [terrain]"]),
     ],
 )

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.config.dotted import flat, with_settings
-from swarm.config.load import parse_scenario
+from swarm.config.load import flat, parse_scenario, with_settings
 from swarm.errors import ConfigError
 
 _TABLES = st.recursive(
