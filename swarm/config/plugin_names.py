@@ -53,7 +53,9 @@ _KINDS = (
     PluginKind("cost_layer", "any", (), "cost", "there is no map without it", call_s=300.0),
     PluginKind("assignment", "agent", get_args(Assigner), "assign", "this agent spreads its vehicles evenly now"),
     PluginKind("strategy", "planner", get_args(Strategy), "row", "this planner keeps exact trees now"),
-    PluginKind("dynamics", "agent", get_args(Dynamics), "speed", "its vehicles drive as the ground allows now"),
+    PluginKind(
+        "dynamics", "agent", get_args(Dynamics), "speed", "this agent's vehicles drive as the ground allows now"
+    ),
 )
 PLUGIN_KINDS: Mapping[str, PluginKind] = {kind.name: kind for kind in _KINDS}
 """Every kind of plug-in, by its name."""
