@@ -1,8 +1,8 @@
-"""The table of processes: the roles of a scenario, in the order in which they start and stop."""
+"""The table of processes: all that is said of a role, in one row, and the processes of a scenario."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,29 +14,106 @@ from swarm.liveness import ranked_id
 
 Restart = Literal["always", "never"]
 
-ROLES = ("router", "keeper", "monitor", "planner", "targets", "agent")
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Role:
+    """What is to be known of a role.
+
+    entry       `module:function` of its `run(setup, stop_when)`
+    jobs        ids of the processes that a scenario has of it, without ranks
+    standbys    how many stand by for each of them, in ranks from 1 on; None: it has no ranks
+    stops       place in the order of the end: each role stops after those which still talk to it
+    niceness    by how much less urgent it is than the launcher, where the processor is short. A vehicle that is
+                driven late stands, and a target jumps; a route may come a little later, what is kept or shown much
+    memory_mib  that a container of it may take at most: about four times what it took on 4096 x 4096 cells
+    is_needed   whether a run is unwell without it
+    expendable  whether a run goes on without it, whatever keeps it from starting
+    kernels     whether it computes with compiled kernels, which have to be there before its first route
+    photo       whether it needs the terrain's photo too; a keeper hands it on
+    simulated   whether simulations and replays have it: a router and a monitor decide nothing
+    any_id      whether a run may have more of it than its scenario says
+    lasting     whether what it writes must outlive its container: a keeper's store, recordings, and what an agent
+                has promised of right of way (decision 25). All else is made again
+    takes_over  how its next life follows one that still runs: "beside" it (each answer is complete, and of two the
+                younger life's counts), or after it; one that "waits" starts at once, and waits for a file that the
+                life before has locked
+    """
+
+    entry: str
+    jobs: Callable[[Scenario], list[str]] = lambda _: ["0"]
+    standbys: Callable[[Scenario], int] | None = None
+    stops: int
+    niceness: int = 0
+    memory_mib: int
+    is_needed: bool = True
+    expendable: bool = False
+    kernels: bool = False
+    photo: bool = False
+    simulated: bool = True
+    any_id: bool = False
+    lasting: bool = False
+    takes_over: Literal["beside", "waits", "after"] = "after"
+
+
+TABLE: dict[str, Role] = {
+    "router": Role(
+        entry="launch_scripts.launcher.router:run",
+        stops=5,
+        memory_mib=512,
+        is_needed=False,
+        simulated=False,
+        any_id=True,
+    ),
+    "keeper": Role(
+        entry="shared_map.keeper.main:run",
+        stops=4,
+        niceness=10,
+        memory_mib=2048,
+        photo=True,
+        any_id=True,
+        lasting=True,
+    ),
+    "monitor": Role(
+        entry="launch_scripts.monitor.main:run",
+        stops=3,
+        niceness=10,
+        memory_mib=4096,
+        is_needed=False,
+        expendable=True,
+        photo=True,
+        simulated=False,
+        lasting=True,
+    ),
+    "planner": Role(
+        entry="planner_service.main:run",
+        jobs=lambda scenario: scenario.target_ids,
+        standbys=lambda scenario: scenario.standbys.planner,
+        stops=2,
+        niceness=5,
+        memory_mib=2048,
+        kernels=True,
+        takes_over="beside",
+    ),
+    "targets": Role(  # the referee also where all targets are external
+        entry="launch_scripts.simulation.world.main:run",
+        standbys=lambda scenario: scenario.standbys.targets,
+        stops=1,
+        memory_mib=2048,
+    ),
+    "agent": Role(
+        entry="vehicle_agent.main:run",
+        jobs=lambda scenario: [plan.id for plan in plan_agents(scenario)],
+        stops=0,
+        memory_mib=1024,
+        lasting=True,
+        takes_over="waits",
+    ),
+}
 """In order of start: each role finds what it needs, and the slowest to import starts early."""
 
-STOP_ORDER = ("agent", "targets", "planner", "monitor", "keeper", "router")
-"""Each role stops after those which still talk to it."""
-
-EXPENDABLE = frozenset({"monitor"})
-"""Roles without which a run goes on, whatever keeps them from starting."""
-
-ENTRIES = {
-    "router": "launch_scripts.launcher.router:run",
-    "keeper": "shared_map.keeper.main:run",
-    "monitor": "launch_scripts.monitor.main:run",
-    "planner": "planner_service.main:run",
-    "targets": "launch_scripts.simulation.world.main:run",
-    "agent": "vehicle_agent.main:run",
-}
-"""`module:function` of each role's `run(setup, stop_when)`."""
-
-
-NICENESS: Mapping[str, int] = {"router": 0, "agent": 0, "targets": 0, "planner": 5, "keeper": 10, "monitor": 10}
-"""By how much less urgent each role is than the launcher, where the processor is short. A vehicle that is driven
-late stands, and a target jumps; a route may come a little later, what is kept or shown much."""
+ROLES = tuple(TABLE)
+STOP_ORDER = tuple(sorted(ROLES, key=lambda role: TABLE[role].stops))
+SIMULATED_ROLES = tuple(role for role in ROLES if TABLE[role].simulated)
 
 RECORDED_BESIDE = "keeper-0"
 """The launcher that starts this process records and reports the run, and all others look after their own processes
@@ -66,30 +143,26 @@ class ProcessSpec:
 def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int | None = None) -> list[ProcessSpec]:
     """Processes of a scenario, restricted to `roles`, in order of start.
 
-    rank  of planners and the targets process: only those of this rank; if None all, with those of rank 0 first
+    rank  of roles with standbys: only those of this rank; if None all, with those of rank 0 first
     """
-    jobs: dict[str, list[str]] = {
-        "router": ["0"],
-        "keeper": ["0"],
-        "monitor": ["0"],
-        "planner": scenario.target_ids,
-        "targets": ["0"],  # the referee also where all targets are external
-        "agent": [plan.id for plan in plan_agents(scenario)],
-    }
-    standbys = {"planner": scenario.standbys.planner, "targets": scenario.standbys.targets}
-    return [
-        ProcessSpec(role, ranked_id(job, each), ENTRIES[role])
-        for role in ROLES
-        if role in roles
-        for each in (range(standbys[role] + 1) if role in standbys else (0,))
-        if rank in (None, each) or role not in standbys
-        for job in jobs[role]
-    ]
+    found = []
+    for name, role in TABLE.items():
+        ranks = [0]
+        if role.standbys is not None:
+            ranks = [each for each in range(role.standbys(scenario) + 1) if rank in (None, each)]
+        if name in roles:
+            found += [spec_of(name, ranked_id(job, each)) for each in ranks for job in role.jobs(scenario)]
+    return found
+
+
+def spec_of(role: str, id: str, *, added: bool = False) -> ProcessSpec:
+    """A process of a role. `added`: as `ProcessSpec` has it."""
+    return ProcessSpec(role, id, TABLE[role].entry, added=added)
 
 
 def planner_spec(id: str) -> ProcessSpec:
     """The planner of a target that was added while the swarm runs, or one of its standbys."""
-    return ProcessSpec("planner", id, ENTRIES["planner"], added=True)
+    return spec_of("planner", id, added=True)
 
 
 LAUNCHER = "launcher"

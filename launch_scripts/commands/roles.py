@@ -195,7 +195,7 @@ def run_role(
     from launch_scripts.launcher.options import next_incarnation
     from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.watcher import check_vacant
-    from launch_scripts.process_table import ENTRIES, processes_of
+    from launch_scripts.process_table import TABLE, processes_of
     from swarm.config.agents import added_agent
     from swarm.errors import ConfigError
     from swarm.runtime.role import RoleSetup
@@ -249,7 +249,7 @@ def run_role(
     setup = RoleSetup(
         scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health
     )
-    load_entry(ENTRIES[role])(setup, None, **role_options)
+    load_entry(TABLE[role].entry)(setup, None, **role_options)
 
 
 def _told_health(name: str, place: Place) -> Health:

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -28,7 +28,7 @@ HostName = Annotated[
 """A label of DNS, so that it can be part of a host's name, a unit's and a certificate's."""
 HostRole = Literal["router", "keeper", "monitor", "planner", "targets", "agent"]
 _LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
-HOST_ROLES: tuple[HostRole, ...] = ("router", "keeper", "monitor", "planner", "targets", "agent")
+HOST_ROLES: tuple[HostRole, ...] = get_args(HostRole)
 
 
 class HostConfig(Section, frozen=True, kw_only=True):

@@ -12,9 +12,9 @@ import msgspec
 from launch_scripts.deploy.hosts import HostConfig, HostsConfig
 from launch_scripts.deploy.placement import ROUTER_CORES, Job, place
 from launch_scripts.process_table import (
-    EXPENDABLE,
     RECORDED_BESIDE,
     ROLES,
+    TABLE,
     certificate_name,
     certificate_names,
     processes_of,
@@ -187,7 +187,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
     }
     for role in ROLES:
-        if role in EXPENDABLE:
+        if TABLE[role].expendable:
             continue
         names = [host.name for host in hosts.hosts if role in host.roles]
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))

@@ -14,7 +14,7 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ import msgspec
 
 from launch_scripts.deploy.host_scenario import GROUND, PLUGINS, host_scenario, plugin_files
 from launch_scripts.deploy.plan import ROUTER, Plan, PlannedHost, PlannedProcess, router_name
+from launch_scripts.process_table import TABLE
 from swarm.bus.access_control import access_control
 from swarm.bus.zenoh_config import tls_settings
 from swarm.config.scenario import NetworkConfig, Scenario
@@ -34,16 +35,6 @@ from swarm.wire.topics import MARKS
 UNIT, COMPOSE_FILE = "swarm.service", "compose.yaml"
 HEALTH_PORT = 9464
 """Where a launcher, or a container, answers probes and Prometheus."""
-MEMORY_MIB: Mapping[str, int] = {
-    "router": 512,
-    "keeper": 2048,
-    "monitor": 4096,
-    "planner": 2048,
-    "targets": 2048,
-    "agent": 1024,
-}
-"""Most memory of a container, by role: about four times what it took on 4096 x 4096 cells (decision 78)."""
-_LASTING = frozenset({"keeper", "agent", "monitor"})
 _LABEL = re.compile(r"[a-z0-9]+([.-][a-z0-9]+)*")
 _LONGEST_LABEL = 50
 _SCENARIO = "scenario.toml"
@@ -100,9 +91,8 @@ class Container(NamedTuple):
 
     @property
     def lasting(self) -> bool:
-        """Whether what it writes must outlive the container: a keeper's store, recordings, and what an agent has
-        promised of right of way (decision 25). All else is made again."""
-        return self.process.role in _LASTING
+        """Whether what it writes must outlive the container."""
+        return TABLE[self.process.role].lasting
 
     @property
     def certificate_files(self) -> tuple[str, str, str]:
@@ -154,7 +144,7 @@ def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Seque
         containers=containers,
         files=sorted({name for each in containers for name in each.certificate_files}),
         mounted=[_SCENARIO, *([PLUGINS] if plugin_files(plan.scenario) else []), *([GROUND] if ground else [])],
-        memory_mib=MEMORY_MIB,
+        memory_mib={role: row.memory_mib for role, row in TABLE.items()},
         router=router_name(host),
         routers=[each.name for each in containers if each.process.role == ROUTER],
     )

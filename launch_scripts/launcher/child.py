@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
-from launch_scripts.process_table import NICENESS
+from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
 from swarm.runtime.health import Board, Health
 from swarm.runtime.role import RoleSetup
@@ -70,7 +70,7 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
     log = logging.getLogger(__name__)
     log.info("%s %s starts, pid %d, incarnation %d", setup.role, setup.id, os.getpid(), setup.incarnation)
     try:
-        load_entry(entry)(setup, lambda: _run_until_launcher_ends(NICENESS.get(setup.role, 0)))
+        load_entry(entry)(setup, lambda: _run_until_launcher_ends(TABLE[setup.role].niceness))
     except SwarmError as error:
         log.error("%s", error)
         pipe.send(ExitReason(str(error), error.exit_code, refused=True))

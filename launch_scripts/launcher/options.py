@@ -19,12 +19,13 @@ from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import (
-    ENTRIES,
     RECORDED_BESIDE,
     ROLES,
+    TABLE,
     ProcessSpec,
     certificate_name,
     processes_of,
+    spec_of,
 )
 from launch_scripts.web.loopback_guard import LOOPBACK
 from shared_map.importers.sources import is_terrain
@@ -39,8 +40,6 @@ from swarm.errors import ConfigError, StoreError
 from swarm.liveness import split_rank
 from swarm.wire.fields import check_id
 
-_AS_MANY_AS_WANTED = ("router", "keeper")
-"""Roles of which a run may have more processes than its scenario says."""
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
@@ -335,12 +334,12 @@ def chosen_processes(scenario: Scenario, words: Sequence[str], rank: int | None)
         every = processes_of(scenario, (role,), rank)
         if id:
             ids = [spec.id for spec in processes_of(scenario, (role,))]
-            if id not in ids and role not in _AS_MANY_AS_WANTED:
+            if id not in ids and not TABLE[role].any_id:
                 raise ConfigError(f"--only: no {role} {id!r} in scenario {scenario.name}; it has {', '.join(ids)}")
             try:
                 check_id("--only", id)
             except ValueError as error:
                 raise ConfigError(str(error)) from error
-            every = [ProcessSpec(role, id, ENTRIES[role])]
+            every = [spec_of(role, id)]
         chosen |= {spec.name: spec for spec in every}
     return sorted(chosen.values(), key=lambda spec: ROLES.index(spec.role))

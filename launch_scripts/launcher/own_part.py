@@ -14,13 +14,11 @@ from launch_scripts.observe.facts import lines_of
 from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.plan import RunPlan
 from launch_scripts.observe.process_load import ProcessLoad, by_role
-from launch_scripts.process_table import ROLES, ProcessSpec
+from launch_scripts.process_table import ROLES, TABLE, ProcessSpec
 from swarm.grid import GridSpec
 from swarm.liveness import Peer, job_of
 from swarm.wire.messages import Message
 
-_NOT_NEEDED = ("router", "monitor")
-"""Roles that a run goes on without: see `RunPlan.crew`."""
 _OTHER_LINES = 4
 """Of the table: title, empty line, labels, and the line of the prompt."""
 
@@ -61,7 +59,7 @@ class OwnPart:
 
     def alarms(self, now_ns: int) -> tuple[Alarm, ...]:
         """What went wrong with them or is told by them."""
-        crew = tuple(sorted(key for key in self._keys() if key[0] not in _NOT_NEEDED))
+        crew = tuple(sorted(key for key in self._keys() if TABLE[key[0]].is_needed))
         targets = tuple(dict.fromkeys(job_of(id) for role, id in crew if role == "planner"))
         plan = RunPlan(targets, crew, 0, self.observed.plan.started_ns)
         return alarms_of(self.observed, plan, targets, now_ns)

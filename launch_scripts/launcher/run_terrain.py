@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from launch_scripts.observe.run_observer import ask_run
+from launch_scripts.process_table import TABLE
 from shared_map.keeper.base_map import NEEDED
 from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
 from shared_map.terrain.prepared import load_prepared, save_prepared, scenario_key
@@ -23,9 +24,6 @@ from swarm.plugins.find import source_of
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
-
-_LOOK = frozenset(("monitor", "keeper"))
-"""Roles that need the photo too. A keeper hands it on."""
 
 
 def missing_files(scenario: Scenario) -> list[str]:
@@ -82,7 +80,7 @@ def fetch_if_missing(
             " where the file is"
         )
     key = scenario_key(scenario)
-    looks = not _LOOK.isdisjoint(roles)
+    looks = any(TABLE[role].photo for role in roles)
     with _locked(run_dir):
         here = load_prepared(run_dir, key)
         if here is not None and (here.photo.any() or not looks):

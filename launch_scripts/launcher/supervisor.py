@@ -22,7 +22,7 @@ import psutil
 from launch_scripts.launcher.child import EndedAsAsked, ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.log_file import LogFormat
-from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
+from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
 from launch_scripts.web.health_verdict import Process
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.deadline import KILLED_BY
@@ -266,9 +266,8 @@ class LocalSwarm:
         """
         for running in self.running:
             running.due_s = running.begins_when = None
-        roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
         failures = []
-        for role in roles:
+        for role in STOP_ORDER:
             of_role = [running for running in self.running if running.spec.role == role and running.alive]
             if of_role and not force():
                 before_role(role)
@@ -324,7 +323,7 @@ class LocalSwarm:
         ran_s = now_s - running.began_s
         wait_s: float | None = running.backoff.crashed(ran_s)
         if reason.refused and self._is_final(running, reason.exit_code, ran_s, now_s):
-            expendable = running.spec.added or running.spec.role in EXPENDABLE
+            expendable = running.spec.added or TABLE[running.spec.role].expendable
             wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
         if running.spec.restart != "always":
             wait_s = None

@@ -17,17 +17,13 @@ from pathlib import Path
 import psutil
 
 from launch_scripts.launcher.supervisor import Running
-from launch_scripts.process_table import ROLES
+from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
 from swarm.runtime.health import LIFE_BEFORE
 
 log = logging.getLogger(__name__)
 
-_BESIDE = "planner"
-"""The role whose two lives may work side by side: each answer is complete, and of two the younger life's counts."""
-_WAITS = "agent"
-"""The role whose next life waits for the file that the life before has locked."""
 _NAMES = tuple(f"{role}-" for role in ROLES)
 _PATIENCE_S = 60.0
 """For successors to be ready: a target without a tracker has no tree, however long one waits."""
@@ -62,9 +58,9 @@ class TakeOver:
         self._asked = False
         """Whether the predecessor has been asked to end."""
         for each in running:
-            if each.spec.role == _BESIDE:
+            if TABLE[each.spec.role].takes_over == "beside":
                 continue
-            if each.spec.role == _WAITS and each.spec.name in self.predecessors:
+            if TABLE[each.spec.role].takes_over == "waits" and each.spec.name in self.predecessors:
                 each.takes_over = True
                 each.begins_when = lambda: self._planners_ready
             else:
@@ -119,7 +115,7 @@ def _lacks(running: Running) -> tuple[str, ...] | None:
 
 def _plans(running: Running) -> bool:
     """Whether a process can answer, if it is a planner."""
-    return running.spec.role != _BESIDE or _lacks(running) == ()
+    return TABLE[running.spec.role].takes_over != "beside" or _lacks(running) == ()
 
 
 def _waits(running: Running) -> bool:

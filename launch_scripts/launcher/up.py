@@ -40,7 +40,7 @@ from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.ports import check_ports, page_of
-from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, ProcessSpec
+from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
@@ -158,7 +158,7 @@ class _Run:
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
-        planners = "planner" in self._options.roles
+        planners = any(TABLE[role].kernels for role in self._options.roles)
         self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
         self._warm_up.begin()
         try:

@@ -32,9 +32,6 @@ from swarm.wire.messages.processes import Stats
 from vehicle_agent.promise_store import PROMISE_STORE, PromiseStore
 from vehicle_agent.service import AgentService
 
-REPLAYED = ("keeper", "planner", "targets", "agent")
-"""Roles whose services are replayed; a router and a monitor decide nothing."""
-
 
 @dataclass(frozen=True, eq=False)
 class Ground:

@@ -8,7 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from launch_scripts.observe.run_folder import SCENARIO_FILE
-from launch_scripts.replay.rebuild import REPLAYED, Ground, Grounds, rebuilt, setup_of
+from launch_scripts.process_table import SIMULATED_ROLES
+from launch_scripts.replay.rebuild import Ground, Grounds, rebuilt, setup_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.recording.recording import path_of, versions
@@ -59,7 +60,7 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
             f"{folder} holds no recorded inputs: `swarm up` and `swarm demo` record them with --record-inputs, "
             "`swarm simulate` always does"
         )
-    order = {role: n for n, role in enumerate(REPLAYED)}
+    order = {role: n for n, role in enumerate(SIMULATED_ROLES)}
     # t2 before t10.
     found.sort(
         key=lambda each: (order.get(each[0].role, len(order)), len(each[0].id), each[0].id, each[0].incarnation)

@@ -17,7 +17,7 @@ import msgspec
 
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED, RunObserver
-from launch_scripts.process_table import ENTRIES, STOP_ORDER, ProcessSpec, planner_spec, processes_of
+from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, planner_spec, processes_of, spec_of
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
@@ -37,7 +37,6 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, ZONES
 
-SIMULATED_ROLES = ("keeper", "planner", "targets", "agent")
 BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5
 """Seconds from a crash to the next start; each further crash of the same process doubles them."""
@@ -141,7 +140,7 @@ class Simulation:
 
     def add(self, added: AddedAgent) -> Node:
         """Let an agent join that is not in the scenario."""
-        spec = ProcessSpec("agent", added.plan.id, ENTRIES["agent"])
+        spec = spec_of("agent", added.plan.id)
         node = Node(self, spec, self._phases.randrange(NS_PER_S), 0, added=added)
         self.nodes[node.name] = node
         node.boot()

@@ -21,7 +21,7 @@ from launch_scripts.launcher.options import UpOptions, chosen_processes
 from launch_scripts.launcher.supervisor import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.takeover import has_ended
 from launch_scripts.launcher.up import run_swarm
-from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
+from launch_scripts.process_table import ROLES, STOP_ORDER, TABLE, ProcessSpec, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
 from swarm.errors import ConfigError
@@ -79,8 +79,9 @@ def test_the_table_has_a_process_for_each_target_and_each_25_vehicles() -> None:
 
 
 def test_the_table_says_of_every_role_how_urgent_it_is_and_none_before_those_that_drive() -> None:
-    assert set(NICENESS) == set(ROLES)
-    assert NICENESS["agent"] == NICENESS["targets"] == min(NICENESS.values()) == 0
+    assert (
+        TABLE["agent"].niceness == TABLE["targets"].niceness == min(role.niceness for role in TABLE.values()) == 0
+    )
 
 
 def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_rank() -> None:
@@ -161,7 +162,7 @@ def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm],
     for running in swarm.running:
         assert running.process is not None
         assert running.process.pid is not None
-        niceness = min(ours + NICENESS[running.spec.role], 19)
+        niceness = min(ours + TABLE[running.spec.role].niceness, 19)
         pid = running.process.pid
         eventually(lambda pid=pid, niceness=niceness: os.getpriority(os.PRIO_PROCESS, pid) == niceness, 5)
     assert swarm.stop(lambda: time.sleep(0.02)) == []
