@@ -19,8 +19,7 @@ def serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     router."""
     from launch_scripts.observe.run_observer import OutsideObserver
     from launch_scripts.web.health_verdict import Process
-    from launch_scripts.web.metric_families import families, figures_of
-    from launch_scripts.web.metrics_endpoint import MetricsEndpoint
+    from launch_scripts.web.prometheus import MetricsEndpoint, families, figures_of
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
     from swarm.runtime.health import Health

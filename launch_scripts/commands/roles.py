@@ -254,15 +254,15 @@ def run_role(
 
 def _told_health(name: str, place: Place) -> Health:
     """What the role tells of itself: to its supervisor, and to probes if they are given a port."""
-    from launch_scripts.web.health_pages import PageServer, health_pages
-    from launch_scripts.web.health_verdict import Process
+    from launch_scripts.web.health_verdict import Process, health_pages
+    from launch_scripts.web.server import Server
     from swarm.runtime.health import Health
     from swarm.runtime.supervisor import supervisor_of
 
     health = Health(supervisor=supervisor_of(os.environ))
     if place.health_port is not None:
         pages = health_pages(lambda: [Process(name, health.board.read())])
-        served = PageServer("health port", place.health_port, pages, place.signals_address)
+        served = Server("health port", place.health_port, pages, place.signals_address)
         logging.getLogger(__name__).info("health at %s/healthz and /readyz", served.url)
     return health
 

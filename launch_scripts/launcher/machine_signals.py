@@ -16,7 +16,7 @@ from swarm.runtime.supervisor import supervisor_of
 
 if TYPE_CHECKING:
     from launch_scripts.observe.latest_state import LatestState
-    from launch_scripts.web.metrics_endpoint import MetricsEndpoint
+    from launch_scripts.web.prometheus import MetricsEndpoint
 
 _TURNS_HZ = 2.0
 """How often a launcher turns, at least."""
@@ -46,7 +46,7 @@ class MachineSignals:
     def _open(self) -> None:
         if self._port is None:
             return
-        from launch_scripts.web.metrics_endpoint import MetricsEndpoint  # takes time to import
+        from launch_scripts.web.prometheus import MetricsEndpoint  # takes time to import
 
         board, seen = self._health.board, self._seen
         self._metrics = MetricsEndpoint(self._port, lambda: [Process(_NAME, board.read()), *seen()], self._address)
@@ -70,7 +70,7 @@ class MachineSignals:
             with suppress(BusError):  # the launcher before still has the port
                 self._open()
         if self._metrics is not None:
-            from launch_scripts.web.metric_families import Figures, Run, families
+            from launch_scripts.web.prometheus import Figures, Run, families
 
             run = Run(*self._run, started_ns) if up is None else None
             alive = observed.up() if up is None else up

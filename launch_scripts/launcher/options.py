@@ -27,7 +27,7 @@ from launch_scripts.process_table import (
     processes_of,
     spec_of,
 )
-from launch_scripts.web.loopback_guard import LOOPBACK
+from launch_scripts.web import LOOPBACK
 from shared_map.importers.sources import is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset

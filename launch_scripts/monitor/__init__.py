@@ -1,1 +1,10 @@
-"""The live view: subscribes, keeps a replica of the map, and logs to rerun."""
+"""The live view: records a run, and shows it to whoever looks.
+
+- `main`: the process; `service` hears the swarm and draws it frame by frame, ten a second for those who look, else
+  five (decision 102). It asks nothing but costs of planners, and nobody waits for it.
+- `ground` lies still: the terrain, its layers with their legends, zones, windows of planners.
+- `movers` moves: vehicles, guests, targets, bodies, their routes and trails, beliefs, alarms.
+- `figures_panel` stands beside: plots, a summary, a log. `blueprint` lays all of it out.
+- `sinks` takes it: a file `run.rrd`, a port for native viewers, a page. If the file ends for want of space, another
+  is begun once there is some.
+"""

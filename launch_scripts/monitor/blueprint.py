@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
-from launch_scripts.monitor.ground.layers import PHOTO, Layer
-from launch_scripts.monitor.ground.legend import BACKGROUND, HEIGHT_PX, WIDTH_PX
-from launch_scripts.monitor.ground.map_margin import said_heights
+from launch_scripts.monitor.ground.ground_view import said_heights
+from launch_scripts.monitor.ground.legend import BACKGROUND, HEIGHT_PX, PHOTO, WIDTH_PX, Layer
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.levels import level_for
-from launch_scripts.monitor.movers.looks import HINT
-from launch_scripts.monitor.movers.mover_drawing import FOLLOWED_ENTITY, mover_overrides
+from launch_scripts.monitor.movers.movers_view import FOLLOWED_ENTITY
+from launch_scripts.monitor.movers.styles import HINT, level_for
+from launch_scripts.monitor.movers.vehicles_view import mover_overrides
 
 
 def make_blueprint(
@@ -62,40 +61,27 @@ def _layer(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None) -
 
 
 def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None) -> rrb.Spatial3DView:
-    middle = (mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean()))
-    far = max(mesh.width_m, mesh.depth_m)
     contents = ["+ /world/**", "- /world/layers/**"]
-    if layer is not PHOTO:
+    if layer != PHOTO:
         contents += [f"- /{PHOTO.entity}/**", f"+ /{layer.entity}/**"]
     if layer.target is not None:
         contents += ["- /world/routes/**", f"+ /world/routes/{layer.target}"]
+    far = max(mesh.width_m, mesh.depth_m)
+    if follow:  # the followed one is the origin of the view: the world moves below it
+        eye, look = (-0.02 * far, -0.16 * far, 0.11 * far), (0.0, 0.0, 0.0)
+    else:
+        east, north, up = mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean())
+        eye, look = (east - 0.05 * far, north - 0.84 * far, up + 0.62 * far), (east, north - 0.19 * far, up)
     return rrb.Spatial3DView(
         origin=f"/{FOLLOWED_ENTITY}" if follow else "/world",
         contents=contents,
         name=", ".join((layer.title, said_heights(mesh.stretch), f"following {follow}" if follow else HINT)),
         background=rrb.Background(color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=_followed(far) if follow else _overview(middle, far),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=look, eye_up=(0, 0, 1)
+        ),
         overrides=mover_overrides(level_for(vehicles)),
-    )
-
-
-def _overview(middle: tuple[float, float, float], far: float) -> rrb.EyeControls3D:
-    return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=(middle[0] - 0.05 * far, middle[1] - 0.84 * far, middle[2] + 0.62 * far),
-        look_target=(middle[0], middle[1] - 0.19 * far, middle[2]),
-        eye_up=(0, 0, 1),
-    )
-
-
-def _followed(far: float) -> rrb.EyeControls3D:
-    """The followed one is the origin of the view: the world moves below it."""
-    return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=(-0.02 * far, -0.16 * far, 0.11 * far),
-        look_target=(0, 0, 0),
-        eye_up=(0, 0, 1),
     )
 
 

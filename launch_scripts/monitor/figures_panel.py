@@ -1,16 +1,83 @@
-"""The figures beside the view, as Markdown."""
+"""Figures beside the view: plots, a summary and a log.
+
+Texts of others are shown so that they do nothing but stand there. Rerun's headless viewer ends on a character that
+its fonts lack, and its text panel reads Markdown, where an image may be fetched. Ids are safe by their characters;
+what an alarm or a note says, or what a zone is called, may be anything.
+"""
 
 from __future__ import annotations
 
-from launch_scripts.monitor.shown_text import in_markdown
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from launch_scripts.monitor.movers.styles import HUES
+from launch_scripts.monitor.sinks import Streams
 from launch_scripts.observe import facts
 from launch_scripts.observe.alarms import KINDS
+from launch_scripts.observe.history import Sample
 from launch_scripts.observe.state import RunState
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.vehicles import VehicleState
 
 _WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside", "teleported")
 _SHOWN_TARGETS = 12
 _SHOWN_ALARMS = 8
+_UNSHOWN = re.compile(r"[^ -~]+")
+_MARKDOWN = re.compile(r"([\\`*_\[\]<>|#!~&$])")
+_LONGEST = 300
+
+
+class FiguresPanel:
+    """Logs plots, the summary and notes to one recording stream, and sets its time."""
+
+    def __init__(self, rec: rr.RecordingStream | Streams, target_ids: Sequence[str]) -> None:
+        self._rec = rec
+        self._target_ids = list(target_ids)
+
+    def set_time(self, frame: int, seconds: float) -> None:
+        """Sets the time of all that follows. What is logged before the first call is on no timeline."""
+        self._rec.set_time("tick", sequence=frame)
+        self._rec.set_time("sim_time", duration=seconds)
+
+    def begin(self) -> None:
+        """Logs what never changes: the styles."""
+        targets = [HUES[n % len(HUES)] for n in range(len(self._target_ids))]
+        states = [state.name.lower() for state in VehicleState]
+        for chart, names, colours in (
+            ("states", states, HUES[: len(states)]),
+            ("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)]),
+            ("gap", self._target_ids, targets),
+            ("growth_ms", self._target_ids, targets),
+            ("messages", ["all processes"], [(86, 180, 233)]),
+        ):
+            self._rec.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
+
+    def plots(self, sample: Sample) -> None:
+        """Logs a point of each line whose value is known."""
+        excess = {id: (gap - 1) * 100 for id, gap in sample.gaps.items()}
+        charts: dict[str, Sequence[float | None]] = {
+            "states": [float(n) for n in sample.states],
+            "captures_and_marks": [sample.captures, None if sample.marks is None else sample.marks / 100],
+            "gap": [excess.get(id) for id in self._target_ids],
+            "growth_ms": [sample.growth_ms.get(id) for id in self._target_ids],
+            "messages": [sample.messages_per_s],
+        }
+        for chart, values in charts.items():
+            if any(value is not None for value in values):
+                numbers = np.array([math.nan if value is None else value for value in values])
+                self._rec.log(f"plots/{chart}", rr.Scalars(numbers))
+
+    def summary(self, markdown: str) -> None:
+        """Logs the text beside the view."""
+        self._rec.log("summary", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def note(self, text: str, level: str) -> None:
+        """Logs a line, at a level as rerun names it."""
+        self._rec.log("log", rr.TextLog(shown(text), level=level))
 
 
 def level_of(kind: str) -> str:
@@ -19,7 +86,7 @@ def level_of(kind: str) -> str:
 
 
 def summary_markdown(setup: RoleSetup, state: RunState) -> str:
-    """The state of a run beside the view."""
+    """The state of a run, as Markdown."""
     time = facts.fact("elapsed_s")
     lines = [f"**{in_markdown(setup.scenario.name)}**, {time.label} {time.shown(state)}  "]
     lines += [f"{line}  " for line in facts.lines(state)]
@@ -30,3 +97,14 @@ def summary_markdown(setup: RoleSetup, state: RunState) -> str:
     if len(rows) > _SHOWN_TARGETS:
         lines.append(f"\n{len(rows) - _SHOWN_TARGETS} more targets")
     return "\n".join(lines)
+
+
+def shown(text: str, most: int = _LONGEST) -> str:
+    """A text in one line of characters that every viewer has; `?` stands for others."""
+    line = _UNSHOWN.sub("?", " ".join(text.split()))
+    return line if len(line) <= most else line[: most - 3] + "..."
+
+
+def in_markdown(text: str) -> str:
+    """The same where Markdown is read: it says itself and does nothing."""
+    return _MARKDOWN.sub(r"\\\1", shown(text))

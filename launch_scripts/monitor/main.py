@@ -1,18 +1,27 @@
-"""The monitor as a process."""
+"""The monitor as a process: a start of the swarm does not wait for what only draws it."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
+import time
 from collections.abc import Callable
+from typing import cast
 
-from launch_scripts.monitor.loading import FRAME_HZ, LoadingMonitor
 from shared_map.terrain.prepared import load_terrain
+from swarm.bus.bus import Event, Post, WorkDone
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process, Service, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
+
+FRAME_HZ = 10.0
+"""How often the view is drawn for those who look."""
+_TAG = "view"
+_Make = Callable[[Member], Service]
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
@@ -22,8 +31,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
 
-        def load() -> Callable[[Member], Service]:
-            from launch_scripts.monitor.view import load_view  # takes as long as a whole planner's start
+        def load() -> _Make:
+            from launch_scripts.monitor.service import load_view  # takes as long as a whole planner's start
 
             return load_view(setup, terrain, bus, inbox.post, stack)
 
@@ -34,3 +43,57 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         if stop_when is not None:
             end_with(stop_when, process.stop)
         process.run()
+
+
+class LoadingMonitor:
+    """A service that stands for another until that is loaded: rerun, the mesh and the recording take more CPU than
+    the start of any other process. It is a member of its run already: it is alive, answers, and may be ended.
+
+    member  joins when this starts, and is handed on
+    load    called on a thread; returns what makes the service. What it raises ends the process
+    """
+
+    def __init__(self, member: Member, post: Post, load: Callable[[], _Make]) -> None:
+        self._member = member
+        self._post = post
+        self._load = load
+        self._service: Service | None = None
+        self._thread = threading.Thread(target=self._work, name="load-view", daemon=True)
+        member.needs("its view", lambda: self._service is not None)
+
+    @property
+    def counters(self) -> Counters:
+        return self._member.counters
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._thread.start()
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if self._service is not None:
+            self._service.handle(event, now_ns)
+        elif isinstance(event, WorkDone) and event.tag == _TAG:
+            self._service = cast("_Make", event.result)(self._member)
+            self._service.start(now_ns)
+        else:
+            self._member.handle(event)
+
+    def tick(self, now_ns: int) -> None:
+        if self._service is not None:
+            self._service.tick(now_ns)
+        else:
+            self._member.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        """A run that ends before the view is loaded has none, and no recording: nobody waits for it."""
+        if self._service is not None:
+            self._service.stop(now_ns)
+        else:
+            self._member.publish_stats(now_ns)
+
+    def _work(self) -> None:
+        began_ns = time.thread_time_ns()
+        self._post(WorkDone(_TAG, self._load(), time.thread_time_ns() - began_ns))

@@ -1,35 +1,42 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
 It listens, and asks planners for the costs that its layers show. It may be late, stalled, killed or absent; no
-process waits for it.
+process waits for it. It loads rerun, so it is imported while the monitor takes part in its run already.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import rerun as rr
 
-from launch_scripts.monitor.drawing import Drawing
-from launch_scripts.monitor.figures_panel import level_of, summary_markdown
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.figures_panel import FiguresPanel, level_of, summary_markdown
 from launch_scripts.monitor.ground.ground_view import GroundView
-from launch_scripts.monitor.ground.layers import PHOTO, Layer
+from launch_scripts.monitor.ground.legend import PHOTO, Layer, shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.monitor.ground.zones import Area
+from launch_scripts.monitor.ground.zone_areas import Area, scenario_areas
 from launch_scripts.monitor.movers.movers_view import MoversView
-from launch_scripts.monitor.serving.recording_watch import RecordingWatch
-from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.monitor.sinks import RecordingWatch, Sinks, Streams, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
-from launch_scripts.web.loopback_guard import Audience
+from launch_scripts.web.server import Audience
+from shared_map.arrays import give_back_memory
+from shared_map.class_grounds import class_terrains
 from shared_map.cost_map import CostMap
+from shared_map.prepared_classes import load_classes
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
+from shared_map.terrain.prepared import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.classes import class_numbers
+from swarm.config.classes import aloft_classes, class_numbers
+from swarm.config.ground import HiddenConfig
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
@@ -106,23 +113,12 @@ class MonitorService:
         self._target_ids = setup.scenario.target_ids
         self._rec = rec
         self._recording = recording
-        self._drawing = Drawing(rec, self._target_ids)
+        self._panel = FiguresPanel(rec, self._target_ids)
         self._movers = MoversView(rec, self._mesh, setup.scenario, self.figures, self.counters, replica.filter)
-        legend = self._movers.looks.legend()
-        shown = layers or [PHOTO]
         self._ground = GroundView(
-            rec,
-            self._mesh,
-            terrain,
-            cost_map,
-            replica,
-            shown,
-            self._target_ids,
-            truth,
-            zones,
-            legend,
-            list(class_numbers(setup.scenario)),
-        )
+            rec, self._mesh, terrain, cost_map, replica, layers or [PHOTO], self._target_ids, truth, zones,
+            self._movers.looks.legend(), list(class_numbers(setup.scenario)),
+        )  # fmt: skip
         self._observer = RunObserver(bus, post, self.figures, _READ)
         self._audience = audience
         self._watched = False
@@ -153,7 +149,7 @@ class MonitorService:
         self._observer.ask_gone()
         self.figures.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)
-        self._drawing.set_time(0, 0.0)
+        self._panel.set_time(0, 0.0)
         self._begin_drawing()
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -210,7 +206,7 @@ class MonitorService:
             case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
                 self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
             case Note() as note:
-                self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
+                self._panel.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.figures.alive(peer, up, now_ns)
@@ -218,7 +214,7 @@ class MonitorService:
             return
         if up:
             self._gone.pop(peer, None)
-            self._drawing.note(f"{peer.role} {peer.id} is up", "INFO")
+            self._panel.note(f"{peer.role} {peer.id} is up", "INFO")
         else:
             self._gone[peer] = now_ns
 
@@ -228,14 +224,14 @@ class MonitorService:
             del self._gone[peer]
             ended = peer in self._ended
             text = f"{peer.role} {peer.id} {'has ended as asked' if ended else 'is gone'}"
-            self._drawing.note(text, "INFO" if ended else "WARN")
+            self._panel.note(text, "INFO" if ended else "WARN")
 
     def _watch_recording(self, now_ns: int) -> None:
         if self._recording is None:
             return
-        sentence, begun = self._recording.look(now_ns)
+        sentence, begun = self._recording.check(now_ns)
         if begun:
-            self._drawing = Drawing(self._rec, self._target_ids)
+            self._panel = FiguresPanel(self._rec, self._target_ids)
             self._begin_drawing()
         if sentence is not None:
             log.warning("%s", sentence)
@@ -243,7 +239,7 @@ class MonitorService:
 
     def _begin_drawing(self) -> None:
         """Draws all that does not move."""
-        self._drawing.begin()
+        self._panel.begin()
         self._ground.begin()
         self._movers.begin()
 
@@ -259,7 +255,7 @@ class MonitorService:
             self._hear(heard, now_ns)
         self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
-        self._drawing.set_time(self._frame, self._seconds())
+        self._panel.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
         if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
             self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
@@ -278,10 +274,68 @@ class MonitorService:
         sample = self.figures.samples.last
         if sample is not None and sample.time_s != self._last_sample_s:
             self._last_sample_s = sample.time_s
-            self._drawing.plots(sample, sample.messages_per_s)
+            self._panel.plots(sample)
         if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
             return
         self._figures_due_ns = now_ns + NS_PER_S
         summary = self.figures.shown(now_ns)
         self._movers.summarised(summary)
-        self._drawing.summary(summary_markdown(self._setup, summary))
+        self._panel.summary(summary_markdown(self._setup, summary))
+
+
+def load_view(
+    setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, closing: contextlib.ExitStack
+) -> Callable[[Member], MonitorService]:
+    """Prepares what is drawn, opens the recording and the live view's ports, and returns what makes the service.
+
+    Called on a thread of its own, so what it returns is called by the thread that owns the service.
+
+    closing  closes what it opens. Raises SwarmError where a file or a port cannot be opened
+    """
+    scenario = setup.scenario
+    config = scenario.monitor
+    seen = load_terrain(setup)  # mapped once more: of what the mesh has read most is not read again
+    load_classes(setup, seen)
+    aloft = class_terrains(scenario, seen, aloft_classes(scenario))
+    mesh = TerrainMesh(seen, config.height_factor, aloft)
+    del seen, aloft
+    knows_truth = scenario.terrain.hidden != HiddenConfig()
+    layers = shown_layers(scenario, knows_truth=knows_truth)
+    blueprint = make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=config.follow)
+    path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
+    sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint)
+    closing.callback(sinks.close)
+    truth = load_truth(setup, terrain) if knows_truth else None
+    zones = scenario_areas(scenario, terrain.grid)
+
+    def make(member: Member) -> MonitorService:
+        service = MonitorService(
+            setup,
+            terrain,
+            bus,
+            post,
+            sinks.streams,
+            mesh=mesh,
+            web_port=sinks.web_port,
+            recording=None if path is None else RecordingWatch(path, sinks.begin_file),
+            truth=truth,
+            zones=zones,
+            layers=layers,
+            audience=sinks.audience,
+            member=member,
+        )
+        give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
+        sinks.tell_page(lambda: page_facts(setup, service, path))
+        return service
+
+    return make
+
+
+def page_facts(setup: RoleSetup, service: MonitorService, recording: Path | None) -> dict[str, Any]:
+    """What the page says beside the view: how far the run is, and how to open its recording."""
+    return {
+        "life": f"{setup.incarnation:x}",
+        "at_s": service.at_s,
+        "over": service.over,
+        "recording": "" if recording is None else f"rerun {recording}",
+    }

@@ -12,6 +12,7 @@ import sys
 import time
 import urllib.parse
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from launch_scripts.plain_text import plain
@@ -59,14 +60,13 @@ def ask(url: str, *, live: bool) -> Answer:
     except OSError as error:
         raise BusError(f"{url} cannot be reached: {error.strerror or error}") from error
     head, _, body = reply.partition(b"\r\n\r\n")
-    status = head.split(b"\r\n", 1)[0].split(b" ")
-    code = status[1].decode("ascii", "replace") if len(status) > 1 and status[0].startswith(b"HTTP/") else "no HTTP"
-    try:
-        told = json.loads(body) if code in ("200", "503") else None
-    except (ValueError, RecursionError):
-        told = None
+    protocol, code, *_ = [*head.decode("ascii", "replace").split(None, 2), "", ""]
+    told = None
+    if protocol.startswith("HTTP/") and code in ("200", "503"):
+        with suppress(ValueError, RecursionError):
+            told = json.loads(body)
     if not isinstance(told, dict) or "status" not in told:
-        raise BusError(f"{url} answers {code[:20]}: there is no page of health")
+        raise BusError(f"{url} answers {code[:20]!r}: there is no page of health")
     return Answer(code == "200", told)
 
 
@@ -84,12 +84,10 @@ def _place(url: str) -> tuple[str, int, str]:
 
 def _read(connection: socket.socket) -> bytes:
     until_s = time.monotonic() + _TIMEOUT_S
-    reply = b""
-    while len(reply) < _MOST_BYTES:
+    reply = part = connection.recv(65536)
+    while part and len(reply) < _MOST_BYTES:
         connection.settimeout(max(until_s - time.monotonic(), 0.001))
         part = connection.recv(65536)
-        if not part:
-            break
         reply += part
     return reply
 

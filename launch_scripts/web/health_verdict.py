@@ -1,11 +1,14 @@
-"""From what processes say of themselves to what a probe is told. Pure: no socket, no clock."""
+"""From what processes say of themselves to what a probe is told. No socket."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
+from launch_scripts.web import Page, Reply
 from swarm.clock import NS_PER_S
 from swarm.runtime.health import Phase, Vitals
 
@@ -13,7 +16,7 @@ HEALTHY, READY = "/healthz", "/readyz"
 
 
 class Process(NamedTuple):
-    """One process, as whoever watches it sees it.
+    """One process, as its watcher sees it.
 
     name    role and id, such as planner-t0
     vitals  what it has said last; None: nothing yet
@@ -24,37 +27,29 @@ class Process(NamedTuple):
     vitals: Vitals | None
     ended: str | None = None
 
-    def wrong(self, now_ns: int) -> str | None:
-        """Why it does not live, in words; None: it does, as far as can be told. One that has ended is its
-        supervisor's to start again, and does not hang."""
-        if self.ended is None and self.vitals is not None and self.vitals.hangs(now_ns):
-            return f"its loop hangs for {(now_ns - self.vitals.stamp_ns) / NS_PER_S:.0f} s"
-        return None
-
-    def lacks(self, now_ns: int) -> tuple[str, ...]:
-        """What it lacks to do its job, in words; nothing if it is ready."""
+    def seen(self, now_ns: int) -> tuple[str, str | None, tuple[str, ...]]:
+        """(state, why it does not live, what it lacks to do its job). A process that has ended does not hang: its
+        supervisor starts it again."""
         if self.ended is not None:
-            return (self.ended,)
+            return "ended", None, (self.ended,)
         if self.vitals is None:
-            return ("its start",)
-        wrong = self.wrong(now_ns)
-        return self.vitals.lacks if wrong is None else (wrong,)
+            return "starts", None, ("its start",)
+        if self.vitals.hangs(now_ns):
+            wrong = f"its loop hangs for {(now_ns - self.vitals.stamp_ns) / NS_PER_S:.0f} s"
+            return "hangs", wrong, (wrong,)
+        return self.vitals.phase.name.lower(), None, self.vitals.lacks
 
     def fields(self, now_ns: int) -> dict[str, object]:
-        state = "ended" if self.ended is not None else "starts"
-        if self.ended is None and self.vitals is not None:
-            state = "hangs" if self.vitals.hangs(now_ns) else _STATES[self.vitals.phase]
-        told: dict[str, object] = {"name": self.name, "state": state, "lacks": list(self.lacks(now_ns))}
+        """What is told of the process as JSON."""
+        state, _, lacks = self.seen(now_ns)
+        told: dict[str, object] = {"name": self.name, "state": state, "lacks": list(lacks)}
         if self.ended is None and self.vitals is not None and self.vitals.phase is Phase.RUNS:
             told["ticked_s_ago"] = round((now_ns - self.vitals.stamp_ns) / NS_PER_S, 3)
         return told
 
 
-_STATES = {Phase.STARTS: "starts", Phase.RUNS: "runs", Phase.ENDS: "ends"}
-
-
 class Verdict(NamedTuple):
-    """Answer to a probe.
+    """The answer to a probe.
 
     missing  what is wrong, or not there, one sentence each; empty if all is well
     """
@@ -65,6 +60,7 @@ class Verdict(NamedTuple):
 
     @property
     def ok(self) -> bool:
+        """True if all is well."""
         return not self.missing
 
     @property
@@ -80,9 +76,19 @@ def verdict(question: str, processes: Sequence[Process], now_ns: int) -> Verdict
     """
     missing: list[str] = []
     for each in processes:
-        if question == READY:
-            missing += [f"{each.name}: {need}" for need in each.lacks(now_ns)]
-        elif (wrong := each.wrong(now_ns)) is not None:
-            missing.append(f"{each.name}: {wrong}")
-    words = ("ready", "not ready") if question == READY else ("healthy", "not healthy")
-    return Verdict(words[bool(missing)], tuple(missing), tuple(each.fields(now_ns) for each in processes))
+        _, wrong, lacks = each.seen(now_ns)
+        found = lacks if question == READY else () if wrong is None else (wrong,)
+        missing += [f"{each.name}: {need}" for need in found]
+    word = "ready" if question == READY else "healthy"
+    status = f"not {word}" if missing else word
+    return Verdict(status, tuple(missing), tuple(each.fields(now_ns) for each in processes))
+
+
+def health_pages(processes: Callable[[], Sequence[Process]]) -> dict[str, Page]:
+    """The two pages that probes ask for: 200 if all is well, 503 otherwise, with the reasons as JSON."""
+
+    def answer(question: str, query: str, headers: object) -> Reply:
+        found = verdict(question, processes(), time.monotonic_ns())
+        return Reply(200 if found.ok else 503, "application/json", found.body)
+
+    return {question: partial(answer, question) for question in (HEALTHY, READY)}

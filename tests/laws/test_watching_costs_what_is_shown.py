@@ -15,7 +15,7 @@ from support.target_reports import fleet
 from launch_scripts.launcher.watcher import Watcher
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED
-from launch_scripts.web.loopback_guard import Audience
+from launch_scripts.web.server import Audience
 from swarm.bus.memory_bus import MemoryBus
 from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import FLEET, FOLLOWED

@@ -22,7 +22,7 @@ from support.fake_run import fake_run
 from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
 
 from launch_scripts.monitor.blueprint import BACKGROUND
-from launch_scripts.web.view_page import viewer_program
+from launch_scripts.web.live_page import viewer_program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -77,10 +77,10 @@ def until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: floa
 def test_a_browser_shows_the_ground_and_each_target_with_its_vehicles_and_asks_nobody_else(
     shown: Rig, tmp_path: Path
 ) -> None:
-    assert shown.sinks.live_url is not None
+    assert shown.sinks.page is not None
     browser = Browser(tmp_path / "profile", SIZE)
     try:
-        browser.open(shown.sinks.live_url)
+        browser.open(shown.sinks.page.server.url)
         until_complete(browser.screenshot, tmp_path, within_s=200)
         hosts = {urllib.parse.urlparse(url).hostname for url in browser.reached if url.startswith("http")}
         assert hosts == {"127.0.0.1"}

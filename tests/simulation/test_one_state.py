@@ -203,8 +203,8 @@ class Watched:
         self.monitor._figures_due_ns = 0
         self.monitor.tick(now_ns)
         movers = self.monitor._movers
-        for due in (movers._vehicles._due, movers._targets._due):
-            due._next_ns = dict.fromkeys(due._next_ns, 0)
+        for limit in (movers._vehicles._limit, movers._limit):
+            limit._next_ns = dict.fromkeys(limit._next_ns, 0)
         movers._fleets_new = True
         self.monitor.tick(now_ns)
 

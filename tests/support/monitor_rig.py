@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.ground.layers import shown_layers
+from launch_scripts.monitor.ground.legend import shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.serving.sinks import Sinks
-from launch_scripts.web.loopback_guard import Audience
+from launch_scripts.monitor.sinks import Sinks
+from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.clock import NS_PER_S

@@ -1,32 +1,35 @@
-"""What lies still in the view: decides which tiles, zones and windows are drawn again, and when."""
+"""Draws what lies still on a recording stream: decides which tiles, zones and windows are drawn again, and when.
+
+Few entities, style logged once: see docs/decisions/0008-the-live-view.md.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.ground.cost_to_go import CostSamples
-from launch_scripts.monitor.ground.ground_colours import GroundColours
-from launch_scripts.monitor.ground.ground_drawing import GroundDrawing
-from launch_scripts.monitor.ground.layers import (
+from launch_scripts.monitor.figures_panel import shown
+from launch_scripts.monitor.ground.cost_to_go import CostSamples, TargetPictures
+from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW, GroundColours
+from launch_scripts.monitor.ground.legend import (
     COST,
     KNOWN,
     LEARNED,
     NEAREST,
     PHOTO,
+    ZONE_COLOURS,
     Layer,
-    legends,
-    nearest_legend,
+    still_legend,
     to_target_legend,
 )
-from launch_scripts.monitor.ground.target_layers import TargetPictures
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.ground.windows import window_outlines
-from launch_scripts.monitor.ground.zones import Area, closed_cells, ordered_areas
-from launch_scripts.monitor.movers.looks import Look
-from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
+from launch_scripts.monitor.ground.zone_areas import Area, borders, closed_cells, ordered_areas, title_places
+from launch_scripts.monitor.movers.styles import Look
+from launch_scripts.monitor.sinks import Streams
+from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
@@ -36,14 +39,24 @@ from swarm.wire.messages.planning import CostReply, PlannerStatus
 
 _WINDOWS_NS = NS_PER_S
 _LAYER_NS = 5 * NS_PER_S
+_NEAREST_NS = 8 * NS_PER_S
 _UNSEEN = 4
 """While nobody looks the ground is drawn so many times as seldom, for the recording."""
+_TILES_AT_ONCE = 80
 _ALL_NAMED, _NAMED_SHARE = 4, 0.12
 """So many windows all have names. Of more, those of a share of the terrain's width: in a small one stands its
 target, which has a name."""
+_NAMES_SHOWN = 40
 _MOST_TARGETS = 256
 """Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""
-_NEAREST_NS = 8 * NS_PER_S
+_MARGIN_COLOUR = (200, 206, 214)
+_LINE, _NO_BALL = -1.3, -0.1
+"""Radii in points of the viewer's window, the same at every zoom: rerun takes negative radii so."""
+_WHOLE_SIDE = 112
+_BAR_SHARE = 0.25
+"""Of the terrain's width, at most."""
+SIDE_POINTS = 33
+"""Points along each side of a window: its outline follows the terrain."""
 
 
 @dataclass(eq=False)
@@ -53,13 +66,11 @@ class _Tiles:
 
     layer      whose tiles these are
     every_ns   how often tiles that are out of date are drawn
-    at_once    how many at most
     """
 
     layer: Layer
     picture: Callable[[Window], Bytes]
     every_ns: int
-    at_once: int
     due_ns: int = 0
 
     def __post_init__(self) -> None:
@@ -76,10 +87,8 @@ class _Tiles:
     def looks_new(self, tile: int, image: Bytes) -> bool:
         """Whether a tile has other pixels than when this was asked last."""
         pixels = hash(image.tobytes())
-        if self._shown.get(tile) == pixels:
-            return False
-        self._shown[tile] = pixels
-        return True
+        before, self._shown[tile] = self._shown.get(tile), pixels
+        return before != pixels
 
 
 class GroundView:
@@ -107,21 +116,18 @@ class GroundView:
         movers: Sequence[Look] = (),
         classes: Sequence[str] = (),
     ) -> None:
-        self._classes = classes
-        self._mesh, self._cost_map, self._replica, self._zones = mesh, cost_map, replica, list(zones)
-        self._movers = movers
-        self._cells = terrain.grid.cells
-        self._drawing = GroundDrawing(rec, mesh)
+        self._rec, self._mesh, self._cost_map, self._replica = rec, mesh, cost_map, replica
+        self._zones, self._movers, self._classes = list(zones), movers, classes
         self._colours = colours = GroundColours(
             mesh, terrain, cost_map.ground_s_per_m, truth, cost_map.prior_s_per_m
         )
         self._colours.close(closed_cells(self._zones))
         self._shown, self._target_ids = list(layers), list(targets)
         tiled = (
-            _Tiles(PHOTO, colours.photo_of, NS_PER_S, 80),
-            _Tiles(COST, colours.cost_of, _LAYER_NS, 80),
-            _Tiles(KNOWN, colours.known_of, _LAYER_NS, 80),
-            _Tiles(LEARNED, colours.learned_of, _LAYER_NS, 80),
+            _Tiles(PHOTO, colours.photo_of, NS_PER_S),
+            _Tiles(COST, colours.cost_of, _LAYER_NS),
+            _Tiles(KNOWN, colours.known_of, _LAYER_NS),
+            _Tiles(LEARNED, colours.learned_of, _LAYER_NS),
         )
         self._layers = [each for each in tiled if each.layer in layers]
         self._targets = [layer for layer in layers if layer.target is not None]
@@ -135,30 +141,41 @@ class GroundView:
         self._windows_new, self._windows_due_ns = False, 0
 
     def begin(self) -> None:
-        """Draws all of it."""
-        tiled = [each.layer.entity for each in self._layers if each.layer is not PHOTO]
-        wholes = [layer.entity for layer in self._shown if layer not in (each.layer for each in self._layers)]
-        self._drawing.begin(tiled, wholes, legends(self._colours, self._shown, self._movers), self._zones)
-        if NEAREST in self._shown:
-            self._drawing.legend(NEAREST.name, nearest_legend(self._target_ids, self._movers))
+        """Draws all of it. What never changes is static: the shape of the ground, legends, the scenario's zones."""
+        self._rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        tiled = [each.layer for each in self._layers]
+        fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
+        whole = [self._mesh.whole(_WHOLE_SIDE)]
+        for layer in self._shown:
+            for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in tiled else whole):
+                self._rec.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
+            self._legend(layer, still_legend(layer, self._colours, self._target_ids, self._movers))
+        style = rr.LineStrips3D.from_fields(colors=[WINDOW], radii=[_LINE])
+        self._rec.log("world/windows", style, static=True)
+        lines, texts, places = map_margin(self._mesh)
+        bars = rr.LineStrips3D(lines, colors=[_MARGIN_COLOUR], radii=[_LINE])
+        self._rec.log("world/margin", bars, static=True)
+        self._rec.log("world/margin/texts", _texts(places, texts, [_MARGIN_COLOUR]), static=True)
+        self._draw_zones("planned", self._zones, static=True)
         self._pictures.full_s = 0.0  # so that the next answer draws a legend
         self.draw_anew()
         self.finish()
 
     def draw_anew(self) -> None:
         """What is drawn on change only is drawn once more, when it is due."""
-        self._drawing.ordered(self._ordered)
+        self._draw_zones("ordered", self._ordered, static=False)
         self._windows_new = bool(self._windows)
         for layer in self._layers:
             layer.draw_anew(self._mesh.tiles)
 
     def finish(self) -> None:
         """Draws all tiles that are out of date."""
-        self._look_for_changes()
+        self._take_changes()
         for layer in self._layers:
             self._draw_tiles(layer, self._mesh.tiles)
 
     def hear_status(self, status: PlannerStatus) -> None:
+        """Takes in which window a planner grew last."""
         if status.target not in self._windows and len(self._windows) >= _MOST_TARGETS + len(self._target_ids):
             return
         self.samples.hear_target(status.target)
@@ -176,17 +193,21 @@ class GroundView:
                 self._draw_to_target(layer, reply.target)
         if NEAREST in self._shown and now_ns >= self._nearest_due_ns and self.samples.costs_s:
             self._nearest_due_ns = now_ns + _NEAREST_NS
-            self._drawing.texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
+            self._texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
     def tick(self, now_ns: int, watched: bool) -> None:
         """Draws what has changed, now and then."""
         slower = 1 if watched else _UNSEEN
-        self._look_for_changes()
-        self._draw_ordered(now_ns)
+        self._take_changes()
+        if self._zones_version != self._replica.zones_version:
+            self._zones_version = self._replica.zones_version
+            self._ordered = ordered_areas(self._replica, now_ns, self._classes)
+            self._colours.close(closed_cells([*self._zones, *self._ordered]))
+            self._draw_zones("ordered", self._ordered, static=False)  # they come and go
         for layer in self._layers:
             if now_ns >= layer.due_ns:
                 layer.due_ns = now_ns + slower * layer.every_ns
-                self._draw_tiles(layer, layer.at_once)
+                self._draw_tiles(layer, _TILES_AT_ONCE)
         if self._windows_new and now_ns >= self._windows_due_ns:
             self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
             self._draw_windows()
@@ -195,7 +216,7 @@ class GroundView:
         """The target whose planner is to be asked for costs now, if it is time."""
         return self.samples.next_target(now_ns, 1 if watched else _UNSEEN)
 
-    def _look_for_changes(self) -> None:
+    def _take_changes(self) -> None:
         for window in self._cost_map.take_dirty():
             changed = dict.fromkeys(self._mesh.tiles_touching(window))
             for layer in self._layers:
@@ -206,37 +227,101 @@ class GroundView:
             del layer.stale[tile]
             image = layer.picture(self._mesh.tile_window(tile))
             if layer.looks_new(tile, image):
-                self._drawing.texture(layer.layer.entity, tile, image)
+                self._texture(layer.layer.entity, tile, image)
+
+    def _texture(self, entity: str, tile: int, image: Bytes) -> None:
+        """Logs the pixels of a tile. Not static: a viewer which joins late gets only recent data."""
+        height, width, _ = image.shape
+        form = rr.components.ImageFormat(width=width, height=height, color_model="RGB", channel_datatype="U8")
+        pixels = np.ascontiguousarray(image).tobytes()
+        texture = rr.Mesh3D.from_fields(albedo_texture_buffer=pixels, albedo_texture_format=form)
+        self._rec.log(f"{entity}/{tile}", texture)
+
+    def _legend(self, layer: Layer, picture: bytes | None) -> None:
+        if picture is not None:
+            image = rr.EncodedImage(contents=picture, media_type="image/png")
+            self._rec.log(f"legend/{layer.name}", image, static=True)
 
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
-        self._drawing.texture(layer.entity, 0, self._pictures.to_target(target))
-        tree = self._pictures.tree(target)
-        self._drawing.tree(layer.entity, tree.lines, tree.radii)
+        self._texture(layer.entity, 0, self._pictures.to_target(target))
+        lines, radii = self._pictures.tree(target)
+        self._rec.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
-            self._drawing.legend(layer.name, to_target_legend(target, self._pictures.full_s, self._movers))
+            self._legend(layer, to_target_legend(target, self._pictures.full_s, self._movers))
 
-    def _draw_ordered(self, now_ns: int) -> None:
-        """Draws operators' zones when they change."""
-        version = self._replica.zones_version
-        if version == self._zones_version:
-            return
-        self._zones_version = version
-        self._ordered = ordered_areas(self._replica, now_ns, self._classes)
-        self._colours.close(closed_cells([*self._zones, *self._ordered]))
-        self._drawing.ordered(self._ordered)
+    def _draw_zones(self, whose: str, zones: Sequence[Area], *, static: bool) -> None:
+        parts = [borders(self._mesh, area) for area in zones]
+        strips = np.concatenate([np.empty((0, 2, 3), np.float32), *parts])
+        per_zone = np.array([ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
+        colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
+        path = f"world/zones/{whose}"
+        self._rec.log(path, rr.LineStrips3D(strips, colors=colours, radii=[_LINE]), static=static)
+        named = zones[:_NAMES_SHOWN]
+        pale = (per_zone[:_NAMES_SHOWN].astype(np.uint16) + 2 * 255) // 3  # on their own hatches names would drown
+        texts = _texts(title_places(self._mesh, named), [area.title for area in named], pale.astype(np.uint8))
+        self._rec.log(f"{path}/names", texts, static=static)
 
     def _draw_windows(self) -> None:
         """Draws the window that each planner grew last, unless it is the whole terrain."""
-        told = (
-            (target, Window(*self._windows[target])) for target in sorted(self._windows) if self._windows[target]
-        )
-        parts = {target: w for target, w in told if not w.empty and w.cells < self._cells}
         grid = self._mesh.grid
-        least = _NAMED_SHARE * max(grid.rows, grid.cols)
-        few = len(parts) <= _ALL_NAMED
-        names = [
-            f"window of {target}" if few or max(w.row1 - w.row0, w.col1 - w.col0) >= least else None
-            for target, w in parts.items()
-        ]
-        self._drawing.windows(window_outlines(self._mesh, list(parts.values())), names)
+        told = [(target, Window(*window)) for target, window in sorted(self._windows.items()) if window]
+        parts = [(target, w) for target, w in told if not w.empty and w.cells < grid.cells]
+        outlines = window_outlines(self._mesh, [window for _, window in parts])
+        least = 0.0 if len(parts) <= _ALL_NAMED else _NAMED_SHARE * max(grid.rows, grid.cols)
+        named = [n for n, (_, w) in enumerate(parts) if max(w.row1 - w.row0, w.col1 - w.col0) >= least]
+        named = named[:_NAMES_SHOWN]
+        names = [f"window of {parts[n][0]}" for n in named]
+        south = outlines[named, 5 * SIDE_POINTS // 2]
+        self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=outlines))
+        self._rec.log("world/windows/names", _texts(south, names, [WINDOW]))
+
+
+def window_outlines(mesh: TerrainMesh, windows: Sequence[Window]) -> Floats:
+    """The border of each window, laid over the terrain: float32 (n, 4 * SIDE_POINTS, 3)."""
+    sides = np.array([(w.row0, w.row1 - 1, w.col0, w.col1 - 1) for w in windows], np.int64).reshape(-1, 4).T
+    north, south = np.clip(sides[:2], 0, mesh.grid.rows - 1)[..., None]
+    west, east = np.clip(sides[2:], 0, mesh.grid.cols - 1)[..., None]
+    along = np.linspace(0, 1, SIDE_POINTS)
+    down, across = (north + (south - north) * along).astype(int), (west + (east - west) * along).astype(int)
+    flat = np.zeros(SIDE_POINTS, int)
+    rows = np.concatenate([north + flat, down, south + flat, down[:, ::-1]], axis=1)
+    cols = np.concatenate([across, east + flat, across[:, ::-1], west + flat], axis=1)
+    return mesh.place_cells(rows * mesh.grid.cols + cols, 0.25 * mesh.scale_m)
+
+
+def map_margin(mesh: TerrainMesh) -> tuple[Floats, list[str], Floats]:
+    """What a map has in its margin, south of the terrain and level with its lowest ground: a bar of known length in
+    the west, an arrow to the north in the east, how much heights are stretched. Lines float32 (n, 2, 3), and texts
+    at places float32 (n, 3)."""
+    unit, south = mesh.scale_m, -mesh.depth_m - 3 * mesh.scale_m
+    length_m = round_length(_BAR_SHARE * mesh.width_m)
+    east, beneath = mesh.width_m - unit, south - 1.5 * unit
+    lines = [((0.0, south), (length_m, south))]
+    lines += [((x, south - unit / 2), (x, south + unit / 2)) for x in (0.0, length_m / 2, length_m)]
+    tip = (east, south + 1.5 * unit)
+    lines += [((east, south - 2.5 * unit), tip), *((tip, (east + side * unit, south)) for side in (-0.8, 0.8))]
+    texts = {
+        "0": (0.0, beneath), said_length(length_m): (length_m, beneath), "N": (east - 2.2 * unit, south),
+        said_heights(mesh.stretch): (mesh.width_m / 2, beneath),
+    }  # fmt: skip
+    level = ((0, 0), (0, 1))
+    places = np.pad(np.array(list(texts.values()), np.float32), level)
+    return np.pad(np.array(lines, np.float32), ((0, 0), *level)), list(texts), places
+
+
+def said_heights(stretch: float) -> str:
+    """How high heights are drawn, in words."""
+    return "heights to scale" if stretch == 1 else f"heights x {stretch:.2g}"
+
+
+def _mesh(tile: MeshTile) -> rr.Mesh3D:
+    return rr.Mesh3D.from_fields(
+        vertex_positions=tile.vertices, triangle_indices=tile.triangles, vertex_texcoords=tile.texcoords
+    )
+
+
+def _texts(places: Floats, texts: list[str], colours: Sequence[tuple[int, ...]] | Bytes) -> rr.Points3D:
+    return rr.Points3D(
+        places, labels=[shown(text, 60) for text in texts], colors=colours, radii=[_NO_BALL], show_labels=True
+    )

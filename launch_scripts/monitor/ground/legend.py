@@ -1,18 +1,23 @@
-"""The legend of each layer, as a picture: a text panel of the viewer can show neither colours nor pictures."""
+"""The layers between which a person switches, one tab each of the same swarm on other ground, and their legends.
+
+A legend is a picture, as a text panel of the viewer can show neither colours nor pictures.
+"""
 
 from __future__ import annotations
 
 import functools
 import io
-from dataclasses import dataclass
-from typing import assert_never
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from launch_scripts.monitor.ground import ground_colours as colours
-from launch_scripts.monitor.movers.looks import Colour, Look
+from launch_scripts.monitor.ground.cost_to_go import unit_of
+from launch_scripts.monitor.movers.styles import HUES, Colour, Look
 from launch_scripts.observe import palette
+from swarm.config.scenario import Scenario
 
 BACKGROUND = (17, 22, 28)
 WIDTH_PX, HEIGHT_PX = 1840, 156
@@ -23,10 +28,36 @@ _SIZE_PX, _SWATCH_PX, _GAP_PX = 21, (40, 18), 30
 _LEFT_PX, _SCALE_PX = 14, 420
 _FINE = 4
 """Shapes are drawn so many times as large, and then made smaller, so that their edges are smooth."""
+ZONE_COLOURS: dict[str, Colour] = {
+    "no-go": colours.NO_GO,
+    "slow": colours.SLOW_MARK,
+    "quick": colours.FAST_MARK,
+    "pace": palette.rgb(palette.PINK),
+}
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
+class Layer(NamedTuple):
+    """A tab of the view.
+
+    name    of its legend
+    entity  which has the ground of this layer
+    target  whose routes alone it shows; None for all
+    """
+
+    name: str
+    title: str
+    entity: str
+    target: str | None = None
+
+
+PHOTO = Layer("photo", "Photo", "world/ground")
+COST = Layer("cost", "Cost", "world/layers/cost")
+KNOWN = Layer("known", "Known and true", "world/layers/known")
+LEARNED = Layer("learned", "Learned", "world/layers/learned")
+NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest")
+
+
+class Scale(NamedTuple):
     """A bar of colours, evenly between those named, and texts evenly along it."""
 
     colours: tuple[str, ...]
@@ -34,34 +65,73 @@ class Scale:
     texts: tuple[str, ...]
 
 
-WINDOW = Look("line", colours.WINDOW, "part grown last")
-ZONE_COLOURS: dict[str, Colour] = {
-    "no-go": colours.NO_GO,
-    "slow": colours.SLOW_MARK,
-    "quick": colours.FAST_MARK,
-    "pace": palette.rgb(palette.PINK),
+_WINDOW = Look("line", colours.WINDOW, "part grown last")
+_CLOSED = (Look("hatch", colours.HATCH, "known to be lethal"), Look("hatch", colours.NO_GO, "no-go zone"))
+_ENTRIES = {
+    PHOTO: (
+        *_CLOSED,
+        Look("fill", colours.LETHAL_MARK, "found lethal"),
+        Look("fill", colours.SLOW_MARK, "found slow"),
+        Look("fill", colours.FAST_MARK, "found quick"),
+    ),
+    COST: (*_CLOSED, Look("fill", colours.LETHAL_PRIOR, "found lethal")),
+    KNOWN: (
+        Look("fill", colours.FOUND, "hidden, and found"),
+        Look("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
+        Look("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
+        Look("fill", colours.OVERRULED, "marked or ordered, yet not so"),
+    ),
+    LEARNED: _CLOSED,
 }
-CLOSED = (
-    Look("hatch", colours.HATCH, "known to be lethal"),
-    Look("hatch", colours.NO_GO, "no-go zone"),
-)
-FOUND = (
-    Look("fill", colours.LETHAL_MARK, "found lethal"),
-    Look("fill", colours.SLOW_MARK, "found slow"),
-    Look("fill", colours.FAST_MARK, "found quick"),
-)
-TO_TARGET = (
+_TO_TARGET = (
     Look("line", colours.TREE, "where the cost falls most"),
     Look("fill", colours.UNREACHED, "no way from here"),
     Look("fill", colours.LETHAL_PRIOR, "lethal"),
 )
-LETHAL_COST = Look("fill", colours.LETHAL_PRIOR, "found lethal")
-KNOWN_OR_NOT = (
-    Look("fill", colours.FOUND, "hidden, and found"),
-    Look("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
-    Look("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
-    Look("fill", colours.OVERRULED, "marked or ordered, yet not so"),
-)
+
+
+def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
+    """The layers of a run, in order of their tabs."""
+    targets = scenario.target_ids
+    shown = [PHOTO, COST]
+    if knows_truth:
+        shown.append(KNOWN)
+    if scenario.map.learning:
+        shown.append(LEARNED)
+    if targets:
+        target = scenario.monitor.show_target or targets[0]
+        shown.append(Layer("to_target", f"To {target}", "world/layers/to_target", target))
+    if len(targets) > 1:
+        shown.append(NEAREST)
+    return shown
+
+
+def still_legend(
+    layer: Layer, ground: colours.GroundColours, targets: Sequence[str], movers: Sequence[Look]
+) -> bytes | None:
+    """PNG of the legend of a layer which stays as it is; None where it changes with the costs.
+
+    targets  in order of their colours, of which as many are named as there are
+    movers   what it says of all that moves
+    """
+    scale = None
+    if layer == COST:  # from dear to cheap, evenly in the logarithm of the pace
+        paces = np.geomspace(ground.slowest_s_per_m, ground.quickest_s_per_m, 5)
+        scale = Scale(colours.COST_COLOURS, "seconds a kilometre", tuple(f"{pace * 1000:.3g}" for pace in paces))
+    if layer == LEARNED:
+        scale = Scale(colours.LEARNED_COLOURS, "times the prior pace", ("1/4", "1/2", "1", "2", "4"))
+    entries = _ENTRIES.get(layer)
+    if layer == NEAREST:
+        entries = tuple(Look("fill", hue, f"nearest: {id}") for id, hue in zip(targets, HUES, strict=False))
+    return None if entries is None else legend_picture((*entries, _WINDOW, *movers), scale)
+
+
+def to_target_legend(target: str, full_s: float, movers: Sequence[Look] = ()) -> bytes:
+    """PNG of the legend of a cost-to-go, of which so much is at the end of the scale."""
+    unit, unit_s = unit_of(full_s)
+    texts = tuple(f"{full_s * n / 5 / unit_s:.3g}" for n in range(6))
+    scale = Scale(colours.COST_TO_GO_COLOURS, f"{unit} to {target}", texts)
+    return legend_picture((*_TO_TARGET, _WINDOW, *movers), scale)
 
 
 @functools.lru_cache(maxsize=16)
@@ -89,9 +159,7 @@ def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> byt
             draw.text((left + _SWATCH_PX[0] + 12, middle), entry.meaning, _TEXT, font, anchor="lm")
         left += width
     file = io.BytesIO()
-    image.save(
-        file, "PNG", compress_level=1
-    )  # of a scale that changes all the time most of the work was to pack it
+    image.save(file, "PNG", compress_level=1)  # of a scale that changes all the time most of the work is to pack it
     return file.getvalue()
 
 
@@ -101,14 +169,14 @@ def _swatch(look: Look) -> Image.Image:
     image = Image.new("RGB", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(image)
     middle, radius, colour, thick = width // 2, height // 2, look.colour, 2 * _FINE
-    square = (middle - radius, 0, middle + radius - 1, height - 1)
+    square, whole = (middle - radius, 0, middle + radius - 1, height - 1), (0, 0, width - 1, height - 1)
     match look.shape:
         case "fill":
-            draw.rectangle((0, 0, width - 1, height - 1), colour, _TEXT, _FINE // 2)
+            draw.rectangle(whole, colour, _TEXT, _FINE // 2)
         case "hatch":
             for start in range(-height, width, height // 2):
                 draw.line((start, height, start + height, 0), colour, thick)
-            draw.rectangle((0, 0, width - 1, height - 1), None, colour, _FINE)
+            draw.rectangle(whole, None, colour, _FINE)
         case "line":
             draw.line((0, radius, width, radius), colour, 2 * thick)
         case "ball":
@@ -122,8 +190,6 @@ def _swatch(look: Look) -> Image.Image:
         case "pin":
             draw.line((middle, radius // 2, middle, height), colour, thick)
             draw.ellipse((middle - radius // 2, 0, middle + radius // 2, radius), colour)
-        case _:
-            assert_never(look.shape)
     return image.resize(_SWATCH_PX, Image.Resampling.LANCZOS)
 
 
@@ -133,7 +199,7 @@ def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, scale: Scale) -> 
     draw.text((_LEFT_PX, top), scale.title, _TEXT, font, anchor="lm")
     bar = colours.between(scale.colours, _SCALE_PX).astype(np.uint8)
     image.paste(Image.fromarray(np.repeat(bar[None], 28, axis=0)), (_LEFT_PX, top + 20))
+    last = len(scale.texts) - 1
     for n, text in enumerate(scale.texts):
-        share = n / (len(scale.texts) - 1)
-        anchor = "lm" if n == 0 else "rm" if share == 1 else "mm"
-        draw.text((_LEFT_PX + share * _SCALE_PX, top + 66), text, _TEXT, small, anchor=anchor)
+        anchor = {0: "lm", last: "rm"}.get(n, "mm")
+        draw.text((_LEFT_PX + n / last * _SCALE_PX, top + 66), text, _TEXT, small, anchor=anchor)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from shared_map.terrain.pyramid import level_of
 from shared_map.terrain.terrain import Terrain
@@ -29,16 +30,10 @@ _RELIEF = 0.09
 """Height of the view, from the lowest to the highest cell, as a share of the terrain's width."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeshTile:
-    """A piece of the terrain's mesh.
+class MeshTile(NamedTuple):
+    """A piece of the terrain's mesh: vertices float32 (n, 3), triangles uint32 (m, 3), and texcoords float32
+    (n, 2), 0..1 over the photo of the piece's window."""
 
-    window     cells whose photo covers it, one row and column more than its own, so that pieces join without seams
-    vertices   float32 (n, 3); triangles uint32 (m, 3); texcoords float32 (n, 2), 0..1 over the window's photo
-    """
-
-    index: int
-    window: Window
     vertices: Floats
     triangles: NDArray[np.uint32]
     texcoords: Floats
@@ -90,29 +85,18 @@ class TerrainMesh:
         return max(self.width_m, self.depth_m) / 100
 
     def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
-        """Points on the terrain, float32 (n, 3), lifted by some metres of the view."""
+        """Points on the terrain, float32 (n, 3), lifted by some metres of the view. Outside, the ground is as high
+        as at its border."""
         east_m, south_m = np.asarray(east_m, np.float32), np.asarray(south_m, np.float32)
-        seen = self.seen.grid
-        rows = np.clip(south_m / seen.resolution_m - 0.5, 0, seen.rows - 1)
-        cols = np.clip(east_m / seen.resolution_m - 0.5, 0, seen.cols - 1)
-        row0, col0 = rows.astype(np.intp), cols.astype(np.intp)
-        row1, col1 = np.minimum(row0 + 1, seen.rows - 1), np.minimum(col0 + 1, seen.cols - 1)
-        down, right = rows - row0, cols - col0
-        h = self.heights_m
-        upper = h[row0, col0] * (1 - right) + h[row0, col1] * right
-        lower = h[row1, col0] * (1 - right) + h[row1, col1] * right
-        up = upper * (1 - down) + lower * down + above_m
+        row_col = np.stack([south_m, east_m]) / self.seen.grid.resolution_m - 0.5
+        up = map_coordinates(self.heights_m, row_col, order=1, mode="nearest") + above_m
         return np.stack([east_m, -south_m, up], axis=-1).astype(np.float32)
 
     def place_cells(self, cells: NDArray[np.integer], above_m: float = 0.0) -> Floats:
         """Centres of cells on the terrain, float32 (n, 3)."""
-        rows, cols = np.divmod(np.asarray(cells, np.int64), self.grid.cols)
-        resolution_m = np.float32(self.grid.resolution_m)
-        return self.place(
-            ((cols + 0.5) * resolution_m).astype(np.float32),
-            ((rows + 0.5) * resolution_m).astype(np.float32),
-            above_m,
-        )
+        south_east = np.stack(np.divmod(np.asarray(cells, np.int64), self.grid.cols)) + 0.5
+        south_m, east_m = (south_east * self.grid.resolution_m).astype(np.float32)
+        return self.place(east_m, south_m, above_m)
 
     @property
     def tiles(self) -> int:
@@ -120,7 +104,16 @@ class TerrainMesh:
 
     def mesh_tiles(self, coarser: int = 1) -> list[MeshTile]:
         """All tiles of the terrain's mesh, with vertices so many times as far apart."""
-        return [self._mesh_tile(index, coarser * self.step) for index in range(self.tiles)]
+        step = coarser * self.step
+        windows = [self.tile_window(index) for index in range(self.tiles)]
+        return [
+            self._piece(
+                window,
+                _stepped(window.row0, window.row1, step, self.tile_cells),
+                _stepped(window.col0, window.col1, step, self.tile_cells),
+            )
+            for window in windows
+        ]
 
     def whole(self, side: int) -> MeshTile:
         """The terrain in one piece, with at most so many vertices along a side."""
@@ -128,9 +121,10 @@ class TerrainMesh:
             np.unique(np.linspace(0, count - 1, min(side, count)).astype(np.int64))
             for count in (self.grid.rows, self.grid.cols)
         )
-        return self._piece(0, Window(0, 0, self.grid.rows, self.grid.cols), rows, cols)
+        return self._piece(Window(0, 0, self.grid.rows, self.grid.cols), rows, cols)
 
     def tile_window(self, index: int) -> Window:
+        """The cells whose photo covers a tile: a step more than its own, so that tiles join without seams."""
         tile_row, tile_col = divmod(index, self.tile_cols)
         row0, col0 = tile_row * self.tile_cells, tile_col * self.tile_cells
         return Window(
@@ -147,27 +141,16 @@ class TerrainMesh:
         cols = range(max(window.col0 - reach, 0) // self.tile_cells, (window.col1 - 1) // self.tile_cells + 1)
         return [row * self.tile_cols + col for row in rows for col in cols]
 
-    def _mesh_tile(self, index: int, step: int) -> MeshTile:
-        window = self.tile_window(index)
-        rows = _stepped(window.row0, window.row1, step, self.tile_cells)
-        cols = _stepped(window.col0, window.col1, step, self.tile_cells)
-        return self._piece(index, window, rows, cols)
-
-    def _piece(self, index: int, window: Window, rows: NDArray[np.int64], cols: NDArray[np.int64]) -> MeshTile:
-        grid_rows, grid_cols = np.meshgrid(rows, cols, indexing="ij")
-        vertices = self.place_cells((grid_rows * self.grid.cols + grid_cols).reshape(-1))
+    def _piece(self, window: Window, rows: NDArray[np.int64], cols: NDArray[np.int64]) -> MeshTile:
+        grid_rows, grid_cols = (each.reshape(-1) for each in np.meshgrid(rows, cols, indexing="ij"))
         height, width = (
             -(-side // self.texel) * self.texel for side in (window.row1 - window.row0, window.col1 - window.col0)
         )
-        texcoords = np.stack(
-            [(grid_cols - window.col0 + 0.5) / width, (grid_rows - window.row0 + 0.5) / height], axis=-1
-        )
+        across = [(grid_cols - window.col0 + 0.5) / width, (grid_rows - window.row0 + 0.5) / height]
         return MeshTile(
-            index=index,
-            window=window,
-            vertices=vertices,
-            triangles=_triangles(len(rows), len(cols)),
-            texcoords=texcoords.reshape(-1, 2).astype(np.float32),
+            self.place_cells(grid_rows * self.grid.cols + grid_cols),
+            _triangles(len(rows), len(cols)),
+            np.stack(across, axis=-1).astype(np.float32),
         )
 
 

@@ -14,14 +14,13 @@ from support.monitor_rig import Rig, little_scenario, little_terrain
 
 from launch_scripts.monitor.ground.cost_to_go import (
     CostSamples,
+    TargetPictures,
     coarse_tree,
     full_scale_s,
     nearest_target,
-    spread,
     unit_of,
 )
 from launch_scripts.monitor.ground.ground_colours import UNREACHED, GroundColours
-from launch_scripts.monitor.ground.target_layers import TargetPictures
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Asked, Event
@@ -85,17 +84,20 @@ def test_between_samples_costs_are_linear_where_all_are_known(
 ) -> None:
     samples = CostSamples(GridSpec(rows, cols, 10.0), None)
     plane = (10 + down * samples.rows[:, None] + right * samples.cols).astype(np.float32)
-    at_rows = np.linspace(samples.rows[0], samples.rows[-1], 7, dtype=np.float32)
-    at_cols = np.linspace(samples.cols[0], samples.cols[-1], 5, dtype=np.float32)
-    found = spread(plane, (samples.rows, samples.cols), at_rows, at_cols)
+    at_rows = np.linspace(samples.rows[0], samples.rows[-1], 7).astype(np.int64)
+    at_cols = np.linspace(samples.cols[0], samples.cols[-1], 5).astype(np.int64)
+    found = samples.spread(plane, at_rows, at_cols)
     np.testing.assert_allclose(found, 10 + down * at_rows[:, None] + right * at_cols, atol=1e-3)
 
 
 def test_beside_ground_without_a_way_costs_are_those_of_the_samples_that_have_one() -> None:
-    costs = np.array([[1, np.inf, np.inf, np.inf]], np.float32)
-    found = spread(costs, (np.array([0]), np.array([0, 4, 8, 12])), np.zeros(1, np.float32), np.arange(13.0))
-    assert found[0, :4].tolist() == [1.0] * 4
-    assert np.isinf(found[0, 4:]).all()
+    samples = CostSamples(GridSpec(256, 256, 10.0), None)
+    assert samples.cols[:3].tolist() == [2, 6, 10]
+    costs = np.full((64, 64), np.inf, np.float32)
+    costs[0, 0] = 1
+    found = samples.spread(costs, np.arange(1), np.arange(256))
+    assert found[0, :6].tolist() == [1.0] * 6
+    assert np.isinf(found[0, 6:]).all()
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -105,7 +107,9 @@ def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> N
     gap, wall = int(rng.integers(0, 40)), int(rng.integers(5, 45))
     pace[:, wall - 1 : wall + 1] = np.inf
     pace[gap, wall - 1 : wall + 1] = 0.1
-    rows, cols = np.arange(1, 40, 4), np.arange(1, 50, 4)
+    samples = CostSamples(GridSpec(40, 50, 10.0), None)
+    samples.step, samples.rows, samples.cols = 4, np.arange(1, 40, 4), np.arange(1, 50, 4)
+    rows, cols = samples.rows, samples.cols
     pace[5, 5] = 0.1
     costs = costs_to(pace, 5, 5)
     lethal = np.isinf(pace)
@@ -114,7 +118,7 @@ def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> N
         found: NDArray[np.bool_] = lethal[at_rows[:, None], at_cols]
         return found
 
-    ends, through = coarse_tree(costs[rows[:, None], cols], rows, cols, lethal_at)
+    ends, through = coarse_tree(costs[rows[:, None], cols], samples, lethal_at)
     assert len(ends)
     assert through.max() <= len(rows) * len(cols)
     for (from_row, from_col), (to_row, to_col) in ends.tolist():
@@ -166,9 +170,9 @@ def test_the_heat_map_is_bright_at_the_target_and_dark_afar_and_says_where_there
     near, far, cut_off = (image[height // 2, round(share * width)] for share in (0.06, 0.8, 0.97))
     assert near.sum() > 1.3 * far.sum()
     assert np.abs(cut_off / cut_off.sum() - np.array(UNREACHED) / sum(UNREACHED)).max() < 0.03
-    tree = drawn.tree("t0")
-    assert len(tree.lines) == len(tree.radii) > 50
-    assert tree.lines[..., 0].max() < 710, "behind the wall no line begins"
+    lines, radii = drawn.tree("t0")
+    assert len(lines) == len(radii) > 50
+    assert lines[..., 0].max() < 710, "behind the wall no line begins"
 
 
 def test_the_monitor_asks_the_planner_and_draws_its_answer() -> None:

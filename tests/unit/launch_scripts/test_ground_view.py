@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,12 +26,20 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
-from launch_scripts.monitor.ground.ground_view import GroundView
-from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends, nearest_legend, to_target_legend
-from launch_scripts.monitor.ground.legend import HEIGHT_PX, WIDTH_PX
-from launch_scripts.monitor.ground.map_margin import map_margin, said_heights
+from launch_scripts.monitor.ground.ground_view import GroundView, map_margin, said_heights
+from launch_scripts.monitor.ground.legend import (
+    COST,
+    HEIGHT_PX,
+    KNOWN,
+    LEARNED,
+    NEAREST,
+    PHOTO,
+    WIDTH_PX,
+    still_legend,
+    to_target_legend,
+)
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.ground.zones import (
+from launch_scripts.monitor.ground.zone_areas import (
     Area,
     borders,
     closed_cells,
@@ -38,7 +47,7 @@ from launch_scripts.monitor.ground.zones import (
     scenario_areas,
     title_places,
 )
-from launch_scripts.monitor.movers.looks import Looks
+from launch_scripts.monitor.movers.styles import Looks
 from shared_map.cost_map import CostMap
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
@@ -128,7 +137,7 @@ def test_a_border_lies_between_inside_and_outside_and_nowhere_else(
     inside = np.zeros((40, 50), np.bool_)
     inside[tuple(np.array(cells).T)] = True
     mesh = TerrainMesh(flat())
-    strips = borders(mesh, [Area("a", "slow", np.flatnonzero(inside))])
+    strips = borders(mesh, Area("a", "slow", np.flatnonzero(inside)))
     drawn = {tuple(np.round(strip[:, :2] / 10).astype(int).reshape(-1).tolist()) for strip in strips}
     padded = np.pad(inside, 1)
     expected = set()
@@ -182,12 +191,12 @@ def test_zones_of_operators_are_those_that_stand() -> None:
 
 @pytest.mark.parametrize(("width_cells", "text"), [(50, "100 m"), (400, "1 km"), (4100, "10 km")])
 def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: int, text: str) -> None:
-    margin = map_margin(TerrainMesh(terrain_of_pace(np.ones((10, width_cells), np.float32), 10.0)))
-    bar = margin.lines[0]
+    lines, texts, _ = map_margin(TerrainMesh(terrain_of_pace(np.ones((10, width_cells), np.float32), 10.0)))
+    bar = lines[0]
     number, unit = text.split()
-    assert text in margin.texts
+    assert text in texts
     assert bar[1, 0] - bar[0, 0] == float(number) * (1000 if unit == "km" else 1)
-    foot, tip = margin.lines[4]
+    foot, tip = lines[4]
     assert (tip[0], tip[2]) == (foot[0], foot[2])
     assert tip[1] > foot[1]
 
@@ -199,7 +208,7 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
     for factor in (1.0, 2.5):
         mesh = TerrainMesh(terrain, factor)
         assert mesh.heights_m.max() == pytest.approx(5 * factor)
-        assert said_heights(factor) in map_margin(mesh).texts
+        assert said_heights(factor) in map_margin(mesh)[1]
 
 
 @pytest.mark.parametrize(
@@ -207,11 +216,10 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
 )
 def test_every_layer_has_a_legend(groups: list[str]) -> None:
     movers = Looks(groups, ["t0"]).legend()
-    pictures = legends(colours_of(flat()), [PHOTO, COST, KNOWN], movers)
-    pictures["to"] = to_target_legend("t0", 5400, movers)
-    pictures["nearest"] = nearest_legend(["t0", "t1"] * 9, movers)
-    assert set(pictures) == {"photo", "cost", "known", "to", "nearest"}
-    for picture in pictures.values():
+    still = (PHOTO, COST, KNOWN, LEARNED, NEAREST)
+    pictures = [still_legend(layer, colours_of(flat()), ["t0", "t1"] * 9, movers) for layer in still]
+    for picture in (*pictures, to_target_legend("t0", 5400, movers)):
+        assert picture is not None
         image = Image.open(io.BytesIO(picture)).convert("RGB")
         assert image.size == (WIDTH_PX, HEIGHT_PX)
         right_edge = np.asarray(image)[:, -4:]
@@ -223,9 +231,9 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
     mesh, cost_map, replica = TerrainMesh(terrain), CostMap(terrain), MapReplica(terrain.grid)
     rec = rr.RecordingStream("names", recording_id="r")
     rec.set_sinks(rr.FileSink(str(tmp_path / "names.rrd"), write_footer=False))
-    drawn: list[list[str | None]] = []
+    drawn: dict[str, Any] = {}
     view = GroundView(rec, mesh, terrain, cost_map, replica, [PHOTO], ["t0"])
-    view._drawing.windows = lambda outlines, names: drawn.append(list(names))  # type: ignore[method-assign]
+    rec.log = drawn.__setitem__  # type: ignore[method-assign]
     for count, named in ((3, {"t0", "t1", "t2"}), (6, {"t5"})):
         for n in range(count):
             window = [0, 0, 30, 30] if n == 5 else [n, n, n + 3, n + 3]
@@ -236,9 +244,10 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
                     following=0, gap_mean=None, gap_p95=None, gap_max=None,
                 )
             )  # fmt: skip
-        view.tick(len(drawn) * 2 * NS_PER_S, watched=True)
-        assert {name for name in drawn[-1] if name} == {f"window of {target}" for target in named}
-        assert len(drawn[-1]) == count
+        view.tick(2 * count * NS_PER_S, watched=True)
+        labels = drawn["world/windows/names"].labels.as_arrow_array().to_pylist()
+        assert set(labels) == {f"window of {target}" for target in named}
+        assert len(drawn["world/windows"].strips.as_arrow_array()) == count
     rec.disconnect()
 
 
@@ -250,7 +259,7 @@ def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_co
         [PHOTO, COST], ["t0"],
     )  # fmt: skip
     logged: list[str] = []
-    view._drawing.texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
+    view._texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
     both = [PHOTO.entity, COST.entity]
 
     def logged_when(at_s: int) -> list[str]:

@@ -26,10 +26,9 @@ from launch_scripts.launcher import supervisor
 from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.supervisor import LOOK_EVERY_S, STILL_S, Ending, HangWatch, LocalSwarm
 from launch_scripts.process_table import ProcessSpec
-from launch_scripts.web.health_pages import PageServer, health_pages
 from launch_scripts.web.health_probe import ask, fast
-from launch_scripts.web.health_verdict import HEALTHY, READY, Process, verdict
-from launch_scripts.web.loopback_guard import MOST_CONNECTIONS
+from launch_scripts.web.health_verdict import HEALTHY, READY, Process, health_pages, verdict
+from launch_scripts.web.server import MOST_CONNECTIONS, Server
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.health import Health, Phase, Vitals
@@ -85,19 +84,19 @@ def health() -> Health:
 
 
 @pytest.fixture
-def server(health: Health) -> Iterator[PageServer]:
-    made = PageServer("health port", 0, health_pages(lambda: [Process("agent-a0", health.board.read())]))
+def server(health: Health) -> Iterator[Server]:
+    made = Server("health port", 0, health_pages(lambda: [Process("agent-a0", health.board.read())]))
     yield made
     made.close()
 
 
-def place(server: PageServer) -> tuple[str, int]:
+def place(server: Server) -> tuple[str, int]:
     host, _, port = server.url.removeprefix("http://").rpartition(":")
     return host, int(port)
 
 
 def test_a_probe_is_told_what_is_missing_and_exits_by_it(
-    server: PageServer, health: Health, capsys: pytest.CaptureFixture[str]
+    server: Server, health: Health, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["health", "--url", server.url]
     assert fast(words) == 1
@@ -111,7 +110,7 @@ def test_a_probe_is_told_what_is_missing_and_exits_by_it(
     assert ask(f"{server.url}/healthz", live=False).told["status"] == "healthy", "a path is asked as it is"
 
 
-def test_a_probe_says_what_it_could_not_reach(server: PageServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_probe_says_what_it_could_not_reach(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
     server.close()
     assert fast(["health", "--url", server.url]) == 4
     assert capsys.readouterr().err == f"swarm: {server.url} cannot be reached: Connection refused\n"
@@ -174,7 +173,7 @@ def test_nothing_that_a_stranger_answers_is_obeyed_by_a_terminal() -> None:
     ],
 )
 def test_a_hostile_request_is_refused_and_the_next_probe_is_answered(
-    server: PageServer, request_bytes: bytes, capfd: pytest.CaptureFixture[str]
+    server: Server, request_bytes: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with socket.create_connection(place(server), 10) as visitor:
         answer = b""
@@ -188,7 +187,7 @@ def test_a_hostile_request_is_refused_and_the_next_probe_is_answered(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_one_who_holds_all_connections_open_keeps_no_probe_out(server: PageServer) -> None:
+def test_one_who_holds_all_connections_open_keeps_no_probe_out(server: Server) -> None:
     held = [socket.create_connection(place(server), 10) for _ in range(2 * MOST_CONNECTIONS)]
     try:
         for each in held:
@@ -204,7 +203,7 @@ def test_one_who_holds_all_connections_open_keeps_no_probe_out(server: PageServe
 def test_only_an_address_beyond_this_machine_serves_others_by_name(health: Health) -> None:
     pages = health_pages(lambda: [Process("agent-a0", health.board.read())])
     for address, code in (("127.0.0.1", 403), ("0.0.0.0", 200)):
-        server = PageServer("health port", 0, pages, address)
+        server = Server("health port", 0, pages, address)
         connection = http.client.HTTPConnection("127.0.0.1", place(server)[1], timeout=10)
         connection.request("GET", "/healthz", headers={"Host": "pod-7.example.org:9464"})
         assert connection.getresponse().status == code
@@ -214,7 +213,7 @@ def test_only_an_address_beyond_this_machine_serves_others_by_name(health: Healt
 
 def test_an_address_of_ip_6_is_served_and_asked(health: Health) -> None:
     try:
-        server = PageServer("health port", 0, health_pages(lambda: [Process("a", health.board.read())]), "::1")
+        server = Server("health port", 0, health_pages(lambda: [Process("a", health.board.read())]), "::1")
     except BusError as error:
         pytest.skip(f"no IPv6 here: {error}")
     assert server.url.startswith("http://[::1]:")
@@ -222,11 +221,11 @@ def test_an_address_of_ip_6_is_served_and_asked(health: Health) -> None:
     server.close()
 
 
-def test_a_port_or_address_that_cannot_be_had_is_named(server: PageServer) -> None:
+def test_a_port_or_address_that_cannot_be_had_is_named(server: Server) -> None:
     with pytest.raises(BusError, match=f"health port {place(server)[1]} cannot be opened: Address already in use"):
-        PageServer("health port", place(server)[1], {})
+        Server("health port", place(server)[1], {})
     with pytest.raises(BusError, match=r"health port 0 at 192\.0\.2\.1 cannot be opened"):
-        PageServer("health port", 0, {}, "192.0.2.1")
+        Server("health port", 0, {}, "192.0.2.1")
 
 
 def test_a_probe_loads_no_command_line() -> None:

@@ -18,8 +18,7 @@ from support.exported_metrics import exported
 from launch_scripts.commands.metrics import dashboard
 from launch_scripts.observe.counts import Counts
 from launch_scripts.observe.run_observer import OutsideObserver
-from launch_scripts.web.metric_families import HELP, Figures, Run, families, figures_of, named
-from launch_scripts.web.metrics_endpoint import MetricsEndpoint
+from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, figures_of, named
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.memory_links import PerfectLinks
 from swarm.bus.scheduler import Scheduler
@@ -184,7 +183,7 @@ def test_no_name_from_the_network_breaks_a_scrape(
 ) -> None:
     from prometheus_client.openmetrics.exposition import generate_latest
 
-    from launch_scripts.web.metrics_endpoint import OneScrape
+    from launch_scripts.web.prometheus import OneScrape
 
     heard = Counts()
     heard.count(
@@ -198,10 +197,10 @@ def test_no_name_from_the_network_breaks_a_scrape(
 
 
 def test_units_are_those_of_prometheus() -> None:
-    assert named("route_query_ms")[:2] == ("swarm_route_query_seconds", 1e-3)
-    assert named("followed_gap_excess")[0] == "swarm_followed_gap_excess_ratio"
-    assert named("bytes_out")[0] == "swarm_sent_bytes"
-    assert all(re.fullmatch(r"swarm_[a-z][a-z0-9_]*", named(name)[0]) for name in HELP)
+    assert named("route_query_ms")[:2] == ("route_query_seconds", 1e-3)
+    assert named("followed_gap_excess")[0] == "followed_gap_excess_ratio"
+    assert named("bytes_out")[0] == "sent_bytes"
+    assert all(re.fullmatch(r"[a-z][a-z0-9_]*", named(name)[0]) for name in HELP)
 
 
 def test_the_dashboard_asks_for_what_is_exported() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import os
 import signal
 import socket
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import time
 import urllib.error
-import urllib.parse
 import urllib.request
 import warnings
 from collections.abc import Callable
@@ -36,9 +34,8 @@ from support.target_reports import fleet
 from launch_scripts import parent_death
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.serving.recording_watch import RecordingWatch
-from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
-from launch_scripts.web.loopback_guard import Audience
+from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
@@ -347,7 +344,7 @@ def test_where_to_watch_is_told_to_whoever_begins_to_listen_later(scenario: Scen
 def test_who_ends_as_asked_is_no_warning_and_who_dies_is_one(scenario: Scenario, terrain: Terrain) -> None:
     rig = Rig(scenario, terrain, None)
     told: list[tuple[str, str]] = []
-    rig.service._drawing.note = lambda text, level: told.append((level, text))  # type: ignore[method-assign]
+    rig.service._panel.note = lambda text, level: told.append((level, text))  # type: ignore[method-assign]
     rig.run(3)
     for id, gauges in (("a0", {"ended": 1.0}), ("a1", {})):
         bus = rig.bus(id)
@@ -410,16 +407,6 @@ def listeners(pid: int) -> set[str]:
     return addresses
 
 
-def stream_port(live_url: str) -> int:
-    """Of the stream that the page leads to."""
-    page = http.client.HTTPConnection("127.0.0.1", urllib.parse.urlparse(live_url).port or 0)
-    page.request("GET", "/")
-    location = page.getresponse().getheader("Location") or ""
-    page.close()
-    stream = urllib.parse.parse_qs(urllib.parse.urlparse(location).query)["url"][0]
-    return urllib.parse.urlparse(stream).port or 0
-
-
 def children(pid: int) -> list[int]:
     return [
         int(child)
@@ -438,18 +425,19 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     monkeypatch.setenv("HOME", str(home))
     before = children(os.getpid())
     sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(terrain)))
-    assert sinks.live_url is not None
+    assert sinks.page is not None
+    url = sinks.page.server.url
     try:
-        with urllib.request.urlopen(sinks.live_url, timeout=30) as reply:
+        with urllib.request.urlopen(url, timeout=30) as reply:
             assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
             assert b"re_viewer.js" in reply.read()
             policy = reply.headers["Content-Security-Policy"]
         assert policy.endswith("connect-src 'self'")
-        with urllib.request.urlopen(f"{sinks.live_url}re_viewer_bg.wasm", timeout=30) as reply:
+        with urllib.request.urlopen(f"{url}/re_viewer_bg.wasm", timeout=30) as reply:
             assert reply.headers["Content-Type"] == "application/wasm"
             assert reply.read(4) == b"\0asm"
         with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(f"{sinks.live_url}etc/passwd", timeout=30)
+            urllib.request.urlopen(f"{url}/etc/passwd", timeout=30)
         assert eventually(lambda: len(listeners(os.getpid())) > 1)
         assert all(address.endswith("7F") for address in listeners(os.getpid())), "127.x.x.x, all of it loopback"
         assert children(os.getpid()) == before, "the viewer program is gone again"
@@ -464,8 +452,9 @@ def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     script = f"""
 import time, numpy, pathlib
+from launch_scripts import parent_death
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.serving.sinks import Sinks
+from launch_scripts.monitor.sinks import Sinks
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.liveness import Peer
@@ -491,10 +480,10 @@ OPENED_WITHIN_A_LIMIT = """
 import pathlib, resource, time
 import numpy
 import rerun as rr
+from launch_scripts import parent_death
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.serving.recording_watch import RecordingWatch
-from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
+from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 
@@ -525,7 +514,7 @@ for second in range(110):
     sinks.streams.set_time("tick", sequence=second)
     sinks.streams.log("a", rr.Points3D(numpy.random.rand(2000, 3)))
     time.sleep(0.12)  # in which what is logged is written
-    sentence, begun = watch.look(second * 10**9)
+    sentence, begun = watch.check(second * 10**9)
     if sentence:
         print(second, begun, sentence, flush=True)
 sinks.close()
@@ -554,7 +543,7 @@ for second in range(20):
         limit(hard)
     sinks.streams.set_time("tick", sequence=second)
     sinks.streams.log("a", rr.Scalars(second))
-    sentence, begun = watch.look(second * 10**9)
+    sentence, begun = watch.check(second * 10**9)
     if sentence:
         print(second, begun, sentence, flush=True)
 sinks.close()
@@ -573,7 +562,7 @@ def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
     rig = Rig(scenario, terrain, tmp_path / "run.rrd")
     watch = RecordingWatch(tmp_path / "run.rrd", rig.sinks.begin_file)
     told = iter([(None, False), ("it goes on", True)])
-    watch.look = lambda now_ns: next(told, (None, False))  # type: ignore[method-assign]
+    watch.check = lambda now_ns: next(told, (None, False))  # type: ignore[method-assign]
     rig.service._recording = watch
     rig.run(0.15)
     rig.sinks.begin_file(tmp_path / "run-2.rrd")
@@ -602,14 +591,14 @@ time.sleep(60)
 
 @pytest.mark.network
 def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.monitor.serving.sinks._PORT_PATIENCE_S", 0.2)
+    monkeypatch.setattr("launch_scripts.monitor.sinks._PORT_PATIENCE_S", 0.2)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
         config = MonitorConfig(grpc_port=0, web_port=port)
         with pytest.raises(
-            BusError, match=rf"live view on port {port}: Address already in use; .*monitor\.web_port"
+            BusError, match=rf"monitor\.web_port {port} cannot be opened: Address already in use; choose another"
         ):
             Sinks("r", None, config, make_blueprint(TerrainMesh(terrain)))
 
@@ -620,8 +609,8 @@ def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain)
 
     sinks = Sinks("r", None, LIVE, make_blueprint(TerrainMesh(terrain)))
     try:
-        assert sinks.live_url is not None
-        port = stream_port(sinks.live_url)
+        assert sinks.gate is not None
+        port = sinks.gate.port
         with socket.create_connection(("127.0.0.1", port)) as stalled:
             stalled.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
             worst_s = 0.0

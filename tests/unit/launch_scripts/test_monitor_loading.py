@@ -9,7 +9,7 @@ import pytest
 from support.monitor_rig import little_scenario, little_terrain
 from support.swarm_model import SwarmModel
 
-from launch_scripts.monitor.loading import LoadingMonitor
+from launch_scripts.monitor.main import LoadingMonitor
 from swarm.bus.bus import Event, Post, Replied, WorkDone
 from swarm.clock import MonotonicClock
 from swarm.errors import BusError

@@ -14,18 +14,37 @@ from numpy.typing import NDArray
 
 from launch_scripts.launcher.options import with_follow
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.alarms import FADES_S, alarm_marks
-from launch_scripts.monitor.movers.details import target_details, target_labels, vehicle_details
-from launch_scripts.monitor.movers.due import Due
-from launch_scripts.monitor.movers.levels import LEVELS, level_for
-from launch_scripts.monitor.movers.looks import ALARM_COLOUR, HUES, LOST_COLOUR, Looks, shaded
-from launch_scripts.monitor.movers.points import cell_at, label_places, target_points, vehicle_points
-from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along, filled
-from launch_scripts.monitor.movers.searches import SILENT_NS, Searches, searched_points
-from launch_scripts.monitor.movers.strips import Trails, poles, rings
+from launch_scripts.monitor.movers.details import (
+    FADES_S,
+    alarm_marks,
+    target_details,
+    target_labels,
+    vehicle_details,
+)
+from launch_scripts.monitor.movers.map_lines import (
+    RouteLines,
+    RouteNow,
+    Trails,
+    cell_at,
+    cells_along,
+    filled,
+    poles,
+    rings,
+)
+from launch_scripts.monitor.movers.movers_view import SILENT_NS, Searches, searched_points
+from launch_scripts.monitor.movers.styles import (
+    ALARM_COLOUR,
+    HUES,
+    LEVELS,
+    LOST_COLOUR,
+    Looks,
+    RateLimit,
+    level_for,
+    shaded,
+)
 from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.counts import CertifiedGap
-from launch_scripts.observe.latest_state import VehicleColumns, gathered
+from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.state import TargetLine
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -176,7 +195,7 @@ def test_alarms_are_marked_where_they_are_and_fade_once_they_are_over(alarms: li
     vehicles = columns([VehicleState.FOLLOWING, VehicleState.STRANDED], [0, -1], ["t0"])
     marks = alarm_marks(alarms, 50.0, {"t0": (30.0, 40.0)}, vehicles, grid)
     assert len(marks) <= 24
-    places = [(mark.east_m, mark.south_m) for mark in marks]
+    places = [mark.place_m for mark in marks]
     assert len(places) == len(set(places)), "no text lies on another"
     assert all(0 <= east_m <= 200 and 0 <= south_m <= 200 for east_m, south_m in places)
     lasting = [alarm for alarm in alarms if alarm.lasts and alarm.cell is not None and alarm.cell < grid.cells]
@@ -196,7 +215,7 @@ def test_an_alarm_has_the_place_of_its_cell_its_target_or_its_agents_vehicles() 
     def place(**about: Any) -> list[tuple[float, float]]:
         alarm = Alarm(kind="down", text=".", since_s=0.0, **about)
         marks = alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, vehicles, grid)
-        return [(mark.east_m, mark.south_m) for mark in marks]
+        return [mark.place_m for mark in marks]
 
     assert place(about="x", cell=21, target="t0") == [(15.0, 15.0)]
     assert place(about="planner-t0", target="t0") == [(30.0, 40.0)]
@@ -207,12 +226,12 @@ def test_an_alarm_has_the_place_of_its_cell_its_target_or_its_agents_vehicles() 
 # --- places and lines -----------------------------------------------------------------------------------------
 
 
-def test_targets_stand_on_poles_above_the_ground_with_their_names_on_top() -> None:
+def test_targets_stand_on_poles_above_the_ground() -> None:
     mesh = TerrainMesh(hill(20, 20))
-    targets = target_points(mesh, {"t0": (50.0, 60.0)})
-    pole = poles(mesh, targets).line(0)
+    tops = mesh.place(np.array([50.0], np.float32), np.array([60.0], np.float32), 30.0)
+    pole = poles(mesh, tops).line(0)
     assert pole[:, :2].tolist() == [[50.0, -60.0], [50.0, -60.0]]
-    assert pole[0, 2] < pole[1, 2] < label_places(mesh, targets)[0, 2]
+    assert pole[1, 2] == pytest.approx(pole[0, 2] + 30.0)
 
 
 def believed(cells: list[int], shares: list[float], target: str = "t0") -> Believed:
@@ -224,14 +243,14 @@ def believed(cells: list[int], shares: list[float], target: str = "t0") -> Belie
 def test_the_likelier_a_target_is_somewhere_the_less_transparent_is_that_drawn_on_the_ground() -> None:
     mesh = TerrainMesh(hill(20, 30))
     positions, colours, radii_m, details = searched_points(
-        mesh, {"t0": believed([65, 10 * 30, 20 * 30], [0.5, 0.1, 0.2])}
+        mesh, [believed([65, 10 * 30, 20 * 30], [0.5, 0.1, 0.2])]
     )
     assert len(positions) == len(colours) == len(radii_m) == 2, "a cell outside of the map is not drawn"
     assert colours[0, 3] > colours[1, 3] > 0
     assert details == ["t0 may be here: 50.0%", "t0 may be here: 10.0%"]
     ground = mesh.place(np.array([55.0, 5.0], np.float32), np.array([25.0, 105.0], np.float32), 0.1 * mesh.scale_m)
     assert np.allclose(positions, ground)
-    assert len(searched_points(mesh, {})[0]) == 0
+    assert len(searched_points(mesh, [])[0]) == 0
 
 
 def test_a_search_is_drawn_until_it_is_over_or_its_planner_is_silent() -> None:
@@ -239,17 +258,18 @@ def test_a_search_is_drawn_until_it_is_over_or_its_planner_is_silent() -> None:
     assert searches.take_changed(0) is None
     searches.hear(believed([1], [1.0]), 0)
     searches.hear(believed([2], [1.0], "t1"), NS_PER_S)
-    assert set(searches.take_changed(NS_PER_S) or ()) == {"t0", "t1"}
+    assert [each.target for each in searches.take_changed(NS_PER_S) or ()] == ["t0", "t1"]
     assert searches.take_changed(2 * NS_PER_S) is None
-    assert set(searches.take_changed(SILENT_NS) or ()) == {"t1"}
+    assert [each.target for each in searches.take_changed(SILENT_NS) or ()] == ["t1"]
     searches.hear(believed([], [], "t1"), SILENT_NS)
-    assert searches.take_changed(SILENT_NS) == {}
+    assert searches.take_changed(SILENT_NS) == []
 
 
 def test_nobody_there_is_nothing_to_draw() -> None:
     mesh = TerrainMesh(hill(20, 20))
-    assert vehicle_points(mesh, gathered([])).positions.shape == (0, 3)
-    assert len(poles(mesh, target_points(mesh, {}))) == 0
+    nowhere = mesh.place(np.empty(0, np.float32), np.empty(0, np.float32))
+    assert nowhere.shape == (0, 3)
+    assert len(poles(mesh, nowhere)) == 0
     assert len(RouteLines(mesh, 3).lines([])) == 0
     assert len(rings(mesh, np.empty((0, 3), np.float32), np.empty(0, np.float32))) == 0
 
@@ -419,9 +439,9 @@ def test_the_more_vehicles_the_less_is_drawn_of_each() -> None:
 
 
 def test_what_is_due_is_due_once_in_its_time() -> None:
-    due = Due({"often": 0.5, "seldom": 2.0})
+    limit = RateLimit({"often": 0.5, "seldom": 2.0})
     times_s = np.arange(0, 10, 0.1)
-    often = [t for t in times_s if due.now("often", int(round(t, 1) * NS_PER_S))]
-    seldom = [t for t in times_s if due.now("seldom", int(round(t, 1) * NS_PER_S))]
+    often = [t for t in times_s if limit.due("often", int(round(t, 1) * NS_PER_S))]
+    seldom = [t for t in times_s if limit.due("seldom", int(round(t, 1) * NS_PER_S))]
     assert len(often) == 20
     assert len(seldom) == 5

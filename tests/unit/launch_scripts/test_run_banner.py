@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from support.devtools import CHROMIUM, Browser
 
-from launch_scripts.web import view_page as web
+from launch_scripts.web import live_page as web
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 

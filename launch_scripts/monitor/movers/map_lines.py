@@ -1,25 +1,111 @@
-"""The routes that vehicles have begun, and what is left of them, as lines. No rerun, no bus, no clock."""
+"""Lines over the terrain: poles, rings, trails, and what is left of the routes that vehicles have begun.
+No rerun."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.points import cell_at
-from launch_scripts.monitor.movers.strips import Strips, ragged
+from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 Cells = NDArray[np.int64]
 Corners = NDArray[np.float64]
 """(n, 2): rows and cols of the places between which a line is straight; whole numbers are middles of cells."""
 
+_CIRCLE_POINTS = 33
 _STEP_ROW, _STEP_COL = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Strips:
+    """Lines of several points each, as rerun keeps them: of a list of lines it makes an array each, which took a
+    third of a frame.
+
+    points   float32 (m, 3), of all lines
+    offsets  int32 (n + 1,): line n has points[offsets[n] : offsets[n + 1]]
+    """
+
+    points: Floats
+    offsets: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Strips)
+            and np.array_equal(self.offsets, other.offsets)
+            and np.array_equal(self.points, other.points)
+        )
+
+    def line(self, n: int) -> Floats:
+        """float32 (k, 3)."""
+        points: Floats = self.points[self.offsets[n] : self.offsets[n + 1]]
+        return points
+
+
+def ragged(points: Floats, lengths: Sequence[int]) -> Strips:
+    """Lines of these lengths, one after the other."""
+    return Strips(points, np.cumsum([0, *lengths], dtype=np.int32))
+
+
+def even(points: Floats) -> Strips:
+    """float32 (n, m, 3): n lines of m points each."""
+    count, each, _ = points.shape
+    return ragged(points.reshape(-1, 3), [each] * count)
+
+
+def feet(mesh: TerrainMesh, positions: Floats) -> Floats:
+    """Places on the terrain below these."""
+    return mesh.place(positions[:, 0], -positions[:, 1])
+
+
+def poles(mesh: TerrainMesh, tops: Floats) -> Strips:
+    """A line from each point, float32 (n, 3), down to the terrain."""
+    return even(np.stack([feet(mesh, tops), tops], axis=1))
+
+
+def rings(mesh: TerrainMesh, centres: Floats, radii_m: Floats) -> Strips:
+    """A circle on the terrain around each place."""
+    angle = np.linspace(0, 2 * np.pi, _CIRCLE_POINTS, dtype=np.float32)
+    east_m = centres[:, :1] + radii_m[:, None] * np.cos(angle)
+    south_m = -centres[:, 1:2] + radii_m[:, None] * np.sin(angle)
+    return even(mesh.place(east_m, south_m, 0.25 * mesh.scale_m))
+
+
+class Trails:
+    """Trails since the last drawing: one line per id, which joins the one before.
+
+    longest_m  what jumped further leaves no trail
+    """
+
+    def __init__(self, longest_m: float) -> None:
+        self._longest_m = longest_m
+        self._last: dict[str, Floats] = {}
+        """Where each was at the end of its trail, float32 (3,)."""
+
+    def advance(self, ids: list[str], positions: Floats) -> tuple[Strips, NDArray[np.bool_]]:
+        """Lines from the last places to these, and whose they are; none for ids which stand still, are new, or
+        jumped."""
+        known = zip(ids, positions, strict=True)
+        last = np.array([self._last.get(id, place) for id, place in known], np.float32).reshape(-1, 3)
+        moved_m = np.hypot(*(positions - last)[:, :2].T)
+        self._last = dict(zip(ids, np.where(moved_m[:, None] > 0, positions, last), strict=True))
+        drawn = (moved_m > 0) & (moved_m <= self._longest_m)
+        return even(np.stack([last[drawn], positions[drawn]], axis=1)), drawn
+
+
+def cell_at(grid: GridSpec, east_m: float, south_m: float) -> int:
+    """The cell at a place, the nearest one if it is outside."""
+    row = min(max(int(south_m // grid.resolution_m), 0), grid.rows - 1)
+    col = min(max(int(east_m // grid.resolution_m), 0), grid.cols - 1)
+    return row * grid.cols + col
 
 
 def cells_along(grid: GridSpec, start: int, directions: bytes) -> Cells | None:

@@ -90,12 +90,6 @@ def closed_cells(areas: Iterable[Area]) -> NDArray[np.int64]:
     return np.concatenate([np.empty(0, np.int64), *closed])
 
 
-def borders(mesh: TerrainMesh, areas: Sequence[Area]) -> Floats:
-    """The borders of zones, laid over the terrain: float32 (n, 2, 3), one line for each side of a texel."""
-    strips = [_border(mesh, area) for area in areas]
-    return np.concatenate([np.empty((0, 2, 3), np.float32), *strips])
-
-
 def title_places(mesh: TerrainMesh, areas: Sequence[Area]) -> Floats:
     """Where the zones' names stand: over the cell of each that is next to its middle."""
     places = []
@@ -121,7 +115,8 @@ def _cells_of(zone: ZoneConfig, grid: GridSpec) -> NDArray[np.int64]:
     return np.flatnonzero(inside)
 
 
-def _border(mesh: TerrainMesh, area: Area) -> Floats:
+def borders(mesh: TerrainMesh, area: Area) -> Floats:
+    """The border of a zone, laid over the terrain: float32 (n, 2, 3), one line for each side of a texel."""
     rows, cols = np.divmod(area.cells, mesh.grid.cols)
     side = mesh.texel
     row0, col0 = int(rows.min()) // side, int(cols.min()) // side

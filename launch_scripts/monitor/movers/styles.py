@@ -1,4 +1,4 @@
-"""How everything that moves looks, and what the legend says of it. Pure: no rerun.
+"""How everything that moves looks, how much of it is drawn and how often, and what the legend says of it. No rerun.
 
 The one place of these colours. They are Okabe and Ito's, which the colour-blind tell apart. Hue says whose a
 vehicle is, brightness how it does, shape what something is.
@@ -6,15 +6,15 @@ vehicle is, brightness how it does, shape what something is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes
 from launch_scripts.observe import palette
+from swarm.clock import NS_PER_S
 from swarm.wire.messages.vehicles import VehicleState
 
 Colour = tuple[int, int, int]
@@ -38,37 +38,26 @@ SIGHTED_COLOUR: Colour = (255, 255, 255)
 SEARCHED_COLOUR: Colour = (253, 174, 107)
 ROUTE_COLOUR: Colour = (205, 212, 220)
 ALARM_COLOUR: Colour = (255, 64, 48)
+LABEL_COLOUR: Colour = (240, 243, 246)
 HINT = "point at a vehicle or target to read who it is"
 _GROUPS = 4
 """Groups in the legend: more have no place there."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shade:
-    """How a hue is changed: `share` of `towards` is mixed in.
-
-    meaning  the legend's words; None where another state's entry says it
-    """
-
-    towards: Colour
-    share: float
-    meaning: str | None
-
-
-SHADES: dict[VehicleState, Shade] = {
-    VehicleState.FOLLOWING: Shade((0, 0, 0), 0.0, "on its way"),
-    VehicleState.ARRIVED: Shade((255, 255, 255), 0.65, "arrived"),
-    VehicleState.WAITING: Shade((0, 0, 0), 0.55, "waits"),
-    VehicleState.IDLE: Shade((0, 0, 0), 0.55, None),
-    VehicleState.STRANDED: Shade((0, 0, 0), 0.9, "stranded"),
-    VehicleState.LOST: Shade((128, 132, 138), 0.85, "planner or target lost"),
-    VehicleState.OUTDATED: Shade((128, 132, 138), 0.85, None),
-    VehicleState.SEARCHING: Shade((255, 255, 255), 0.35, "searches"),
+SHADES: dict[VehicleState, tuple[Colour, float, str | None]] = {
+    VehicleState.FOLLOWING: ((0, 0, 0), 0.0, "on its way"),
+    VehicleState.ARRIVED: ((255, 255, 255), 0.65, "arrived"),
+    VehicleState.WAITING: ((0, 0, 0), 0.55, "waits"),
+    VehicleState.IDLE: ((0, 0, 0), 0.55, None),
+    VehicleState.STRANDED: ((0, 0, 0), 0.9, "stranded"),
+    VehicleState.LOST: ((128, 132, 138), 0.85, "planner or target lost"),
+    VehicleState.OUTDATED: ((128, 132, 138), 0.85, None),
+    VehicleState.SEARCHING: ((255, 255, 255), 0.35, "searches"),
 }
+"""What is mixed into a hue, its share, and the legend's words; None where another state's entry says it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(NamedTuple):
     """One line of the legend: a shape in a colour, and what it stands for."""
 
     shape: Shape
@@ -76,13 +65,15 @@ class Look:
     meaning: str
 
 
+def mixed(colour: Colour, other: Colour, share: float) -> Colour:
+    """A colour with a share of another one."""
+    red, green, blue = (round((1 - share) * own + share * its) for own, its in zip(colour, other, strict=True))
+    return red, green, blue
+
+
 def shaded(hue: Colour, state: VehicleState) -> Colour:
     """The colour of a vehicle whose group or target has this hue."""
-    shade = SHADES[state]
-    red, green, blue = (
-        round((1 - shade.share) * own + shade.share * other) for own, other in zip(hue, shade.towards, strict=True)
-    )
-    return red, green, blue
+    return mixed(hue, *SHADES[state][:2])
 
 
 def dimmed(colours: Bytes) -> Bytes:
@@ -122,8 +113,7 @@ class Looks:
     def route(self, target: str) -> Colour:
         """Of routes to a target: darker than its vehicles, which are on top of them."""
         hue = self._hue.get(target, ROUTE_COLOUR) if self.by_target else ROUTE_COLOUR
-        red, green, blue = (round(0.85 * value) for value in hue)
-        return red, green, blue
+        return mixed(hue, (0, 0, 0), 0.15)
 
     def legend(self) -> list[Look]:
         """What is drawn of all that moves."""
@@ -133,17 +123,76 @@ class Looks:
         else:
             who = [Look("ball", self._hue[name], f"of {name[:14]}") for name in self.groups[:_GROUPS]]
         states = [
-            Look("ball", shaded(first, state), shade.meaning)
-            for state, shade in SHADES.items()
-            if shade.meaning is not None and state != VehicleState.FOLLOWING
+            Look("ball", shaded(first, state), meaning)
+            for state, (_, _, meaning) in SHADES.items()
+            if meaning is not None and state != VehicleState.FOLLOWING
         ]
         return [
             *who,
             *states,
-            Look("box", (240, 243, 246), "around guests"),
+            Look("box", LABEL_COLOUR, "around guests"),
             Look("pin", self.target(next(iter(self.target_ids), "")), "target"),
             Look("ring", SIGHTED_COLOUR, "hidden target seen"),
             Look("disc", BODY_COLOUR, "body to keep off"),
             Look("line", self.route(next(iter(self.target_ids), "")), "route, trail"),
             Look("pin", ALARM_COLOUR, "alarm"),
         ]
+
+
+class Level(NamedTuple):
+    """How much is drawn of each vehicle: the less, the more vehicles there are.
+
+    most            vehicles for which it is used, at most
+    radius_px       of a vehicle's ball, in points of the viewer's window
+    line_px         of trails and routes
+    frames          vehicles are drawn in every so many frames
+    trail_every_s   a piece of each trail is drawn so often
+    trail_s         so long a trail is seen
+    details_s       who each vehicle is and what it does is told again so often
+    routes_s        all routes are drawn once in this time
+    route_stride    a route has a point for so many cells
+    names           whether vehicles' ids are shown all the time
+    """
+
+    most: int
+    radius_px: float
+    line_px: float
+    frames: int
+    trail_every_s: float
+    trail_s: float
+    details_s: float
+    routes_s: float
+    route_stride: int
+    names: bool
+
+
+LEVELS = (
+    Level(30, 6.5, 1.4, 1, 0.5, 25.0, 1.0, 1.5, 2, True),
+    Level(150, 5.4, 1.2, 1, 0.5, 25.0, 1.0, 1.5, 3, False),
+    Level(400, 4.6, 1.0, 1, 0.5, 20.0, 2.0, 3.0, 3, False),
+    Level(2000, 3.8, 0.7, 2, 1.0, 12.0, 4.0, 4.0, 4, False),
+    Level(1 << 62, 2.4, 0.6, 5, 2.0, 10.0, 10.0, 10.0, 6, False),
+)
+
+
+def level_for(vehicles: int) -> Level:
+    """The level of detail for so many vehicles."""
+    return next(level for level in LEVELS if vehicles <= level.most)
+
+
+class RateLimit:
+    """When each of several things is done next, each at its own pace.
+
+    every_s  name -> seconds from one time to the next
+    """
+
+    def __init__(self, every_s: Mapping[str, float]) -> None:
+        self._every_ns = {name: int(seconds * NS_PER_S) for name, seconds in every_s.items()}
+        self._next_ns = dict.fromkeys(every_s, 0)
+
+    def due(self, name: str, now_ns: int, slower: int = 1) -> bool:
+        """Whether it is time; if so, the next time is counted from now, and comes so many times as late."""
+        if now_ns < self._next_ns[name]:
+            return False
+        self._next_ns[name] = now_ns + slower * self._every_ns[name]
+        return True

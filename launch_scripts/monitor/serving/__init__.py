@@ -1,1 +1,0 @@
-"""Where the view goes: a file, a port, a page."""

@@ -1,0 +1,271 @@
+"""Where the view goes: a file, and viewers on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from launch_scripts.observe.run_folder import SAY_EVERY_S, can_write
+from launch_scripts.web import LOOPBACK
+from launch_scripts.web.live_page import LivePage
+from launch_scripts.web.server import Audience, Server
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import MonitorConfig
+from swarm.errors import BusError, StoreError
+
+log = logging.getLogger(__name__)
+
+_PORT_PATIENCE_S = 3.0
+"""A port that is in use is waited for so long: after a restart the one before may still have it."""
+_MEMORY = "64MiB"
+"""What the stream keeps for viewers that come later; the oldest goes first. The process grows by twice as much."""
+_PACK_S = 1.0
+"""Within this time rerun packs what is logged of an entity into one chunk, unless the service flushes it for those
+who watch. Ten chunks a second take its threads five times the CPU, and twice the space."""
+STILL_CHECKS = 5
+"""Checks in a row, one a second, that find the file as long as before: something is drawn every second."""
+_RETRY_S = 10.0
+_SPACE_BYTES = 8 << 20
+"""Space from which on a new recording is begun."""
+
+T = TypeVar("T")
+
+
+def new_recording_path(folder: Path) -> Path:
+    """`run.rrd`, or `run-2.rrd` and so on where an earlier monitor left one: no file is overwritten."""
+    for n in range(1, 10_000):
+        path = folder / ("run.rrd" if n == 1 else f"run-{n}.rrd")
+        try:
+            path.open("xb").close()
+            return path
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    raise StoreError(f"{folder} is full of recordings")
+
+
+class Streams:
+    """Recording streams to which the same is logged."""
+
+    def __init__(self, *streams: rr.RecordingStream) -> None:
+        self.streams = streams
+
+    def log(self, path: str, *what: Any, static: bool = False) -> None:
+        for stream in self.streams:
+            stream.log(path, *what, static=static)
+
+    def set_time(self, timeline: str, **when: Any) -> None:
+        for stream in self.streams:
+            stream.set_time(timeline, **when)
+
+    def flush(self, *, timeout_sec: float) -> None:
+        for stream in self.streams:
+            stream.flush(timeout_sec=timeout_sec)
+
+
+class Sinks:
+    """A recording stream and its sinks. `close` takes seconds at most, even if a disk or a viewer hangs."""
+
+    def __init__(
+        self, recording_id: str, path: Path | None, config: MonitorConfig, blueprint: rrb.Blueprint
+    ) -> None:
+        self._recording_id = recording_id
+        self._blueprint = blueprint
+        self.rec = self._stream()
+        self.streams = Streams(self.rec)
+        """Where to log: `rec`, and the file that was begun last, if the first has ended."""
+        self._servers: list[Server] = []
+        self.page: LivePage | None = None
+        self.gate: Server | None = None
+        """The known port of the stream for native viewers. rerun lets pages read its answers only if their Origin
+        is on loopback, but looks at no Host. So rerun listens on a loopback address that is drawn by chance."""
+        live: list[rr.GrpcServerSink] = []
+        if config.live:
+            host, port = behind = _hidden_address()
+            self.gate = _when_free(
+                lambda: Server("grpc_port", config.grpc_port, {}, behind=behind, newest_first=False)
+            )
+            self.page = _when_free(lambda: LivePage(config.web_port, behind))
+            self._servers = [self.page.server, self.gate]
+            live.append(rr.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY))
+        try:
+            self.rec.set_sinks(*_files(path), *live, default_blueprint=blueprint)
+        except RuntimeError as error:  # no space on the disk: `RecordingWatch` begins another file later
+            if path is None:
+                raise
+            log.warning("recording nothing in %s: %s", path, error)
+            self.rec.set_sinks(*live, default_blueprint=blueprint)
+
+    @property
+    def stream_url(self) -> str | None:
+        """Address for a native viewer."""
+        return None if self.gate is None else f"rerun+{self.gate.url}/proxy"
+
+    @property
+    def web_port(self) -> int:
+        """Port of the live view's page on this machine; 0 without one."""
+        return 0 if self.page is None else self.page.server.port
+
+    def audience(self) -> Audience:
+        """Viewers of the stream."""
+        each = [server.audience() for server in self._servers]
+        return Audience(sum(one.now for one in each), sum(one.ever for one in each))
+
+    def tell_page(self, run: Callable[[], Mapping[str, Any]]) -> None:
+        """What the page shows of the run beside the view, asked once a second for each page that is open."""
+        if self.page is not None:
+            self.page.run = run
+
+    def begin_file(self, path: Path) -> None:
+        """Lets what is logged to `streams` go to this file, too. On a stream of its own: new sinks for `rec` would
+        close the live view's port. Raises StoreError where nothing can be written to it."""
+        _, *earlier = self.streams.streams
+        stream = self._stream()
+        try:
+            stream.set_sinks(*_files(path), default_blueprint=self._blueprint)
+        except RuntimeError as error:
+            raise StoreError(f"cannot write {path}: {error}") from error
+        self.streams.streams = (self.rec, stream)
+        for each in earlier:
+            each.disconnect()
+
+    def _stream(self) -> rr.RecordingStream:
+        packing = rr.ChunkBatcherConfig(flush_tick=_PACK_S)
+        return rr.RecordingStream("terrain-swarm", recording_id=self._recording_id, batcher_config=packing)
+
+    def close(self, within_s: float = 3.0) -> None:
+        written = _in_time(lambda: self._flush(within_s), within_s)
+        for server in self._servers:
+            server.close()
+        # Only now, as it would take who still watches back to the beginning.
+        if not written or not _in_time(self._let_play, 1.0):
+            log.warning("the recording was not written to the end within %.0f s", within_s)
+
+    def _flush(self, within_s: float) -> None:
+        for stream in reversed(self.streams.streams):
+            with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
+                stream.flush(timeout_sec=within_s * 0.8)
+
+    def _let_play(self) -> None:
+        """Lets the recording be opened at its beginning and play: the live view follows its end."""
+        if (panel := self._blueprint.time_panel) is not None:
+            panel.play_state = "playing"
+        for stream in reversed(self.streams.streams):
+            with contextlib.suppress(Exception):  # as above
+                stream.send_blueprint(self._blueprint, make_active=True, make_default=True)
+                stream.flush(timeout_sec=0.8)
+            stream.disconnect()
+
+
+class RecordingWatch:
+    """Notices that a recording has ended for want of space, says so, and begins another when there is some. Rerun's
+    file sink ends at the first error, with a line in its own log only.
+
+    begin  lets what is drawn from now on go to this file as well; raises StoreError where it cannot
+    """
+
+    def __init__(self, path: Path, begin: Callable[[Path], None]) -> None:
+        self._path = path
+        self._begin = begin
+        self._size, self._still = -1, 0
+        """Bytes of the file, and checks that found as many, without a break."""
+        self._told_ns: int | None = None
+        """When it was last said that the recording has ended; None while it goes on."""
+        self._retry_ns = self._due_ns = 0
+
+    def check(self, now_ns: int) -> tuple[str | None, bool]:
+        """What is to be told, if anything, and whether a new file has begun, in which nothing is drawn yet."""
+        if now_ns < self._due_ns:
+            return None, False
+        self._due_ns = now_ns + NS_PER_S
+        if self._told_ns is None:
+            return (self._tell(now_ns), False) if self._has_ended() else (None, False)
+        if now_ns >= self._retry_ns:
+            self._retry_ns = now_ns + int(_RETRY_S * NS_PER_S)
+            with contextlib.suppress(OSError, StoreError):
+                check_space(self._path.parent)
+                self._path = new_recording_path(self._path.parent)
+                self._begin(self._path)
+                self._size, self._still, self._told_ns = -1, 0, None
+        if self._told_ns is None:
+            return f"the recording goes on in {self._path}", True
+        return (self._tell(now_ns) if now_ns - self._told_ns >= SAY_EVERY_S * NS_PER_S else None), False
+
+    def _has_ended(self) -> bool:
+        before = self._size
+        with contextlib.suppress(OSError):
+            self._size = self._path.stat().st_size
+        self._still = self._still + 1 if self._size == before else 0
+        return self._still >= STILL_CHECKS
+
+    def _tell(self, now_ns: int) -> str:
+        self._told_ns = now_ns
+        why = "it does not grow"
+        try:
+            check_space(self._path.parent)
+        except OSError as error:
+            why = error.strerror or str(error)
+        return f"the recording {self._path} has ended: {why}; another begins when there is space"
+
+
+def check_space(folder: Path) -> None:
+    """Raises OSError if there is no space for a recording. It is tried by writing, as there are quotas and limits
+    that nothing else shows; but only where that does not fill the disk for everybody else meanwhile."""
+    left = os.statvfs(folder)
+    if left.f_bavail * left.f_frsize < 2 * _SPACE_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    can_write(folder, _SPACE_BYTES)
+
+
+def _files(path: Path | None) -> list[rr.FileSink]:
+    """A file without a footer, if there is to be one. For that rerun keeps an entry of every chunk in memory up to
+    the end, 4 MB a minute of the demo. What reads recordings reads those without one, too: a killed monitor leaves
+    one in any case."""
+    return [] if path is None else [rr.FileSink(path, write_footer=False)]
+
+
+def _in_time(work: Callable[[], None], within_s: float) -> bool:
+    """True if the work is done in time; else it goes on beside."""
+    thread = threading.Thread(target=work, name="flush", daemon=True)
+    thread.start()
+    thread.join(within_s)
+    return not thread.is_alive()
+
+
+def _when_free(listen: Callable[[], T]) -> T:
+    """Listens on a port, and waits for one which is still in use. Raises BusError."""
+    deadline_s = time.monotonic() + _PORT_PATIENCE_S
+    while True:
+        try:
+            return listen()
+        except BusError as error:
+            if time.monotonic() > deadline_s:
+                raise BusError(
+                    f"no live view: monitor.{error}; choose another, 0 for any, or monitor.live = false"
+                ) from error
+        time.sleep(0.1)
+
+
+def _hidden_address() -> tuple[str, int]:
+    """An address on loopback that nobody guesses, if the system has more than one there."""
+    host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(254) + 1}.{secrets.randbelow(254) + 1}"
+    with socket.socket() as probe:
+        try:
+            probe.bind((host, 0))
+        except OSError:
+            probe.bind((LOOPBACK, 0))
+        address, port = probe.getsockname()
+        return str(address), int(port)

@@ -1,0 +1,129 @@
+"""The page of the live view: the files of rerun's web viewer, and what they show of the run beside it.
+
+rerun's own function serves to the whole network, and its page calls home, for usage data among other things; the
+policy of our server stops that. The page's files are found only inside the viewer program, so it is started for a
+moment when the first visitor comes.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Mapping
+from email.message import Message
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from launch_scripts import parent_death
+from launch_scripts.web import LOOPBACK, Page, Reply
+from launch_scripts.web.server import Server
+from swarm.errors import StoreError
+
+log = logging.getLogger(__name__)
+
+_FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/sw.js")
+_BANNER = "/run_banner.js"
+_READY_WITHIN_S = 20.0
+_LASTS_S = 120.0
+"""The page has 40 MB, and a tunnel may be slow."""
+
+
+class LivePage:
+    """Serves the page of the web viewer, and its stream; a visit to `/` leads to both. Raises BusError if it cannot
+    listen on the port; 0 is any.
+
+    stream  address of rerun's server
+    """
+
+    def __init__(self, port: int, stream: tuple[str, int]) -> None:
+        self.run: Callable[[], Mapping[str, Any]] = dict
+        """What the page is told of the run whenever it asks, see `run_banner.js`."""
+        self._files: dict[str, Reply] = {}
+        self._fetching = threading.Lock()
+        banner = Path(__file__).with_name("run_banner.js").read_bytes()
+        pages: dict[str, Page] = {path: partial(self._file, path) for path in _FILES}
+        pages |= {
+            "/": self._entrance,
+            _BANNER: lambda query, headers: Reply(200, "text/javascript", banner),
+            "/run.json": lambda query, headers: Reply(200, "application/json", json.dumps(self.run()).encode()),
+        }
+        self.server = Server("web_port", port, pages, behind=stream, lasts_s=_LASTS_S, newest_first=False)
+
+    def _entrance(self, query: str, headers: Message) -> Reply:
+        """Leads a visit without a query to the stream, which comes through the page's own port: so a tunnel needs
+        one port, and may begin at any."""
+        if query:
+            return self._file("/", query, headers)
+        told = {"url": f"rerun+http://{headers['host']}/proxy", "theme": "dark", "hide_welcome_screen": "1"}
+        return Reply(302, "text/plain", b"", {"Location": f"/?{urllib.parse.urlencode(told)}"})
+
+    def _file(self, path: str, query: str, headers: Message) -> Reply:
+        with self._fetching:
+            if not self._files:
+                try:
+                    self._files = _take_files()
+                except (OSError, StoreError) as error:
+                    log.warning("no viewer to serve: %s", error)
+                    told = b"the viewer program cannot be started; see the monitor's log\n"
+                    return Reply(503, "text/plain", told)
+        return self._files[path]
+
+
+def viewer_program() -> Path:
+    """The viewer itself. The script of that name on the path would be a second process between us and it."""
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is None or spec.origin is None:
+        raise StoreError("rerun's viewer is not installed: install rerun-sdk, or set monitor.live = false")
+    return Path(spec.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def _take_files() -> dict[str, Reply]:
+    """The page's files, from a viewer program that lives only as long as that takes; the page with our script at
+    its end. Raises OSError if the program does not serve them."""
+    with socket.create_server((LOOPBACK, 0)) as probe:
+        port = probe.getsockname()[1]
+    # Given a stream to show, the program serves nothing but the page. On "CI" it collects no usage data and writes
+    # nothing to the home folder.
+    serve = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port), "rerun+http://127.0.0.1:1/proxy"]
+    viewer = subprocess.Popen(
+        [sys.executable, "-I", parent_death.__file__, str(os.getpid()), str(viewer_program()), *serve],
+        stdin=subprocess.DEVNULL,
+        env={**os.environ, "CI": "1", "RUST_LOG": "warn"},
+    )
+    try:
+        files = {path: _fetch(f"http://{LOOPBACK}:{port}{path}", viewer) for path in _FILES}
+    finally:
+        viewer.kill()
+        viewer.wait()
+    body, end, rest = files["/"].content.rpartition(b"</body>")
+    script = f'<script src="{_BANNER}"></script>'.encode()
+    return {**files, "/": files["/"]._replace(content=body + script + end + rest)}
+
+
+def _fetch(url: str, viewer: subprocess.Popen[bytes]) -> Reply:
+    """Waits for the viewer to listen. Raises OSError, as urllib's errors are."""
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    deadline_s = time.monotonic() + _READY_WITHIN_S
+    while True:
+        try:
+            with direct.open(url, timeout=_READY_WITHIN_S) as reply:
+                content = reply.read()
+                kind = reply.headers.get("Content-Type") or "text/html"
+                return Reply(200, kind, content, {"rerun-final-length": str(len(content))})
+        except urllib.error.HTTPError:
+            raise
+        except OSError:
+            if viewer.poll() is not None or time.monotonic() > deadline_s:
+                raise
+        time.sleep(0.02)
