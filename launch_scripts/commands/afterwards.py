@@ -64,14 +64,14 @@ def export(
         list[str] | None,
         typer.Option(
             help="tracks, targets, captures, routes or marks; may be given several times; all by default.",
-            autocompletion=complete.words("launch_scripts.report.geo.run_export", "WHAT"),
+            autocompletion=complete.words("launch_scripts.report.run_layers", "WHAT"),
         ),
     ] = None,
     format: Annotated[
         str,
         typer.Option(
-            help="geojson or csv, a file per layer; gpkg, one file with all layers.",
-            autocompletion=complete.words("launch_scripts.report.geo.run_export", "FORMATS"),
+            help="geojson, csv or gpx, a file per layer; gpkg or kml, one file with all layers.",
+            autocompletion=complete.words("launch_scripts.report.run_layers", "ENDINGS"),
         ),
     ] = "geojson",
     out: Annotated[

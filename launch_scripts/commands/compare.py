@@ -13,7 +13,7 @@ from rich.text import Text
 from launch_scripts.launcher.console import REPORTED
 from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
-from launch_scripts.report.results.compare import (
+from launch_scripts.report.compare import (
     LeftRun,
     Row,
     circumstances_that_differ,

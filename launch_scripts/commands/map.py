@@ -11,7 +11,8 @@ import typer
 
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.shared_options import AsJson, Tls, spread
-from launch_scripts.report.geo.geo_layers import Layer, mark_layer, write_layers
+from launch_scripts.report.export import FORMATS, Layer, write_layers, write_raster
+from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame
@@ -26,7 +27,6 @@ app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is
 Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
 _TEXT = (".json",)
 _PIXELS = (".tif", ".tiff")
-_SHAPES = (".geojson", ".gpkg")
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
@@ -107,7 +107,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
 @app.command()
 def export(
     store: Store,
-    out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson: the winners.")],
+    out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.")],
 ) -> None:
     """Write the marks of a store: all of them, and what was learned, as JSON, which can be imported; the winners as
     pixels or polygons.
@@ -125,10 +125,10 @@ def export(
             out.write_text(stored_marks.to_json(terrain, grid, sets, classes), encoding="utf-8")
         elif kind_of_file in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
-        elif kind_of_file in _SHAPES:
+        elif kind_of_file in FORMATS:
             write_layers(out, [_layer(grid, sets)], MapFrame(grid))
         else:
-            raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS + _SHAPES)}")
+            raise StoreError(f"{out}: the name must end in {', '.join((*_TEXT, *_PIXELS, *FORMATS))}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
     print(f"{out}: {_counted(grid, sets) if kind_of_file in _TEXT else _counted_for_all(grid, sets)}")
@@ -202,35 +202,11 @@ def learned(
 
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
     import numpy as np
-    import rasterio
-    from rasterio._err import CPLE_BaseError
-    from rasterio.errors import CRSError, RasterioError
-    from rasterio.transform import from_origin
 
     pace, kind = stored_marks.to_bands(grid, sets, time.time_ns())
-    try:
-        crs = rasterio.crs.CRS.from_user_input(grid.crs)
-    except CRSError:
-        crs = None  # a grid of its own, as synthetic terrain has
-    try:
-        with rasterio.open(
-            out,
-            "w",
-            driver="GTiff",
-            height=grid.rows,
-            width=grid.cols,
-            count=2,
-            dtype="float32",
-            nodata=np.nan,
-            compress="deflate",
-            crs=crs,
-            transform=from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m),
-        ) as tiff:
-            tiff.write(pace, 1)
-            said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
-            tiff.write(said, 2)
-            tiff.set_band_description(1, "pace of marks, s/m; inf lethal; nan as the prior map says")
-            tiff.set_band_description(2, "kind: 0 pace, 1 lethal, 2 clear; nan nothing said")
-            tiff.update_tags(terrain=terrain)
-    except (RasterioError, CPLE_BaseError) as error:
-        raise StoreError(f"cannot write {out}: {error.__cause__ or error}") from error
+    said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+    bands = [
+        "pace of marks, s/m; inf lethal; nan as the prior map says",
+        "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
+    ]
+    write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)

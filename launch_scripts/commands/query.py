@@ -117,7 +117,8 @@ def route(
         str, typer.Option("--class", help="Which class of the swarm's vehicles drives there.")
     ] = "ground",
     out: Annotated[
-        Path | None, typer.Option(help="Write .geojson, .gpx, .kml or .csv; with --terrain also .png, a picture.")
+        Path | None,
+        typer.Option(help="Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture."),
     ] = None,
     preset: PresetOption = None,
     as_json: AsJson = False,

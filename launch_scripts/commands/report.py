@@ -12,7 +12,7 @@ from swarm.errors import ConfigError
 
 def write_report_page(run: str, runs: Path) -> None:
     """Write a run's page again. Raises ConfigError or StoreError in one sentence."""
-    from launch_scripts.report.page.run_page import write_page
+    from launch_scripts.report.run_page import write_page
 
     print(write_page(find_run(run, runs)))
 
@@ -27,15 +27,15 @@ def export_from(
     mcap: bool,
 ) -> None:
     """Write files of a run. Raises ConfigError or StoreError in one sentence."""
-    from launch_scripts.report.geo.run_export import FORMATS, WHAT, export_run
+    from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
 
-    for option, given, allowed in (("--what", what, tuple(WHAT)), ("--format", [format], FORMATS)):
+    for option, given, allowed in (("--what", what, tuple(WHAT)), ("--format", [format], ENDINGS)):
         for each in given:
             if each not in allowed:
                 raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
     folder = find_run(run, runs)
     if mcap:
-        from launch_scripts.report.foxglove.mcap_export import export_mcap
+        from launch_scripts.report.mcap_export import export_mcap
 
         print(export_mcap(folder, out, force))
         return

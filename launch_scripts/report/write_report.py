@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import importlib.metadata
+import io
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
@@ -14,11 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.ground_pace import GROUND_PACE_FILE, packed_ground
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import REPORT_FILE, ended, replacing, write_file
-from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, tracks_in
-from launch_scripts.report.results.result_tables import TABLES, csv_of
+from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
 from shared_map.learning.learned import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
@@ -74,8 +74,7 @@ def write_report(
     """
     report = {**report, **({"made": made} if (made := ended(folder)) else {})}
     # matplotlib takes a moment
-    from launch_scripts.report.pictures.ground_picture import GROUND_FILE, ground_picture
-    from launch_scripts.report.pictures.learned_picture import LEARNED_FILE, learned_overlay
+    from launch_scripts.report.map_figure import GROUND_FILE, LEARNED_FILE, ground_picture, learned_overlay
 
     tracks = packed_tracks(recorder)
     ground = ground_picture(terrain, recorder.scenario, truth)
@@ -92,8 +91,8 @@ def write_report(
         contents[LEARNED_FILE] = lambda: learned_overlay(terrain, factors)
     for name, content in contents.items():
         _write(folder / name, content())
-    from launch_scripts.report.page.run_page import write_page
-    from launch_scripts.report.pictures.picture import save_picture
+    from launch_scripts.report.picture import save_picture
+    from launch_scripts.report.run_page import write_page
 
     with _sentence(folder / PICTURE_FILE), replacing(folder / PICTURE_FILE) as half:
         save_picture(half, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
@@ -111,3 +110,31 @@ def _sentence(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+TABLES = {"by_target": ("targets.csv", "target"), "by_group": ("groups.csv", "group"),
+          "by_vehicle": ("vehicles.csv", "vehicle")}  # fmt: skip
+"""Section of the report -> its file, and what its first column is called."""
+_GAP = ("mean", "p95", "max", "unproven")
+
+
+def csv_of(section: str, report: Mapping[str, Any]) -> bytes:
+    """One row per target, group or vehicle. What has no value is empty."""
+    rows = [flat(id, row) for id, row in report[section].items()]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow([TABLES[section][1], *columns[1:]])
+    writer.writerows([row.get(name) for name in columns] for row in rows)
+    return file.getvalue().encode()
+
+
+def flat(id: str, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row without tables inside: `certified_gap_mean` and so on."""
+    values: dict[str, Any] = {"id": id}
+    for name, value in row.items():
+        if name == "certified_gap":
+            values |= {f"{name}_{part}": (value or {}).get(part) for part in _GAP}
+        else:
+            values[name] = value
+    return values

@@ -1,23 +1,19 @@
-"""A route and the ground along it, written for other programs: GeoJSON, GPX, KML, CSV, a picture."""
+"""A route and the ground along it, written for other programs by the one exporter, or as a picture."""
 
 from __future__ import annotations
 
-import csv
-import json
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.geo.geo_shapes import in_degrees
+from launch_scripts.report.export import COSTS, Feature, FieldKind, Layer, check_file, write_layers
 from shared_map.arrays import Floats
 from shared_map.terrain.places import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain
-from swarm.errors import ConfigError, TerrainError
+from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 from swarm.places import fields_of
 
@@ -56,11 +52,6 @@ class DescribedRoute:
         return max(self.cost_s / self.lower_bound_s, 1.0) if self.lower_bound_s > 0 else np.inf
 
     @property
-    def placed(self) -> bool:
-        """Whether the terrain has a place on Earth."""
-        return self.grid.crs != "local"
-
-    @property
     def climb_m(self) -> tuple[float, float] | None:
         """(metres up, metres down) in all."""
         if self.height_m is None:
@@ -71,10 +62,6 @@ class DescribedRoute:
     def metres(self) -> NDArray[np.float64]:
         """float64 (2, n): x and y in metres of the map."""
         return middles_of(self.grid, self.cells)
-
-    def degrees(self) -> NDArray[np.float64]:
-        """float64 (2, n): latitudes and longitudes; the terrain has a place."""
-        return MapFrame(self.grid).to_degrees(*self.metres())
 
     def facts(self) -> dict[str, Any]:
         """Numbers of the route, by name."""
@@ -112,124 +99,61 @@ def profile_of(route: DescribedRoute) -> str:
     return f"{''.join(_BARS[n] for n in levels)}  {low:.0f} to {high:.0f} m"
 
 
+def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
+    """The route as a line; in a table its cells instead, and in a GeoPackage these, too."""
+    x_m, y_m = route.metres()
+    steps: dict[str, NDArray[Any]] = {"at_m": route.at_m.round(2)}
+    if route.at_s is not None:
+        steps["at_s"] = route.at_s.round(2)
+    xy_m = np.stack([x_m, y_m], axis=1)
+    if route.height_m is not None and np.isfinite(route.height_m).all():
+        xy_m = np.column_stack([xy_m, route.height_m.round(2)])
+    kinds: dict[type, FieldKind] = {str: "text", int: "int", float: "real", dict: "json", list: "json"}
+    values = {"name": route.name, **route.facts()}
+    if ending == ".geojson":
+        values |= {name: each.tolist() for name, each in steps.items()}
+    # A line has two points at least, also of somebody who is there already.
+    whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values)
+    line = Layer("route", "LineString", {name: kinds[type(v)] for name, v in values.items()}, [whole], COSTS)
+    if ending not in (".csv", ".gpkg"):
+        return [line]
+    rows, cols = np.divmod(route.cells, route.grid.cols)
+    columns: dict[str, NDArray[Any]] = {"row": rows, "col": cols}
+    if route.height_m is not None:
+        columns["height_m"] = route.height_m.round(2)
+    columns |= steps
+    told = zip(*(column.tolist() for column in columns.values()), strict=True)
+    cells = Layer(
+        "route_cells",
+        "Point",
+        {name: "int" if name in ("row", "col") else "real" for name in columns},
+        [
+            Feature([place], dict(zip(columns, each, strict=True)))
+            for place, each in zip(xy_m[:, None, :2], told, strict=True)
+        ],
+        COSTS,
+    )
+    return [cells] if ending == ".csv" else [line, cells]
+
+
 def check_route_file(path: Path | None) -> None:
-    """Raise ConfigError before the work, if the ending says no format or the folder is not there."""
-    if path is None:
-        return
-    if path.suffix.lower() not in WRITERS:
-        raise ConfigError(f"--out {path}: write {', '.join(WRITERS)}")
-    if path.is_dir() or not path.parent.is_dir():
-        raise ConfigError(f"--out {path}: cannot write there, it is a folder or lies in none")
+    """Raises ConfigError before the work, if the ending says no format or the folder is not there."""
+    if path is not None:
+        check_file(path, ".png")
 
 
 def write_route(route: DescribedRoute, path: Path) -> None:
-    """Write a route in the format of the file's ending.
-
-    Raises
-    ------
-    ConfigError
-        On another ending, or without a place on Earth or a terrain where the format needs one.
-    TerrainError
-        If the file cannot be written.
-    """
+    """Writes a route in the format of the file's ending. Raises ConfigError or StoreError in one sentence, also
+    without a place on Earth or a terrain where the format needs one."""
     check_route_file(path)
+    ending = path.suffix.lower()
+    if ending != ".png":
+        write_layers(path, layers_of(route, ending), MapFrame(route.grid))
+        return
     try:
-        WRITERS[path.suffix.lower()](route, path)
+        _png(route, path)
     except OSError as error:
-        raise TerrainError(f"cannot write {path}: {error.strerror or error}") from error
-
-
-# --- the formats ----------------------------------------------------------------------------------------------
-
-
-def _degrees(route: DescribedRoute, path: Path) -> NDArray[np.float64]:
-    if not route.placed:
-        raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .png")
-    return route.degrees()
-
-
-def _points(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any, digits: int) -> Iterator[list[float]]:
-    """[x, y, height] per point; without the height where it is not known."""
-    for n, (x, y) in enumerate(zip(xs.tolist(), ys.tolist(), strict=True)):
-        known = heights is not None and np.isfinite(heights[n])
-        yield [round(x, digits), round(y, digits), *([round(float(heights[n]), 2)] if known else [])]
-
-
-def _line(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any) -> list[list[float]]:
-    """As `_points`, to 8 digits; at least two, as a line has in GeoJSON and KML: who is there already stays."""
-    points = list(_points(xs, ys, heights, 8))
-    return points * 2 if len(points) == 1 else points
-
-
-def _geojson(route: DescribedRoute, path: Path) -> None:
-    """RFC 7946: WGS 84, longitude first. A terrain without a place is written in its own metres, and says so."""
-    points = route.metres().T
-    xs, ys = (in_degrees(points, MapFrame(route.grid)) if route.placed else points).T
-    properties = {"name": route.name, **route.facts(), "at_m": route.at_m.round(2).tolist()}
-    if route.at_s is not None:
-        properties["at_s"] = route.at_s.round(2).tolist()
-    feature = {
-        "type": "Feature",
-        "properties": properties,
-        "geometry": {"type": "LineString", "coordinates": _line(xs, ys, route.height_m)},
-    }
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
-
-
-def _gpx(route: DescribedRoute, path: Path) -> None:
-    lat, lon = _degrees(route, path)
-    root = ElementTree.Element(
-        "gpx", version="1.1", creator="terrain-swarm", xmlns="http://www.topografix.com/GPX/1/1"
-    )
-    track = ElementTree.SubElement(root, "trk")
-    ElementTree.SubElement(track, "name").text = route.name
-    segment = ElementTree.SubElement(track, "trkseg")
-    for n in range(len(lat)):
-        point = ElementTree.SubElement(segment, "trkpt", lat=f"{lat[n]:.8f}", lon=f"{_within_180(lon[n]):.8f}")
-        if route.height_m is not None and np.isfinite(route.height_m[n]):
-            ElementTree.SubElement(point, "ele").text = f"{route.height_m[n]:.2f}"
-    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
-
-
-def _within_180(lon_deg: float) -> float:
-    """GPX allows -180 to just below 180."""
-    return float((lon_deg + 180.0) % 360.0 - 180.0) if not -180.0 <= lon_deg < 179.999999995 else float(lon_deg)
-
-
-def _kml(route: DescribedRoute, path: Path) -> None:
-    lat, lon = _degrees(route, path)
-    root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
-    mark = ElementTree.SubElement(ElementTree.SubElement(root, "Document"), "Placemark")
-    ElementTree.SubElement(mark, "name").text = route.name
-    line = ElementTree.SubElement(mark, "LineString")
-    ElementTree.SubElement(line, "tessellate").text = "1"
-    ElementTree.SubElement(line, "altitudeMode").text = "clampToGround"
-    points = _line(lon, lat, route.height_m)
-    ElementTree.SubElement(line, "coordinates").text = " ".join(",".join(map(_plain, point)) for point in points)
-    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
-
-
-def _plain(value: float) -> str:
-    return f"{value:.8f}".rstrip("0").rstrip(".")
-
-
-def _csv(route: DescribedRoute, path: Path) -> None:
-    rows_cols = np.divmod(route.cells, route.grid.cols)
-    x_m, y_m = route.metres()
-    columns: dict[str, NDArray[Any]] = {
-        "row": rows_cols[0], "col": rows_cols[1], "x_m": x_m.round(3), "y_m": y_m.round(3),
-    }  # fmt: skip
-    if route.placed:
-        columns["lat"], columns["lon"] = route.degrees().round(8)
-    if route.height_m is not None:
-        columns["height_m"] = route.height_m.round(2)
-    columns["at_m"] = route.at_m.round(2)
-    if route.at_s is not None:
-        columns["at_s"] = route.at_s.round(2)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(columns)
-        rows.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _png(route: DescribedRoute, path: Path) -> None:
@@ -294,13 +218,3 @@ def _relief(terrain: Terrain) -> tuple[Floats, tuple[float, float]]:
         level.grid.cols * side_m,
         level.grid.rows * side_m,
     )
-
-
-WRITERS: Mapping[str, Callable[[DescribedRoute, Path], None]] = {
-    ".geojson": _geojson,
-    ".gpx": _gpx,
-    ".kml": _kml,
-    ".csv": _csv,
-    ".png": _png,
-}
-"""Ending -> what writes it."""

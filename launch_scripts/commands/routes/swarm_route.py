@@ -139,8 +139,8 @@ def as_json(answer: Answer) -> str:
     if cells:
         route = _route(answer, cells)
         fields["path"] = {name: line.round(6).tolist() for name, line in zip("xy", route.metres(), strict=True)}
-        if route.placed:
-            lat, lon = route.degrees().round(9).tolist()
+        if frame.grid.crs != "local":
+            lat, lon = frame.to_degrees(*route.metres()).round(9).tolist()
             fields["path"] |= {"lat": lat, "lon": lon}
     return json.dumps(fields)
 

@@ -9,7 +9,6 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from launch_scripts.commands.terrain.terrain_files import write_geotiff
 from launch_scripts.commands.terrain.terrain_options import (
     TIFF,
     Crs,
@@ -21,6 +20,7 @@ from launch_scripts.commands.terrain.terrain_options import (
     print_shares,
 )
 from launch_scripts.launcher.console import progress
+from launch_scripts.report.export import write_raster
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
@@ -79,7 +79,7 @@ def classify(
     if labels is not None:
         _compare(terrain, labels)
     if out is not None:
-        write_geotiff(out, [terrain.classes], terrain.grid)
+        write_raster(out, [terrain.classes], terrain.grid, descriptions=["class"])
     if picture is not None:
         draw_terrain(terrain, picture, f"{photo.name} on {elevation.name}")
     for note in terrain.notes:

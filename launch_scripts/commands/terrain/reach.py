@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.commands.terrain.route_on_terrain import between, finder_for
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.geo.geo_shapes import areas_of, polygon
+from launch_scripts.report.export import COSTS, Feature, Layer, areas_of, write_layers, write_raster
 from shared_map.arrays import Floats
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -131,35 +128,29 @@ def _to(scenario: Scenario, terrain: Terrain, cell: int, option: str) -> Floats:
 
 
 def write_reach(found: Reach, path: Path, every_s: float) -> None:
-    """Write seconds as a GeoTIFF (-1 where there is no way), or areas of equal time as GeoJSON.
+    """Writes seconds as a GeoTIFF (-1 where there is no way), or areas of equal time in a format of the exporter.
 
-    every_s  how far apart in time the lines of the GeoJSON are
+    every_s  how far apart in time the borders of areas are
 
-    Raises ConfigError on another ending or too many lines, TerrainError if the file cannot be written.
+    Raises ConfigError on another ending or too many areas, StoreError if the file cannot be written.
     """
     if path.suffix.lower() in (".tif", ".tiff"):
-        from launch_scripts.commands.terrain.terrain_files import write_geotiff
-
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
-        write_geotiff(path, [seconds], found.grid, nodata=-1.0)
-    elif path.suffix.lower() == ".geojson":
-        many = (found.quantiles_s()[1] - (found.fastest_s or 0.0)) / every_s
-        if many > _MOST_BANDS:
-            raise ConfigError(f"--every-s {every_s:g} makes {many:.0f} areas, at most {_MOST_BANDS}: ask for fewer")
-        collection = {"type": "FeatureCollection", "features": list(_areas(found, every_s))}
-        try:
-            path.write_text(json.dumps(collection), encoding="utf-8")
-        except OSError as error:
-            raise TerrainError(f"cannot write {path}: {error.strerror or error}") from error
-    else:
-        raise ConfigError(f"--out {path}: write .tif or .geojson")
+        write_raster(path, [seconds], found.grid, descriptions=["seconds of driving, -1 no way"], nodata=-1.0)
+        return
+    many = (found.quantiles_s()[1] - (found.fastest_s or 0.0)) / every_s
+    if many > _MOST_BANDS:
+        raise ConfigError(f"--every-s {every_s:g} makes {many:.0f} areas, at most {_MOST_BANDS}: ask for fewer")
+    write_layers(path, [_areas(found, every_s)], MapFrame(found.grid))
 
 
-def _areas(found: Reach, every_s: float) -> Iterator[dict[str, Any]]:
+def _areas(found: Reach, every_s: float) -> Layer:
     """Areas between lines of equal time; of a corridor, of equal time lost against the best way."""
-    frame, known = MapFrame(found.grid), np.isfinite(found.seconds)
+    known = np.isfinite(found.seconds)
     above_s = np.where(known, found.seconds - np.float32(found.fastest_s or 0.0), 0)
     bands: NDArray[np.int32] = np.maximum(np.floor(above_s / every_s), 0).astype(np.int32)
-    for band, rings in areas_of(bands, known, frame):
-        properties = {"from_s": band * every_s, "to_s": (band + 1) * every_s}
-        yield {"type": "Feature", "properties": properties, "geometry": polygon(rings, frame)}
+    areas = [
+        Feature(rings, {"from_s": band * every_s, "to_s": (band + 1) * every_s})
+        for band, rings in areas_of(bands, known, found.grid)
+    ]
+    return Layer("reach", "Polygon", {"from_s": "real", "to_s": "real"}, areas, COSTS)

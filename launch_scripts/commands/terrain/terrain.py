@@ -14,7 +14,6 @@ from rich.table import Table
 
 from launch_scripts.commands.shared_options import AsJson, PresetOption
 from launch_scripts.commands.terrain import photo_classes
-from launch_scripts.commands.terrain.terrain_files import write_geotiff
 from launch_scripts.commands.terrain.terrain_options import (
     TIFF,
     Cover,
@@ -31,6 +30,7 @@ from launch_scripts.commands.terrain.terrain_options import (
     print_shares,
 )
 from launch_scripts.launcher.console import progress
+from launch_scripts.report.export import FORMATS, write_raster
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
@@ -195,7 +195,13 @@ def cost(
 
 def _write_cost(terrain: Terrain, path: Path, tell: Tell) -> None:
     pace = terrain.pace_s_per_m
-    write_geotiff(path, [np.where(np.isfinite(pace), pace, np.float32(-1))], terrain.grid, nodata=-1.0)
+    write_raster(
+        path,
+        [np.where(np.isfinite(pace), pace, np.float32(-1))],
+        terrain.grid,
+        descriptions=["pace, seconds per metre; -1 lethal"],
+        nodata=-1.0,
+    )
     tell("writing", 1.0)
 
 
@@ -275,9 +281,9 @@ def synth(
         except OSError as error:
             raise TerrainError(f"cannot write {out}: {error.strerror or error}") from error
     else:
-        write_geotiff(out, [terrain.elevation_m], grid)
+        write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:
-        write_geotiff(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
+        write_raster(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     if picture is not None:
         draw_terrain(terrain, picture, f"synthetic, seed {seed}")
     console.print(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}: {out}")
@@ -295,20 +301,21 @@ def reach(
         float, typer.Option(min=0.0, max=100.0, help="With --from: a way may take this share longer than the best.")
     ] = 0.05,
     out: Annotated[
-        Path | None, typer.Option(help="Write .tif (seconds, -1 where there is no way) or .geojson (areas).")
+        Path | None,
+        typer.Option(help="Write .tif: seconds, -1 where there is no way; .geojson, .gpkg, .kml or .csv: areas."),
     ] = None,
     every_s: Annotated[
-        float, typer.Option(min=0.001, max=1e9, help="How far apart the areas of a .geojson are, in seconds.")
+        float, typer.Option(min=0.001, max=1e9, help="How far apart areas are, in seconds.")
     ] = 600.0,
     preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as GeoJSON.
+    """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as areas.
 
     With --from: the corridor of near-optimal ways between two places. Each of
     its cells has the time of a good way that passes it, which can be driven
-    and may take a little longer than the best that does; the areas of a
-    .geojson are seconds lost against the best way of all.
+    and may take a little longer than the best that does; areas tell the
+    seconds lost against the best way of all.
 
     swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
     swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
@@ -317,7 +324,7 @@ def reach(
     from launch_scripts.commands.terrain.reach import corridor, write_reach
     from launch_scripts.commands.terrain.reach import reach as reach_of
 
-    check_target(out, "--out", *TIFF, ".geojson")
+    check_target(out, "--out", *TIFF, *(ending for ending in FORMATS if ending != ".gpx"))
     found = reach_of(terrain, to, preset) if start is None else corridor(terrain, start, to, slack, preset)
     if out is not None:
         write_reach(found, out, every_s)

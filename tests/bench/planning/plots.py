@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 from bench.planning.chase import Tally
 from bench.tables import label_of, on_machine
 from launch_scripts.observe.palette import BLUE, FAINT, INK, ORANGE, PINK, SKY, STYLE, VIOLET
-from launch_scripts.report.pictures.plots import halo
+from launch_scripts.report.plots import halo
 from swarm.config.values import Strategy
 
 _COLOURS: dict[Strategy, str] = {

@@ -11,7 +11,7 @@ import pytest
 
 from launch_scripts.cli import main
 from launch_scripts.launcher.console import REPORTED
-from launch_scripts.report.results.compare import LeftRun, circumstances_that_differ, figures, settings_that_differ
+from launch_scripts.report.compare import LeftRun, circumstances_that_differ, figures, settings_that_differ
 from swarm.config.load import parse_scenario
 from swarm.config.write import scenario_text
 

@@ -25,10 +25,9 @@ from launch_scripts.cli import main
 from launch_scripts.gateways.ros2.frames import RosMap
 from launch_scripts.gateways.ros2.grids import rows_from_north
 from launch_scripts.gateways.ros2.names import ros_name
-from launch_scripts.observe.ground_pace import GROUND_PACE_FILE
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report.foxglove.timeline import frame_names, instants_of
-from launch_scripts.report.geo.track_file import TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.timeline import frame_names, instants_of
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -68,7 +67,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
     recorder.heard(note, BEGAN_NS + 3 * NS_PER_S)
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
-        patched.setattr("launch_scripts.report.pictures.picture.save_picture", lambda half, *_: half.touch())
+        patched.setattr("launch_scripts.report.picture.save_picture", lambda half, *_: half.touch())
         write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
     return folder
 
@@ -295,7 +294,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
         assert told.count("\n") == 1
         assert not list(damaged.rglob("*.mcap*"))
     with monkeypatch.context() as patched:
-        patched.setattr("launch_scripts.report.foxglove.mcap_export.find_spec", lambda name: None)
+        patched.setattr("launch_scripts.report.mcap_export.find_spec", lambda name: None)
         assert swarm(patched, "export", run, "--mcap") == 2
     assert "--mcap needs mcap and rosbags and xxhash" in (told := capsys.readouterr().err)
     assert "pip install 'terrain-swarm[ros2]'" in told

@@ -18,9 +18,9 @@ from support.fake_run import fake_run
 
 from launch_scripts.observe.palette import STYLE, hillshade
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report.geo.track_file import packed_tracks, tracks_in
-from launch_scripts.report.pictures import picture, plots
-from launch_scripts.report.pictures.ground_picture import ground_picture
+from launch_scripts.report import picture, plots
+from launch_scripts.report.map_figure import ground_picture
+from launch_scripts.report.run_arrays import packed_tracks, tracks_in
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.load import parse_scenario

@@ -24,9 +24,9 @@ from support.map_strategies import set_of
 from launch_scripts.cli import main
 from launch_scripts.observe.history import BegunRoute
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report.geo.geo_layers import mark_layer, track_layers
-from launch_scripts.report.geo.geo_shapes import in_degrees
-from launch_scripts.report.geo.track_file import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
+from launch_scripts.report.export import COSTS, in_degrees
+from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
+from launch_scripts.report.run_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace
@@ -138,7 +138,8 @@ def test_what_never_moved_is_a_point_and_no_line_without_a_length(run: Path) -> 
         vehicles=[track("a", (1.0, 2.0)), track("b", (1.0, 2.0), (1.0, 2.0)), track("c", (0.0, 0.0), (3.0, 4.0))],
         targets=[track("t", (5.0, 5.0)), track("u")],
     )
-    layers = {layer.name: layer for layer in track_layers(still, {"a": "g"})}
+    made = (*vehicle_tracks(still, {"a": "g"}), *target_tracks(still, {}))
+    layers = {layer.name: layer for layer in made}
     assert [each.values["vehicle"] for each in layers["vehicle_tracks"].features] == ["c"]
     assert [each.values["length_m"] for each in layers["vehicle_tracks"].features] == [5.0]
     assert [each.values["vehicle"] for each in layers["vehicles_standing"].features] == ["a", "b"]
@@ -158,6 +159,50 @@ def test_a_table_has_a_row_per_place_with_degrees(
         assert [float(row["x_m"]), float(row["y_m"])] == pytest.approx([x_m, y_m], abs=1e-3)
         (degrees,) = in_degrees(np.array([[x_m, y_m]]), MapFrame(GRID))
         assert [float(row["lon"]), float(row["lat"])] == pytest.approx(degrees.tolist(), abs=1e-7)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_format_holds_all_layers_that_it_can(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    raw = pytest.importorskip("pyogrio.raw", reason="the extra vectors is not installed")
+    assert swarm(monkeypatch, "export", run, "--format", ending, "--out", tmp_path) == 0
+    tracks = read_tracks(run / TRACKS_FILE)
+    if ending == "csv":
+        rows = list(csv.DictReader((tmp_path / f"{run.name}-vehicle_tracks.csv").open()))
+        assert {row["vehicle"] for row in rows} == {track.id for track in tracks.vehicles}
+        assert all(row["at"].endswith("Z") and float(row["lat"]) > 0 for row in rows)
+        wkt = [row["wkt"] for row in csv.DictReader((tmp_path / f"{run.name}-marks.csv").open())]
+        assert all(each.startswith("POLYGON ((") for each in wkt)
+        return
+    if ending == "gpx":
+        meta, _, _, values = raw.read(tmp_path / f"{run.name}-vehicle_tracks.gpx", layer="track_points")
+        found = dict(zip(meta["fields"].tolist(), values, strict=True))
+        assert set(found["track_fid"].tolist()) == set(range(len(tracks.vehicles)))
+        assert not np.isnat(found["time"]).any()
+        assert swarm(monkeypatch, "export", run, "--format", "gpx", "--what", "marks", "--out", tmp_path) != 0
+        return
+    several = ending in ("gpkg", "kml")
+    for name in ("vehicle_tracks", "target_tracks", "captures", "routes", "marks"):
+        path = tmp_path / (f"{run.name}.{ending}" if several else f"{run.name}-{name}.{ending}")
+        meta, _, shapes, _ = raw.read(path, layer=name)
+        assert len(shapes) > 0, name
+        assert ending == "gpkg" or meta["crs"] == "EPSG:4326"
+
+
+def test_a_file_with_costs_says_how_they_count(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert swarm(monkeypatch, "export", run, "--what", "routes", "--out", tmp_path) == 0
+    (path,) = tmp_path.iterdir()
+    assert json.loads(path.read_text())["description"] == COSTS
+
+
+def test_without_pyogrio_a_sentence_says_what_to_install_and_tables_are_written(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyogrio", None)
+    assert swarm(monkeypatch, "export", run, "--what", "captures", "--format", "csv", "--out", tmp_path) == 0
+    assert swarm(monkeypatch, "export", run, "--what", "captures", "--out", tmp_path) == 2
+    assert "pip install 'terrain-swarm[vectors]'" in capsys.readouterr().err
 
 
 def test_no_route_that_leaves_the_map_harms_the_others(recorder: Recorder, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorder.heard(note, recorder.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
-        patched.setattr("launch_scripts.report.pictures.picture.save_picture", lambda half, *_: half.touch())
+        patched.setattr("launch_scripts.report.picture.save_picture", lambda half, *_: half.touch())
         write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
     return folder
 

@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
+import base64
 import datetime
-from collections.abc import Mapping
+import io
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from launch_scripts.observe import palette
 from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact, grouped, together
+from launch_scripts.observe.palette import GROUPS, STYLE, round_length, said_length
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
-from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
-from launch_scripts.report.page.map_svg import map_parts
-from launch_scripts.report.page.theme import themed_svg
-from launch_scripts.report.pictures.learned_picture import QUICKER, SLOWER
-from launch_scripts.report.pictures.plots import PLOTS, draw_plot
-from launch_scripts.report.results.result_tables import TABLES
-from swarm.config.input_files import FileKind, read_text
+from launch_scripts.report.map_figure import (
+    GROUND_FILE,
+    LEARNED_FILE,
+    QUICKER,
+    SLOWER,
+    Points,
+    colours_of_groups,
+    group_of,
+    in_km,
+    mark_overlay,
+)
+from launch_scripts.report.plots import PLOTS, draw_plot
+from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.write_report import TABLES
+from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.errors import StoreError
 
 PAGE_FILE = "report.html"
@@ -76,7 +94,7 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
 def environment_of_pages() -> Environment:
     """Templates that escape all that they are given, and raise where something is missing."""
     environment = Environment(
-        loader=PackageLoader("launch_scripts.report.page", "templates"),
+        loader=PackageLoader("launch_scripts.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -230,3 +248,113 @@ def _cell(name: str, value: Any) -> tuple[str, Any]:
     if name.endswith("_s"):
         return f"{value:,.0f}", value
     return (count(value) if isinstance(value, int | float) else str(value)), value
+
+
+# --- the map, as SVG over the picture of its ground: tracks can be pointed at and switched ------------------------
+
+WIDTH = 1000
+"""Units of the drawing across the longer side of the map."""
+_MOST_POINTS = 60_000
+"""Points of all tracks: more would be slow to look at."""
+
+
+def map_parts(folder: Path, tracks: RunTracks, report: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page's template makes a map of: places in units of the drawing, pictures as data."""
+    grid = tracks.grid
+    long_km = max(grid.rows, grid.cols) * grid.resolution_m / 1000
+    scale = WIDTH / long_km
+    samples = sum(len(track.time_ns) for track in (*tracks.vehicles, *tracks.targets))
+    step = max(1, -(-samples // _MOST_POINTS))
+    groups = colours_of_groups(report)
+    vehicles = [
+        {
+            "id": track.id,
+            "group": (group := group_of(track.id, report)),
+            "colour": groups.get(group, GROUPS[0]),
+            **_drawn(in_km(track, grid) * scale, step),
+        }
+        for track in tracks.vehicles
+        if len(track.time_ns)
+    ]
+    pieces = [(track.id, in_km(track, grid) * scale) for track in tracks.targets if len(track.time_ns)]
+    bar_km = round_length(grid.cols * grid.resolution_m / 5000)
+    ground, learned = folder / GROUND_FILE, folder / LEARNED_FILE
+    return {
+        "width": round(grid.cols * grid.resolution_m / 1000 * scale, 1),
+        "height": round(grid.rows * grid.resolution_m / 1000 * scale, 1),
+        "ground": data_uri("image/webp", read_bytes(ground, FileKind.RUN)) if ground.exists() else None,
+        "learned": data_uri("image/png", read_bytes(learned, FileKind.RUN)) if learned.exists() else None,
+        "marks": _png(tracks) if len(tracks.marks.cells) else None,
+        "groups": groups,
+        "vehicles": vehicles,
+        "thin": 1 / max(1.0, len(vehicles) / 60) ** 0.5,
+        "targets": [{"id": id, **_drawn(line, step)} for id, line in pieces],
+        "last": {id: [round(float(v), 1) for v in line[-1]] for id, line in pieces},
+        "captures": [
+            {"target": track.id, "place": [round(float(v), 1) for v in in_km(track, grid)[0] * scale]}
+            for track in tracks.captures
+        ],
+        "bar": {"units": round(bar_km * scale, 1), "text": said_length(bar_km * 1000)},
+    }
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _drawn(line: Points, step: int) -> dict[str, Any]:
+    """A path of every step-th point, and those that go straight on left out; where it begins and ends."""
+    some = np.concatenate([line[:-1:step], line[-1:]])
+    before, after = np.diff(some[:-1], axis=0), np.diff(some[1:], axis=0)
+    straight = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) < 0.05 * np.hypot(*before.T)
+    kept = np.ones(len(some), np.bool_)
+    kept[1:-1] = ~straight
+    points = [f"{x:.1f} {y:.1f}" for x, y in some[kept]]
+    return {"path": "M" + "L".join(points), "begin": points[0].split(), "end": points[-1].split()}
+
+
+def _png(tracks: RunTracks) -> str:
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(mark_overlay(tracks)).save(file, "PNG", optimize=True)
+    return data_uri("image/png", file.getvalue())
+
+
+# --- plots, as SVG whose colours follow the page: one drawing, light and dark -------------------------------------
+
+WIDTH_IN, HEIGHT_IN = 4.1, 1.8
+_THEMED = {
+    palette.INK: "--ink",
+    palette.FAINT: "--faint",
+    STYLE["axes.edgecolor"]: "--rule",
+    STYLE["grid.color"]: "--grid",
+    palette.VIOLET: "--violet",
+    palette.BLUE: "--blue",
+    palette.BLACK: "--black",
+    "#ffffff": "--card",
+    "#000000": "--ink",
+}
+"""Colour of a drawing -> the page's variable that takes its place."""
+_VARIABLES = {colour.lower(): variable for colour, variable in _THEMED.items()}
+_COLOUR = re.compile("|".join(_THEMED), re.IGNORECASE)
+
+
+def themed_svg(draw: Callable[[Axes], None]) -> Markup:
+    """What `draw` draws, as an SVG element. Its text is text; the page says in which font."""
+    with mpl.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": "run"}):
+        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN))
+        axes = figure.add_axes((0.125, 0.135, 0.775, 0.7))
+        axes.set_facecolor("none")
+        draw(axes)
+        file = io.StringIO()
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    return Markup(themed(file.getvalue()))
+
+
+def themed(svg: str) -> str:
+    """The SVG element of a file, as wide as its place, in the page's colours."""
+    element = svg[svg.index("<svg") :]
+    head, _, rest = element.partition(">")
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    return _COLOUR.sub(lambda found: f"var({_VARIABLES[found.group().lower()]})", f"{head}>{rest}")

@@ -13,10 +13,9 @@ from matplotlib.lines import Line2D
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact
 from launch_scripts.observe.palette import FAINT, GREEN, INK, RED, RULE, STYLE
-from launch_scripts.report.geo.track_file import RunTracks
-from launch_scripts.report.pictures.ground_picture import GroundPicture
-from launch_scripts.report.pictures.map_picture import draw_map
-from launch_scripts.report.pictures.plots import PLOTS, draw_plot
+from launch_scripts.report.map_figure import GroundPicture, draw_map
+from launch_scripts.report.plots import PLOTS, draw_plot
+from launch_scripts.report.run_arrays import RunTracks
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 

@@ -9,17 +9,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from launch_scripts.observe.ground_pace import GROUND_PACE_FILE, read_ground
 from launch_scripts.observe.palette import GROUPS, rgb
 from launch_scripts.observe.run_folder import REPORT_FILE, read_report, replacing
-from launch_scripts.report.geo.run_export import free_places, groups_of, tracks_of_run
+from launch_scripts.report.run_arrays import GROUND_PACE_FILE, read_ground
+from launch_scripts.report.run_layers import free_places, groups_of, tracks_of_run
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
     from launch_scripts.gateways.ros2.markers import Colour
     from launch_scripts.gateways.ros2.types import RosTypes
-    from launch_scripts.report.foxglove.timeline import Told
+    from launch_scripts.report.timeline import Told
 
 _PROFILE, _SCHEMAS, _MESSAGES = "ros2", "ros2msg", "cdr"
 """Words of MCAP's registry: what the file is for, how types are written in it, how messages."""
@@ -31,8 +31,7 @@ def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
     from launch_scripts.gateways.ros2.frames import RosMap
     from launch_scripts.gateways.ros2.messages import RosMessages
     from launch_scripts.gateways.ros2.types import Distribution, types_of
-    from launch_scripts.report.foxglove.log_lines import lines_of
-    from launch_scripts.report.foxglove.timeline import told
+    from launch_scripts.report.timeline import lines_of, told
 
     tracks = tracks_of_run(folder)
     report = read_report(folder) if (folder / REPORT_FILE).exists() else {}

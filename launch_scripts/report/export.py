@@ -1,0 +1,430 @@
+"""The one exporter of geometries and rasters, for other programs: a GIS, a spreadsheet, a navigation device.
+
+| ending     | driver            | places                                                                      |
+|------------|-------------------|-----------------------------------------------------------------------------|
+| `.geojson` | GDAL's GeoJSON    | WGS 84, longitude first (RFC 7946); metres of the map where it has no place |
+| `.gpkg`    | GDAL's GeoPackage | metres of the map, in its own coordinate system; one file holds all layers  |
+| `.kml`     | GDAL's LIBKML     | WGS 84, laid on the ground                                                  |
+| `.gpx`     | GDAL's GPX        | WGS 84; lines are tracks, points are waypoints, areas cannot be written     |
+| `.csv`     | Python's csv      | a row per point, in metres and degrees; an area or a route as WKT           |
+| `.tif`     | GDAL's GeoTIFF    | pixels of the map (`write_raster`)                                          |
+
+Names of fields end in their unit: `_m`, `_s`, `_s_per_m`, `_m2`. A layer with costs says how they count (`COSTS`)
+in the description of the layer, where the format has one. All formats but CSV and GeoTIFF need the extra "vectors".
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import datetime
+import json
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.terrain.places import MapFrame
+from swarm.errors import ConfigError, StoreError
+from swarm.grid import GridSpec
+
+COSTS = (
+    "Costs (cost_s, at_s, from_s, to_s) are seconds of driving: a step takes its length in metres times the pace, "
+    "in seconds per metre, of the cell that it enters. certified_gap is the cost over a proven lower bound of it."
+)
+"""The convention of costs, in each file that has some."""
+
+Value = str | int | float | np.datetime64 | list[Any] | dict[str, Any] | None
+FieldKind = Literal["text", "int", "flag", "real", "time", "json"]
+Shape = Literal["Point", "LineString", "Polygon"]
+Points = NDArray[np.float64]
+"""float64 (n, 2): x and y in metres of the map, or (n, 3) with the height; a ring ends with its first point."""
+TIMED: Mapping[str, FieldKind] = {"begins": "time", "ends": "time", "samples": "int", "length_m": "real"}
+"""Fields of a track beside those which say whose it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """One geometry and its values.
+
+    parts    rings of a polygon, or the points of a line or the point
+    time_ns  int64 (n,), UNIX time of each point of a line
+    """
+
+    parts: list[Points]
+    values: Mapping[str, Value]
+    time_ns: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Features of one shape with the same fields.
+
+    about  a sentence for the description of the layer
+    """
+
+    name: str
+    shape: Shape
+    fields: Mapping[str, FieldKind]
+    features: list[Feature] = field(default_factory=list)
+    about: str = ""
+
+
+class Format(NamedTuple):
+    """One row of `FORMATS`.
+
+    driver   of GDAL; empty: `_write_csv`
+    degrees  places are longitudes and latitudes, where the terrain has a place
+    local    places may be metres of a map without a place on Earth
+    many     a file holds several layers
+    """
+
+    driver: str
+    degrees: bool
+    local: bool
+    many: bool
+
+
+FORMATS: Mapping[str, Format] = {
+    ".geojson": Format("GeoJSON", degrees=True, local=True, many=False),
+    ".gpkg": Format("GPKG", degrees=False, local=True, many=True),
+    ".kml": Format("LIBKML", degrees=True, local=False, many=True),
+    ".gpx": Format("GPX", degrees=True, local=False, many=False),
+    ".csv": Format("", degrees=True, local=True, many=False),
+}
+"""Ending -> format of layers."""
+
+
+def check_file(path: Path, *others: str) -> None:
+    """Raises ConfigError before the work, if the ending says no format or the folder is not there.
+
+    others  endings that the caller writes itself
+    """
+    if path.suffix.lower() not in (*FORMATS, *others):
+        raise ConfigError(f"--out {path}: write {', '.join((*FORMATS, *others))}")
+    if path.is_dir() or not path.parent.is_dir():
+        raise ConfigError(f"--out {path}: cannot write there, it is a folder or lies in none")
+
+
+def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
+    """Writes layers in the format of the file's ending; of formats which hold one layer, the first.
+
+    Raises
+    ------
+    ConfigError
+        On another ending, on a map without a place or an area where the format needs or forbids one, and if pyogrio
+        is not installed.
+    StoreError
+        If the file cannot be written.
+    """
+    check_file(path)
+    form = FORMATS[path.suffix.lower()]
+    placed = frame.grid.crs != "local"
+    if not placed and not form.local:
+        raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
+    if form.driver == "GPX" and any(layer.shape == "Polygon" for layer in layers):
+        raise ConfigError(f"--out {path}: GPX has no areas; write .geojson, .gpkg or .kml")
+    half = path.with_name(f"{path.stem}.part{path.suffix}")
+    half.unlink(missing_ok=True)
+    try:
+        if not form.driver:
+            _write_csv(half, layers[0], frame)
+        else:
+            timed = [layer for layer in layers if any(each.time_ns is not None for each in layer.features)]
+            extra = map(_places_of, timed) if form.driver == "GPKG" else ()
+            for number, layer in enumerate([*layers, *extra]):
+                _write_layer(half, layer, frame, form, append=number > 0)
+        half.replace(path)
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            half.unlink(missing_ok=True)
+
+
+# --- by GDAL ------------------------------------------------------------------------------------------------------
+
+
+def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append: bool) -> None:
+    try:
+        import shapely
+        from pyogrio import raw
+        from pyogrio.errors import DataLayerError, DataSourceError
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"--out: a {path.suffix} needs pyogrio and shapely: pip install 'terrain-swarm[vectors]'"
+        ) from error
+    degrees = form.degrees and frame.grid.crs != "local"
+    fields, name, options = dict(layer.fields), layer.name, {"DESCRIPTION": layer.about or layer.name}
+    match form.driver:
+        case "GeoJSON":
+            layer = _with_names(layer)
+            fields = {"layer": "text", **fields, **({"times": "json"} if _is_timed(layer) else {})}
+            options["COORDINATE_PRECISION"] = "8" if degrees else "3"
+        case "LIBKML":
+            layer = _with_names(layer)
+            fields = {**fields, "tessellate": "flag", "altitudeMode": "text"}
+            options = {}
+        case "GPX":
+            layer = _gpx_points(layer)
+            fields, name = dict(layer.fields), layer.name
+            options = {}
+    made = {"Point": shapely.points, "LineString": shapely.linestrings, "Polygon": shapely.polygons}[layer.shape]
+    shapes = np.empty(len(layer.features), object)
+    for n, feature in enumerate(layer.features):
+        parts = [_placed(part, frame) for part in feature.parts] if degrees else feature.parts
+        if not all(np.isfinite(part[:, :2]).all() for part in parts):
+            raise StoreError(
+                f"cannot write the layer {layer.name}: a place has no longitude and latitude in "
+                f"{frame.grid.crs[:60]}; write a .gpkg, which is in metres of the map"
+            )
+        border, holes = parts[0], [parts[1:]] if parts[1:] else []
+        shapes[n] = made(border[0]) if layer.shape == "Point" else made(border, *holes)
+    high = any(part.shape[1] == 3 for feature in layer.features for part in feature.parts)
+    crs = "EPSG:4326" if form.driver in ("LIBKML", "GPX") else None
+    if form.driver == "GPKG" and frame.grid.crs != "local":
+        crs = frame.system.to_wkt()
+    try:
+        with warnings.catch_warnings():
+            # RFC 7946 has no system to name, nor has a site; GPX ends at 180 degrees, and begins at -180.
+            warnings.filterwarnings("ignore", "'crs' was not provided|Longitude")
+            raw.write(
+                path,
+                # Borders against the clock, holes with it, as RFC 7946 has it.
+                shapely.to_wkb(shapely.orient_polygons(shapes), output_dimension=3 if high else 2),
+                [_column(layer, name, kind) for name, kind in fields.items()],
+                list(fields),
+                layer=name,
+                driver=form.driver,
+                geometry_type=f"{layer.shape} Z" if high else layer.shape,
+                crs=crs,
+                append=append,
+                layer_options=options,
+                gdal_tz_offsets={  # 100 is UTC
+                    name: np.full(len(layer.features), 100) for name, kind in fields.items() if kind == "time"
+                },
+            )
+    except (DataSourceError, DataLayerError) as error:
+        raise StoreError(f"cannot write {path}: {error}") from error
+
+
+def _is_timed(layer: Layer) -> bool:
+    return any(each.time_ns is not None for each in layer.features)
+
+
+def _with_names(layer: Layer) -> Layer:
+    """The layer with what GeoJSON and KML have beside its fields: its name, times, and how KML lays it down."""
+    more: dict[str, Value] = {"layer": layer.name, "tessellate": 1, "altitudeMode": "clampToGround"}
+    features = [
+        Feature(
+            each.parts,
+            {**each.values, **more, "times": None if each.time_ns is None else list(map(iso_time, each.time_ns))},
+            each.time_ns,
+        )
+        for each in layer.features
+    ]
+    return Layer(layer.name, layer.shape, layer.fields, features, layer.about)
+
+
+def _gpx_points(layer: Layer) -> Layer:
+    """The points of a layer as GDAL's GPX driver wants them: of lines their track points, of points waypoints."""
+    names = [str(each.values.get("name") or next(iter(each.values.values()), "")) for each in layer.features]
+    if layer.shape == "Point":
+        at = [each.values.get("at", each.values.get("begins")) for each in layer.features]
+        features = [
+            Feature(each.parts, {"name": name, "time": time})
+            for each, name, time in zip(layer.features, names, at, strict=True)
+        ]
+        return Layer("waypoints", "Point", {"name": "text", "time": "time"}, features)
+    fields: dict[str, FieldKind] = {
+        "track_fid": "int", "track_seg_id": "int", "track_name": "text", "ele": "real", "time": "time",
+    }  # fmt: skip
+    points: list[Feature] = []
+    for number, each in enumerate(layer.features):
+        (part,) = each.parts
+        for n, place in enumerate(part):
+            values: dict[str, Value] = {"track_fid": number, "track_seg_id": 0, "track_name": names[number]}
+            values["ele"] = round(float(place[2]), 2) if len(place) == 3 else None
+            values["time"] = None if each.time_ns is None else moment(each.time_ns[n])
+            points.append(Feature([place[None, :2]], values))
+    return Layer("track_points", "Point", fields, points)
+
+
+def _places_of(layer: Layer) -> Layer:
+    """The points of a layer of lines, each with its time: what a GIS plays back."""
+    own = [name for name in layer.fields if name not in TIMED]
+    fields: dict[str, FieldKind] = {**{name: layer.fields[name] for name in own}, "at": "time"}
+    points = Layer(layer.name.replace("_tracks", "_places"), "Point", fields)
+    for feature in layer.features:
+        if feature.time_ns is not None:
+            values = {name: feature.values[name] for name in own}
+            points.features.extend(
+                Feature([place[None]], {**values, "at": moment(time_ns)})
+                for place, time_ns in zip(feature.parts[0], feature.time_ns, strict=True)
+            )
+    return points
+
+
+def _column(layer: Layer, name: str, kind: FieldKind) -> NDArray[Any]:
+    values = [feature.values.get(name) for feature in layer.features]
+    match kind:
+        case "text":
+            return np.array(values, object)
+        case "json":  # GDAL writes a text which is JSON as JSON into GeoJSON
+            return np.array([None if value is None else json.dumps(value) for value in values], object)
+        case "int" | "flag":
+            return np.array(values, np.int64 if kind == "int" else np.int32)
+        case "real":
+            return np.array([np.nan if value is None else value for value in values], np.float64)
+        case "time":
+            return np.array(values, "datetime64[ms]")
+
+
+# --- as a table ---------------------------------------------------------------------------------------------------
+
+
+def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
+    """A row per point, with metres of the map, and degrees where it has a place. What has no time or other value of
+    each of its points is one row, with its shape as WKT, longitude first."""
+    placed = frame.grid.crs != "local"
+    whole = layer.shape == "Polygon" or (layer.shape == "LineString" and not _is_timed(layer))
+    own = list(layer.fields) if whole else [name for name in layer.fields if name not in TIMED]
+    timed = ["at"] if not whole and (_is_timed(layer) or "begins" in layer.fields) else []
+    where = ["wkt"] if whole else ["x_m", "y_m", *(["lat", "lon"] if placed else [])]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*own, *timed, *where])
+        for feature in layer.features:
+            values = [_cell(feature.values[name]) for name in own]
+            if whole:
+                writer.writerow([*values, _wkt(layer, feature, frame)])
+                continue
+            begins = feature.values.get("begins")
+            times = [begins] if feature.time_ns is None else map(moment, feature.time_ns)
+            (part,) = feature.parts
+            degrees = _placed(part, frame).round(8) if placed else np.empty((len(part), 0))
+            for at, (x_m, y_m, *_), lon_lat in zip(times, part.round(3).tolist(), degrees.tolist(), strict=True):
+                writer.writerow([*values, *([_cell(at)] if timed else []), x_m, y_m, *lon_lat[1::-1]])
+
+
+def _wkt(layer: Layer, feature: Feature, frame: MapFrame) -> str:
+    placed = frame.grid.crs != "local"
+    parts = [(_placed(part, frame) if placed else part).round(8 if placed else 3) for part in feature.parts]
+    texts = [", ".join(" ".join(map(str, place)) for place in part[:, :2].tolist()) for part in parts]
+    if layer.shape == "LineString":
+        return f"LINESTRING ({texts[0]})"
+    return f"POLYGON ({', '.join(f'({text})' for text in texts)})"
+
+
+def _cell(value: Value) -> Any:
+    return json.dumps(value) if isinstance(value, list | dict) else iso_time(value)
+
+
+# --- values and shapes --------------------------------------------------------------------------------------------
+
+
+def moment(time_ns: np.int64) -> np.datetime64:
+    """A UNIX time in ns, to the millisecond."""
+    return np.datetime64(int(time_ns) // 1_000_000, "ms")
+
+
+def iso_time(value: Any) -> Any:
+    """A time in words, `2026-11-22T15:41:15.250Z`, also of UNIX time in ns; any other value as it is."""
+    if isinstance(value, np.int64):
+        value = moment(value)
+    if not isinstance(value, np.datetime64):
+        return value
+    at = datetime.datetime.fromtimestamp(int(value.astype(np.int64)) / 1000, datetime.UTC)
+    return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def in_degrees(points: Points, frame: MapFrame) -> Points:
+    """Longitudes and latitudes of points of the map; without a jump where the map crosses 180 degrees."""
+    from swarm.places import bounds_of
+
+    lat, lon = frame.to_degrees(points[:, 0], points[:, 1])
+    box = bounds_of(frame)
+    least_lon = -360.0 if box is None or box[3] <= 180.0 else 0.0  # smaller ones lie beyond 180 degrees
+    return np.stack([np.where(lon < least_lon, lon + 360.0, lon), lat], axis=1)
+
+
+def _placed(points: Points, frame: MapFrame) -> Points:
+    """`in_degrees`, with heights where there are some."""
+    return np.concatenate([in_degrees(points, frame), points[:, 2:]], axis=1)
+
+
+def areas_of(
+    values: NDArray[np.int32], inside: NDArray[np.bool_], grid: GridSpec
+) -> Iterator[tuple[int, list[Points]]]:
+    """(value, rings) of each connected area of equal value, in metres of the map: its border, then its holes.
+
+    values, inside  (rows, cols); cells that are not `inside` belong to no area
+    """
+    from rasterio.features import shapes
+
+    for shape, value in shapes(values, mask=inside, transform=transform_of(grid)):
+        yield int(value), [np.array(ring, np.float64) for ring in shape["coordinates"]]
+
+
+def turns_of(cells: NDArray[np.int64], grid: GridSpec) -> NDArray[np.int64]:
+    """The cells of a route at which it turns, and both ends: int64 (n,)."""
+    rows, cols = np.divmod(cells, grid.cols)
+    turns = np.ones(len(cells), np.bool_)
+    turns[1:-1] = (np.diff(rows, 2) != 0) | (np.diff(cols, 2) != 0)
+    return cells[turns]
+
+
+# --- rasters ------------------------------------------------------------------------------------------------------
+
+
+def transform_of(grid: GridSpec) -> Any:
+    """rasterio's transform from pixels to metres of the map."""
+    from rasterio.transform import from_origin
+
+    return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
+
+
+def write_raster(
+    path: Path,
+    bands: Sequence[NDArray[Any]],
+    grid: GridSpec,
+    *,
+    descriptions: Sequence[str] = (),
+    tags: Mapping[str, str] | None = None,
+    **profile: Any,
+) -> None:
+    """Writes a tiled, compressed GeoTIFF with overviews (its tile pyramid). A terrain without a place gets none.
+
+    bands         (rows, cols) each, of one dtype
+    descriptions  what each band holds, with its unit
+    profile       as rasterio takes it, such as nodata
+
+    Raises StoreError if it cannot be written.
+    """
+    import rasterio
+    from rasterio._err import CPLE_BaseError
+    from rasterio.enums import Resampling
+    from rasterio.errors import RasterioError
+
+    side = {"tiled": True, "blockxsize": 256, "blockysize": 256} if min(grid.rows, grid.cols) >= 256 else {}
+    size = {"height": grid.rows, "width": grid.cols, "count": len(bands), "dtype": bands[0].dtype}
+    crs = None if grid.crs == "local" else grid.crs
+    where = {"crs": crs, "transform": transform_of(grid)}
+    try:
+        with rasterio.open(
+            path, "w", driver="GTiff", compress="deflate", **where, **side, **size, **profile
+        ) as file:
+            for number, band in enumerate(bands, 1):
+                file.write(band, number)
+            for number, text in enumerate(descriptions, 1):
+                file.set_band_description(number, text)
+            file.update_tags(**(tags or {}))
+            factors = [2**n for n in range(1, 8) if max(grid.rows, grid.cols) // 2**n >= 128]
+            if factors:
+                file.build_overviews(factors, Resampling.nearest)
+    except (RasterioError, CPLE_BaseError, OSError) as error:
+        raise StoreError(f"cannot write {path}: {error.__cause__ or error}") from error

@@ -1,1 +1,0 @@
-"""Tracks, captures and marks of a run for a GIS."""

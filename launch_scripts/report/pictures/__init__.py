@@ -1,1 +1,0 @@
-"""The picture of a run, and what pictures share."""
