@@ -138,13 +138,6 @@ def written(frame: Frame, cell: int) -> str:
     return f"cell:{row},{col} ({text})"
 
 
-def brief(frame: Frame, cell: int) -> str:
-    """A cell for tables: latitude and longitude where the terrain has a place, else row and column."""
-    row, col = frame.grid.row_col(cell)
-    degrees = _degrees(frame, *frame.grid.centre_m(cell))
-    return f"cell:{row},{col}" if degrees is None else _short(frame, degrees, cell)
-
-
 def fields_of(frame: Frame, cell: int) -> dict[str, Any]:
     """A cell for programs: row, col, x_m, y_m and, where the terrain has a place, lat and lon of its middle."""
     row, col = frame.grid.row_col(cell)

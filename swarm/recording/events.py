@@ -3,6 +3,7 @@ process counted, which the service publishes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -137,53 +138,43 @@ class LoopCounters(Counters):
     """The counters of a service, for its loop: the same figures, and which of them the loop writes."""
 
     def __init__(self, counters: Counters) -> None:
-        self.counts = counters.counts
-        self.gauges = counters.gauges
-        self.histograms = counters.histograms
-        self.counts_by = counters.counts_by
-        self.histograms_by = counters.histograms_by
-        self._counts: dict[str, int | None] = {}
-        """Written by the loop, as last recorded; so are those below."""
-        self._gauges: dict[str, float | None] = {}
-        self._buckets: dict[str, dict[int, int]] = {}
+        vars(self).update(vars(counters))  # the same, not copies
+        self._recorded = LoopFigures({}, {}, {})
+        """What the loop has written, as last recorded; of what it never was a value that no figure has."""
 
     def count(self, name: str, by: int = 1) -> None:
-        self._counts.setdefault(name, None)
+        self._recorded.counts.setdefault(name, -1)
         super().count(name, by)
 
     def set_counts(self, counts: Mapping[str, int]) -> None:
         for name in counts:
-            self._counts.setdefault(name, None)
+            self._recorded.counts.setdefault(name, -1)
         super().set_counts(counts)
 
     def gauge(self, name: str, value: float) -> None:
-        self._gauges.setdefault(name, None)
+        self._recorded.gauges.setdefault(name, math.nan)
         super().gauge(name, value)
 
     def observe(self, name: str, value: float) -> None:
-        self._buckets.setdefault(name, {})
+        self._recorded.buckets.setdefault(name, {})
         super().observe(name, value)
 
     def changed(self) -> LoopFigures | None:
         """What the loop has changed since this was called last; None if it has not changed anything."""
-        counts = {name: self.counts[name] for name, told in self._counts.items() if self.counts[name] != told}
-        gauges = {
-            name: self.gauges[name]
-            for name, told in self._gauges.items()
-            if name in self.gauges and self.gauges[name] != told
-        }
-        buckets: dict[str, dict[int, int]] = {}
-        for name, told_buckets in self._buckets.items():
+        last, gauges = self._recorded, self.gauges
+        new = LoopFigures(
+            {name: self.counts[name] for name, was in last.counts.items() if self.counts[name] != was},
+            {name: gauges[name] for name, was in last.gauges.items() if name in gauges and gauges[name] != was},
+            {},
+        )
+        for name, was in last.buckets.items():
             found = self.histograms[name].buckets
-            new = {bucket: count for bucket, count in found.items() if count != told_buckets.get(bucket)}
-            if new:
-                buckets[name] = new
-                told_buckets.update(new)
-        if not counts and not gauges and not buckets:
-            return None
-        self._counts.update(counts)
-        self._gauges.update(gauges)
-        return LoopFigures(counts, gauges, buckets)
+            if changed := {bucket: count for bucket, count in found.items() if count != was.get(bucket)}:
+                new.buckets[name] = changed
+                was.update(changed)
+        last.counts.update(new.counts)
+        last.gauges.update(new.gauges)
+        return new if new.counts or new.gauges or new.buckets else None
 
 
 def set_figures(counters: Counters, figures: LoopFigures | None) -> None:

@@ -51,7 +51,6 @@ class VehicleState(enum.IntEnum):
 
 NO_TARGET = 255
 _Place = Annotated[bytes, Column("<f4", per="ids", least=-1e9, most=1e9)]
-_PLOTS = Meta(max_length=1 << 16)
 
 
 class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):

@@ -98,6 +98,9 @@ def test_targets_come_move_and_go() -> None:
     assert (moved.cell, moved.walk) == (9, "still")
     assert keeper.give(subject="group", name="red", targets=["x"]) is None
     assert keeper.book.targets_of("red", SCENARIO) == ["x"]
+    assert keeper.give(subject="group", name="red") is None
+    assert keeper.book.targets_of("red", SCENARIO) == ["t0", "t1", "real", "x"], "all, though the scenario says t0"
+    assert keeper.give(subject="group", name="red", targets=["x"]) is None
     assert keeper.give(subject="target", name="x", off=True) is None
     assert keeper.book.targets_of("red", SCENARIO) == ["t0"], "removing loses nobody"
     assert keeper.give(subject="group", name="red", off=True) is None
