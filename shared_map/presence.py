@@ -77,7 +77,7 @@ class Presence:
         known = self._newest.get(key)
         if known is not None and fleet.seq <= known.seq:
             return
-        self._leases.heard(key, now_ns)
+        self._leases.renew(key, now_ns)
         self._newest[key] = fleet
         self._forget_index()
 

@@ -105,7 +105,7 @@ class Leases:
         self._lease_ns = lease_ns
         self._heard_ns: dict[str, int] = {}
 
-    def heard(self, key: str, now_ns: int) -> None:
+    def renew(self, key: str, now_ns: int) -> None:
         """Renew the lease of a key."""
         self._heard_ns[key] = now_ns
 

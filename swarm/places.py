@@ -27,7 +27,7 @@ _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _PLACE = re.compile(rf"(?:(cell|xy|latlon):)?\s*({_NUMBER})\s*,\s*({_NUMBER})\s*")
 _WHOLE = re.compile(r"[+-]?\d+")
 _MOST_DECIMALS = 12
-_SAID: dict[Kind, str] = {
+_MEANINGS: dict[Kind, str] = {
     "cell": "a row and a column",
     "xy": "metres of the map",
     "latlon": "a latitude and longitude",
@@ -261,5 +261,5 @@ def _shown(place: Place) -> str:
 
 
 def _two_meanings(kinds: tuple[Kind, ...]) -> str:
-    said = " and ".join(f"{_SAID[kind]} ({kind}:)" for kind in kinds)
-    return f"which may be {said}: write one of these before it"
+    meanings = " and ".join(f"{_MEANINGS[kind]} ({kind}:)" for kind in kinds)
+    return f"which may be {meanings}: write one of these before it"

@@ -9,7 +9,7 @@ from typing import Any
 from typer.exceptions import TyperException
 
 from swarm.config.explain import UNBOUNDED, choice, nearest
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 
 
 def sentence(error: TyperException) -> str:
@@ -47,7 +47,7 @@ def _of_value(error: Any, ctx: Any) -> str:
     name = param.opts[-1] if param.param_type_name == "option" else param.metavar or param.name.upper()
     descriptor = param.type_descriptor
     cause: Sequence[Any] = getattr(error.__cause__, "errors", list)()
-    found = shown(cause[0]["input"]) if cause else "something else"
+    found = quoted(cause[0]["input"]) if cause else "something else"
     if descriptor.choices:
         allowed = [str(getattr(each, "value", each)) for each in descriptor.choices]
         return f"{name}: found {found}{choice(found.strip(chr(39)), allowed)}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 from swarm.errors import ConfigError
 
 KitName = Literal["systemd", "compose"]
@@ -90,9 +90,9 @@ def plan(
 
 def _check_image(image: str, kit: KitName) -> None:
     if image and kit == "systemd":
-        raise ConfigError(f"--image: found {shown(image)} with --kit systemd, expected none: it has no containers")
+        raise ConfigError(f"--image: found {quoted(image)} with --kit systemd, expected none: it has no containers")
     if image and re.fullmatch(_IMAGE, image) is None:
-        raise ConfigError(f"--image: found {shown(image)}, expected NAME:TAG; the monitor's is NAME:TAG-all")
+        raise ConfigError(f"--image: found {quoted(image)}, expected NAME:TAG; the monitor's is NAME:TAG-all")
 
 
 def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:

@@ -13,7 +13,7 @@ import typer
 
 from launch_scripts.check import settings
 from swarm.config.explain import expected
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 from swarm.config.load import BUILT_IN_TERRAINS, read_scenario
 from swarm.config.values import MOST_PER_AGENT
 from swarm.config.write import commented
@@ -113,7 +113,7 @@ def _read(answer: object, kind: type[Any]) -> Any:
     try:
         return kind(answer)
     except ValueError as error:
-        raise ConfigError(f"found {shown(answer)}, expected {expected(kind)}") from error
+        raise ConfigError(f"found {quoted(answer)}, expected {expected(kind)}") from error
 
 
 def _checked(path: Path, choices: Choices) -> None:

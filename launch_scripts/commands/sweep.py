@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from launch_scripts.simulation.study.needs import check_installed
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     if scheduler is not None and workers is not None:
         raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
     if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:
-        raise ConfigError(f"--scheduler: found {shown(scheduler)}, expected an address such as {_EXAMPLE}")
+        raise ConfigError(f"--scheduler: found {quoted(scheduler)}, expected an address such as {_EXAMPLE}")
     from launch_scripts.simulation.study.cluster import cores
     from launch_scripts.simulation.study.run import Sweep
     from launch_scripts.simulation.study.study import study_path

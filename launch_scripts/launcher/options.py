@@ -33,7 +33,7 @@ from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, explain, nearest
 from swarm.config.ground import TerrainConfig
-from swarm.config.input_files import FileKind, check_bytes, shown
+from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
@@ -76,7 +76,7 @@ def scenario_path(name: str) -> Path:
     if path.suffix in (".tif", ".tiff", ".hgt", ".asc", ".npz"):
         raise ConfigError(f"no terrain {name!r}: no such file")
     raise ConfigError(
-        f"no scenario {shown(name)}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
+        f"no scenario {quoted(name)}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
     )
 
 

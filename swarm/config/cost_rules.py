@@ -14,7 +14,7 @@ import msgspec
 
 from swarm.config.explain import nearest
 from swarm.config.ground import CostConfig
-from swarm.config.input_files import FileKind, read_text, shown
+from swarm.config.input_files import FileKind, quoted, read_text
 from swarm.config.values import Slope, SlopeFactor
 from swarm.errors import ConfigError
 
@@ -61,7 +61,7 @@ def cost_of_preset(name: str | None) -> CostConfig:
     if name is None:
         return CostConfig()
     if name not in PRESETS:
-        raise ConfigError(f"no preset {shown(name)}{nearest(name, list(PRESETS))}; there are {', '.join(PRESETS)}")
+        raise ConfigError(f"no preset {quoted(name)}{nearest(name, list(PRESETS))}; there are {', '.join(PRESETS)}")
     return msgspec.convert(with_preset({"cost": {"preset": name}})["cost"], CostConfig)
 
 
@@ -97,7 +97,7 @@ def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float
     names = [name.strip() for name in rows[0]] if rows else []
     if len(names) != 2 or names[0] not in _SLOPES or names[1] not in _VALUES:
         raise ConfigError(
-            f"slope table {path}: the first line is {shown(','.join(names))}, expected two columns,"
+            f"slope table {path}: the first line is {quoted(','.join(names))}, expected two columns,"
             f" {' or '.join(_SLOPES)} and {' or '.join(_VALUES)}"
         )
     points = []
@@ -114,7 +114,7 @@ def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float
             points.append(msgspec.convert((slope, factor), tuple[Slope, SlopeFactor]))
         except (ValueError, ZeroDivisionError, msgspec.ValidationError) as error:
             raise ConfigError(
-                f"slope table {path}: line {number} is {shown(','.join(row))}, expected a slope between -90 and 90"
+                f"slope table {path}: line {number} is {quoted(','.join(row))}, expected a slope between -90 and 90"
                 " degrees and a pace of 0.01 to 100 times the flat one"
             ) from error
     return tuple(points)

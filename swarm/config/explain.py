@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 
 # --- what a setting means and may be ------------------------------------------------------------------------------
 
@@ -280,15 +280,15 @@ def _wrong(name: str, value: Any, hint: Any) -> str:
     if is_section(kind) and isinstance(value, list):
         return f"{name}: found several tables [[{table}]], expected one: [{table}]"
     if is_section(kind):
-        return f"{name}: found {shown(value)}, expected a table: [{table}] with its keys below"
+        return f"{name}: found {quoted(value)}, expected a table: [{table}] with its keys below"
     if typing.get_origin(kind) is tuple and isinstance(value, str | int | float):
         shape = f"{key} = [{_as_toml(value)}]" if typing.get_args(kind)[-1] is Ellipsis else expected(hint)
-        return f"{name}: found {shown(value)}, expected a list: {shape}"
+        return f"{name}: found {quoted(value)}, expected a list: {shape}"
     if typing.get_origin(kind) is Literal:
-        return f"{name}: found {shown(value)}{choice(str(value), list(map(str, typing.get_args(kind))))}"
+        return f"{name}: found {quoted(value)}{choice(str(value), list(map(str, typing.get_args(kind))))}"
     if typing.get_origin(kind) is dict and isinstance(value, dict):
         return f"{name}: found the key {_refused_key(value, typing.get_args(kind)[0])}"
-    found = "" if isinstance(value, dict | list) and value else f" found {shown(value)},"
+    found = "" if isinstance(value, dict | list) and value else f" found {quoted(value)},"
     return f"{name}:{found} expected {expected(hint)}{_finite(value)}{_meant_number(key, value, kind)}"
 
 

@@ -187,7 +187,7 @@ def _toml_fault(reason: str, text: str) -> str:
     return f"line {number}{place[2] or ''}: {meant}, found {line if len(line) <= 60 else f'{line[:57]}...'!r}"
 
 
-def shown(value: object) -> str:
+def quoted(value: object) -> str:
     """A value as a sentence quotes it, however large it is; dates and truth as TOML writes them."""
     if isinstance(value, bool):
         return str(value).lower()

@@ -17,7 +17,7 @@ from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import choice, explain, located, nearest
 from swarm.config.ground import CostConfig, HiddenConfig, ZoneConfig
-from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, read_text, shown
+from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
 from swarm.config.values import MOST_TARGETS, RESERVED_GROUP
@@ -135,20 +135,20 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),
     ):
         for n, zone in enumerate(zones):
-            yield from _said(_check_zone, zone, f"{source}: {key}[{n}]")
+            yield from _complaint(_check_zone, zone, f"{source}: {key}[{n}]")
     for n, target in enumerate(scenario.targets):
         if target.start is not None:
-            yield from _said(read_place, target.start, f"{source}: targets[{n}].start")
+            yield from _complaint(read_place, target.start, f"{source}: targets[{n}].start")
     for n, group in enumerate(scenario.groups):
         for place in group.cells:
-            yield from _said(read_place, place, f"{source}: groups[{n}].cells")
+            yield from _complaint(read_place, place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
-        yield from _said(check_name, plugin, source)
-    yield from _said(check_cost, scenario.cost, source)
+        yield from _complaint(check_name, plugin, source)
+    yield from _complaint(check_cost, scenario.cost, source)
     if scenario.cost.directional:
-        yield from _said(_check_climbs, scenario.planner, "cost.directional = true", source)
+        yield from _complaint(_check_climbs, scenario.planner, "cost.directional = true", source)
     elif aloft := aloft_classes(scenario):
-        yield from _said(_check_climbs, scenario.planner, f"class {aloft[0]}, which flies", source)
+        yield from _complaint(_check_climbs, scenario.planner, f"class {aloft[0]}, which flies", source)
     yield from class_faults(scenario, source)
     yield from _group_faults(scenario, source)
     marked = scenario.monitor.show_target
@@ -157,10 +157,12 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
         yield f"{source}: monitor.show_target is {marked!r}, which is no target{known}"
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
-            yield from _said(check_endpoint, endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
+            yield from _complaint(
+                check_endpoint, endpoint, scenario.network.tls is not None, f"{source}: network.{key}"
+            )
 
 
-def _said(check: Callable[..., object], *of: object) -> Iterator[str]:
+def _complaint(check: Callable[..., object], *of: object) -> Iterator[str]:
     """The sentence with which a check refuses what it is given, if it does."""
     try:
         check(*of)
@@ -301,7 +303,7 @@ def with_settings(raw: Mapping[str, Any], settings: Mapping[str, Any], source: s
     changed: dict[str, Any] = copy.deepcopy(dict(raw))
     for key, value in settings.items():
         if key.count(".") >= MAX_DEPTH:
-            raise ConfigError(f"{source}: {shown(key)}: a key has more than {MAX_DEPTH} parts")
+            raise ConfigError(f"{source}: {quoted(key)}: a key has more than {MAX_DEPTH} parts")
         _set(changed, key.split("."), value, f"{source}: {key}")
     return changed
 
@@ -324,7 +326,7 @@ def _set(at: dict[str, Any] | list[Any], steps: list[str], value: Any, where: st
 def _inner(found: Any, step: str, where: str) -> dict[str, Any] | list[Any]:
     if isinstance(found, dict | list):
         return found
-    raise ConfigError(f"{where}: found {shown(found)} above {step!r}, expected a table")
+    raise ConfigError(f"{where}: found {quoted(found)} above {step!r}, expected a table")
 
 
 def _indices(items: list[Any], step: str, where: str) -> range:
@@ -333,4 +335,4 @@ def _indices(items: list[Any], step: str, where: str) -> range:
     if step.isdecimal() and len(step) < 10 and int(step) < len(items):
         return range(int(step), int(step) + 1)
     last = f"a number from 0 to {len(items) - 1}" if items else "nothing, as it is empty,"
-    raise ConfigError(f"{where}: found {shown(step)} in a list, expected {last} or {EACH!r} for each")
+    raise ConfigError(f"{where}: found {quoted(step)} in a list, expected {last} or {EACH!r} for each")

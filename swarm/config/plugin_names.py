@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, get_args
 
 from swarm.config.explain import nearest
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
 from swarm.config.values import Assigner, Dynamics, Sensor, Strategy, Walk
 from swarm.errors import ConfigError
@@ -137,4 +137,4 @@ def check_name(plugin: NamedPlugin, source: str) -> None:
         return
     allowed = [*kind.built_in, *known]
     choices = ", ".join([*map(repr, allowed), "or a plug-in as 'module:Name'"])
-    raise ConfigError(f"{source}: {plugin.key}: found {shown(name)}{nearest(name, allowed)}; allowed: {choices}")
+    raise ConfigError(f"{source}: {plugin.key}: found {quoted(name)}{nearest(name, allowed)}; allowed: {choices}")

@@ -19,7 +19,7 @@ from typing import Any
 import msgspec
 
 from swarm.config.explain import explain, nearest
-from swarm.config.input_files import shown
+from swarm.config.input_files import quoted
 from swarm.config.plugin_names import NamedPlugin, check_name, installed, plugins_of
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
@@ -66,7 +66,7 @@ def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
     kind, name = named.kind, named.name
     if name in kind.built_in:
         if named.options:
-            raise ConfigError(f"{named.key}: {name!r} takes no options, found {shown(dict(named.options))}")
+            raise ConfigError(f"{named.key}: {name!r} takes no options, found {quoted(dict(named.options))}")
         return Plugin(named, None, None)
     found = _imported(named, folder)
     return Plugin(named, found, _options(named, getattr(found, "Options", None)))
@@ -125,7 +125,7 @@ def _imported(named: NamedPlugin, folder: str) -> Factory:
     if not isinstance(found, type) and callable(getattr(found, kind.method, None)):
         return lambda world, options: found  # it is made already
     if not callable(found):
-        raise ConfigError(f"{named.key}: {name!r} is {shown(found)}; expected a class or a function")
+        raise ConfigError(f"{named.key}: {name!r} is {quoted(found)}; expected a class or a function")
     return found
 
 

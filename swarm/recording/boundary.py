@@ -108,16 +108,16 @@ class BoundaryBus:
         self, what: str, topic: Topic, collect: Callable[[], list[tuple[T, Message]]], kind: Any
     ) -> list[tuple[T, Message]]:
         """Samples that wait, each with its key: collected from the bus and taken down, or made of what was."""
-        heard: list[tuple[T, Message]] | None = None
+        collected: list[tuple[T, Message]] | None = None
 
         def taken_down() -> bytes:
-            nonlocal heard
-            heard = collect()
-            return content_of([(key, content_of(message)) for key, message in heard])
+            nonlocal collected
+            collected = collect()
+            return content_of([(key, content_of(message)) for key, message in collected])
 
         content = self._crossing.read(what, taken_down)
-        if heard is not None:
-            return heard
+        if collected is not None:
+            return collected
         return [(key, decode(each, topic.message)) for key, each in unpack(content, list[tuple[kind, bytes]])]
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:

@@ -82,7 +82,7 @@ class Topic:
     buffer: int = 1024
     fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
-    _said_twice: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    _repeated: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _values: dict[tuple[tuple[str, str | int], ...], tuple[Mapping[str, str], str]] = field(
         init=False, repr=False, compare=False, default_factory=dict
     )
@@ -94,8 +94,8 @@ class Topic:
             if message_type is not None:
                 prime(message_type)  # on one thread, before others decode it
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
-        said_twice = tuple(name for name in self.fields if name in self.message.__struct_fields__)
-        object.__setattr__(self, "_said_twice", said_twice)
+        repeated = tuple(name for name in self.fields if name in self.message.__struct_fields__)
+        object.__setattr__(self, "_repeated", repeated)
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
         """All fields as chunks of a key; those not given become `*`.
@@ -152,10 +152,10 @@ class Topic:
     def check_key(self, fields: Mapping[str, str], message: Message) -> None:
         """Raise ProtocolError on a message with a field that differs from its key. Routers grant access by key, so
         the key decides who a sender is."""
-        for name in self._said_twice:
-            said = str(getattr(message, name))
-            if said != fields[name]:
-                raise ProtocolError(f"{name} is {said[:80]!r} in the message and {fields[name]!r} in its key")
+        for name in self._repeated:
+            stated = str(getattr(message, name))
+            if stated != fields[name]:
+                raise ProtocolError(f"{name} is {stated[:80]!r} in the message and {fields[name]!r} in its key")
 
 
 _CHUNK = re.compile(r"[^/*$?#\s]+|\*")

@@ -16,7 +16,7 @@ from msgspec import Meta
 from launch_scripts.simulation.campaign import MIX, parse_seeds
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.explain import choice, explain
-from swarm.config.input_files import FileKind, parse_toml, read_text, shown
+from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
 from swarm.config.load import flat
 from swarm.config.values import Name, Options, Positive, Section
 from swarm.errors import ConfigError
@@ -80,7 +80,7 @@ def study_path(name: str) -> Path:
     if "/" in name or is_file(Path(name)) or not is_file(built_in):
         if not name.endswith(".toml"):
             names = study_names()
-            raise ConfigError(f"no study {shown(name)}{choice(name, names, ' give a .toml file or one of: ')}")
+            raise ConfigError(f"no study {quoted(name)}{choice(name, names, ' give a .toml file or one of: ')}")
         return Path(name)
     return built_in
 
@@ -149,22 +149,22 @@ def _check(study: Study) -> None:
     count = len(study.seed_range) * len(study.scenarios) * max(1, len(study.variants))
     for key, values in flat(study.parameters):
         if not isinstance(values, list) or not values:
-            raise ConfigError(f"parameters.{key}: found {shown(values)}, expected a list of values")
+            raise ConfigError(f"parameters.{key}: found {quoted(values)}, expected a list of values")
         if (twice := _twice(values)) is not None:
-            raise ConfigError(f"parameters.{key}: found {shown(twice[0])} twice")
+            raise ConfigError(f"parameters.{key}: found {quoted(twice[0])} twice")
         count *= len(values)
     if count > MOST_TRIALS:
         raise ConfigError(f"it has {count:,} trials, expected at most {MOST_TRIALS:,}")
     for what, given in (("scenarios", study.scenarios), ("outcomes", study.outcomes)):
         if (same := _twice(given)) is not None:
-            raise ConfigError(f"{what}: found {shown(same[0])} twice")
+            raise ConfigError(f"{what}: found {quoted(same[0])} twice")
     for what, names in (("scenarios", study.scenarios), ("outcomes", study.outcomes), ("variants", study.variants)):
         longest = _LONGEST_PATH if what == "scenarios" else _LONGEST
         for name in names:
             if not name.isprintable() or not 0 < len(name) <= longest:
-                raise ConfigError(f"{what}: found {shown(name)}, expected 1 to {longest} characters that print")
+                raise ConfigError(f"{what}: found {quoted(name)}, expected 1 to {longest} characters that print")
     if not study.about.replace("\n", "").isprintable():
-        raise ConfigError(f"about: found {shown(study.about)}, expected printable text")
+        raise ConfigError(f"about: found {quoted(study.about)}, expected printable text")
     varied = dict(flat(study.parameters))
     for name, settings in study.variants.items():
         for key, _ in flat(settings):
@@ -208,6 +208,6 @@ def _short_names(keys: Iterable[str]) -> dict[str, str]:
 def _label(variant: str, varied: Mapping[str, Any]) -> str:
     parts = [variant] if variant else []
     for name, value in varied.items():
-        text = value if isinstance(value, str) and value.isprintable() else shown(value)
+        text = value if isinstance(value, str) and value.isprintable() else quoted(value)
         parts.append(f"{name} = {text if len(text) <= 40 else f'{text[:37]}...'}")
     return ", ".join(parts) or "as it is"

@@ -133,8 +133,8 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
         strange = next((id for id in self.ids if not id.startswith(prefix)), None)
         if strange is not None:
             raise ValueError(f"vehicle {strange!r} is none of agent {self.agent}")
-        for name, told in (("ids", self.ids), ("target_ids", self.target_ids)):
-            if len(set(told)) < len(told):
+        for name, listed in (("ids", self.ids), ("target_ids", self.target_ids)):
+            if len(set(listed)) < len(listed):
                 raise ValueError(f"{name} has one twice")
         if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):
             raise ValueError("a target index points past target_ids")

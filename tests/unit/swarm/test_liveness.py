@@ -65,9 +65,9 @@ def test_a_token_that_was_never_up_may_fall():
 
 def test_a_lease_runs_out_once_and_a_word_renews_it():
     leases = Leases(lease_ns=10)
-    leases.heard("a", 0)
-    leases.heard("b", 0)
-    leases.heard("a", 8)
+    leases.renew("a", 0)
+    leases.renew("b", 0)
+    leases.renew("a", 8)
     assert leases.expired(10) == []
     assert leases.expired(11) == ["b"]
     assert leases.expired(30) == ["a"]
