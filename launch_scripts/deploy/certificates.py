@@ -7,14 +7,14 @@ import datetime
 import ipaddress
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from launch_scripts.observe.run_folder import replacing
@@ -30,8 +30,7 @@ _NEW_AUTHORITY = "make an authority and all certificates anew, in another folder
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 
-@dataclass(frozen=True, slots=True)
-class Authority:
+class Authority(NamedTuple):
     """A certificate authority: its certificate, and the key that never leaves its folder."""
 
     certificate: x509.Certificate
@@ -45,27 +44,17 @@ def authority(folder: Path) -> Authority:
     if path.exists():
         return _read_authority(folder)
     key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "swarm authority")])
-    usage = x509.KeyUsage(
-        digital_signature=False,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=True,
-        crl_sign=True,
-        encipher_only=False,
-        decipher_only=False,
-    )
+    name = _name("swarm authority")
+    # Signs certificates and lists of revoked ones, and is for nothing else.
+    usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
     certificate = (
         _begun(name, name, key.public_key(), _in_days(_CA_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())
     )
-    made = Authority(certificate, key)
     _write(folder, CA, certificate, key)
-    return made
+    return Authority(certificate, key)
 
 
 def issue(
@@ -91,19 +80,15 @@ def issue(
     # A certificate is refused once its authority has expired, so it promises no more than that.
     end = min(_in_days(days), signer.certificate.not_valid_after_utc)
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, called or name)])
-    usages = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
-    public_key = signer.key.public_key()
-    certificate = (
-        _begun(subject, signer.certificate.subject, key.public_key(), end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(usages, critical=False)
-        .add_extension(
-            x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]), critical=False
-        )
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(public_key), critical=False)
-        .sign(signer.key, hashes.SHA256())
-    )
+    begun = _begun(_name(called or name), signer.certificate.subject, key.public_key(), end)
+    begun = begun.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    for extension in (
+        x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]),
+        x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]),
+        x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key()),
+    ):
+        begun = begun.add_extension(extension, critical=False)
+    certificate = begun.sign(signer.key, hashes.SHA256())
     _write(folder, name, certificate, key)
     return path
 
@@ -123,15 +108,17 @@ def _begun(
     )
 
 
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
 def _in_days(days: int) -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
 
 
 def _general_name(host: str) -> x509.GeneralName:
-    try:
+    with contextlib.suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(host))
-    except ValueError:
-        pass
     try:
         return x509.DNSName(host)
     except ValueError as error:
@@ -139,11 +126,9 @@ def _general_name(host: str) -> x509.GeneralName:
 
 
 def _read_authority(folder: Path) -> Authority:
-    try:
-        certificate = x509.load_pem_x509_certificate(read_bytes(folder / f"{CA}.pem", FileKind.CERTIFICATE))
-        key = serialization.load_pem_private_key(read_bytes(folder / f"{CA}.key", FileKind.CERTIFICATE), None)
-    except (ValueError, TypeError) as error:
-        raise StoreError(f"the authority in {folder} is no certificate and key in PEM: {error}") from error
+    with _pem(f"the authority in {folder} is no certificate and key"):
+        certificate = _certificate(folder / f"{CA}.pem")
+        key = _key(folder / f"{CA}.key")
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise StoreError(f"{folder / CA}.key is not the key of {folder / CA}.pem")
     _check_today(certificate, folder / f"{CA}.pem", _NEW_AUTHORITY)
@@ -187,22 +172,32 @@ def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
 
 
 def _read(path: Path) -> x509.Certificate:
+    with _pem(f"{path} is no certificate"):
+        return _certificate(path)
+
+
+def _certificate(path: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE))
+
+
+def _key(path: Path) -> PrivateKeyTypes:
+    return serialization.load_pem_private_key(read_bytes(path, FileKind.CERTIFICATE), None)
+
+
+@contextlib.contextmanager
+def _pem(what: str) -> Iterator[None]:
+    """Raises StoreError in place of what cryptography raises of a file that is not in PEM."""
     try:
-        return x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE))
+        yield
     except (ValueError, TypeError) as error:
-        raise StoreError(f"{path} is no certificate in PEM: {error}") from error
+        raise StoreError(f"{what} in PEM: {error}") from error
 
 
 def check_signed(ca: Path, certificate: Path, key: Path) -> None:
     """Raise StoreError where three files in PEM do not go together: another authority's, another's key, or one of
     the certificates not valid today."""
-    try:
-        authority, own = (
-            x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE)) for path in (ca, certificate)
-        )
-        secret = serialization.load_pem_private_key(read_bytes(key, FileKind.CERTIFICATE), None)
-    except (ValueError, TypeError) as error:
-        raise StoreError(f"{ca}, {certificate} and {key} are not certificates and a key in PEM: {error}") from error
+    with _pem(f"{ca}, {certificate} and {key} are not certificates and a key"):
+        authority, own, secret = _certificate(ca), _certificate(certificate), _key(key)
     try:
         own.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
 
+from launch_scripts.observe.run_folder import write_file
 from swarm.config.scenario import NetworkConfig
 from swarm.config.values import CommonName
 from swarm.errors import ConfigError, StoreError
@@ -25,9 +25,7 @@ def revoked_in(folder: Path) -> tuple[str, ...]:
     except FileNotFoundError:
         return ()
     except UnicodeDecodeError as error:
-        raise ConfigError(
-            f"{path}: not UTF-8 text ({error.reason}), but names of certificates, one a line"
-        ) from error
+        raise ConfigError(f"{path}: not UTF-8 text ({error.reason}), expected names, one a line") from error
     except OSError as error:
         raise StoreError(f"cannot read {path}: {error.strerror or error}") from error
     if len(text) > _MOST_BYTES:
@@ -50,13 +48,8 @@ def revoke(folder: Path, names: list[str]) -> Path:
     path = folder / FILE
     checked = [_checked(name, "a name to revoke") for name in names]
     every = dict.fromkeys((*revoked_in(folder), *checked))
-    new = path.with_name(f"{FILE}.new")
     try:
-        with new.open("w", encoding="utf-8") as file:
-            file.write("".join(f"{name}\n" for name in every))
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)
+        write_file(path, "".join(f"{name}\n" for name in every).encode())
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     return path
