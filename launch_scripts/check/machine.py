@@ -1,4 +1,4 @@
-"""This machine and this installation, one finding for each thing that a swarm needs."""
+"""This machine: whether it, with what is installed on it, is fit for a swarm, and large enough for one."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-from launch_scripts.check.findings import Finding, failure, ok, warning
-from launch_scripts.check.needs import available_bytes
+from launch_scripts.check.findings import Finding, Level, failure, warning
 from launch_scripts.observe.run_folder import can_write
+from launch_scripts.process_table import processes_of
+from swarm.config.agents import plan_agents
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import SwarmError
@@ -25,39 +26,159 @@ PACKAGE = "terrain-swarm"
 _EXTRAS = ("all", "roles", "vectors")
 """What the command needs beside what is always there."""
 _ENOUGH_BYTES = 1 << 30
-_ENOUGH_DISK_BYTES = 1 << 30
+"""Of memory, and of disk."""
 _ENOUGH_FILES = 1024
 _COARSE_S = 1e-3
 _UNSYNCHRONISED = 5
 """What `adjtimex` returns of a clock that nobody sets: TIME_ERROR."""
 _TIMEX_BYTES = 256
 
+# docs/scale-figures.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. That agents,
+# vehicles and trees cost in proportion to ticks and numbers is the thumb in the rule.
+_AGENT_CORES_AT_5_HZ = 0.022
+_VEHICLE_CORES_AT_5_HZ = 0.31 / 1000
+_PLANNER_CORES = 0.011
+_OTHERS_CORES = 0.135
+_PROCESS_BYTES = 31 << 20
+_VEHICLE_BYTES = 100 << 10
+_TREE_CELL_BYTES = 24
+_BUSY_SHARE = 3 / 4
+"""Beyond this share of the cores ticks are late: none of them at 1.4 cores of 2, 10 % at 1.9."""
+_FEW_AGENTS = 5
+_CELL_BYTES = 30
+"""Of the terrain, which all processes share, and of its file in the folder of a run."""
+_RECORDING_BYTES_PER_MINUTE = 20 << 20
+_MOST_BYTES = 1 << 60
+
+
+class Machine(NamedTuple):
+    """What there is here; None where that is not known."""
+
+    cores: int
+    free_bytes: int | None
+    disk_bytes: int | None
+
+
+class Needs(NamedTuple):
+    """What a scenario is estimated to take.
+
+    cores       that are busy all the time
+    disk_bytes  in the folder of the run
+    recording_bytes  of these, what is written while the run lasts
+    """
+
+    processes: int
+    agents: int
+    cores: float
+    memory_bytes: int
+    disk_bytes: int
+    recording_bytes: int
+
+
+def this_machine(runs: Path) -> Machine:
+    """What there is here, with the disk of a folder of runs."""
+    try:
+        disk = shutil.disk_usage(_nearest(runs)).free
+    except OSError:
+        disk = None
+    return Machine(len(os.sched_getaffinity(0)), available_bytes(), disk)
+
+
+def available_bytes() -> int | None:
+    """Memory that new processes can have."""
+    import psutil
+
+    try:
+        return int(psutil.virtual_memory().available)
+    except (psutil.Error, OSError, RuntimeError):
+        return None
+
+
+def needs_of(scenario: Scenario, cells: int) -> Needs:
+    """What a scenario takes on a terrain of so many cells."""
+    vehicles, ticks = scenario.vehicle_count, scenario.vehicles.tick_hz / 5
+    agents, processes = len(plan_agents(scenario)), len(processes_of(scenario))
+    trees = len(scenario.target_ids) * (1 + scenario.standbys.planner)
+    moving = ticks * (agents * _AGENT_CORES_AT_5_HZ + vehicles * _VEHICLE_CORES_AT_5_HZ)
+    memory = processes * _PROCESS_BYTES + vehicles * _VEHICLE_BYTES
+    recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
+    return Needs(
+        processes=processes,
+        agents=agents,
+        cores=moving + trees * _PLANNER_CORES + _OTHERS_CORES,
+        memory_bytes=memory + cells * (_CELL_BYTES + trees * _TREE_CELL_BYTES),
+        disk_bytes=cells * _CELL_BYTES + recording,
+        recording_bytes=recording,
+    )
+
+
+def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iterator[Finding]:
+    """Where the machine has less than a run needs."""
+    if needs.cores > _BUSY_SHARE * here.cores:
+        hz = scenario.vehicles.tick_hz
+        fewer = " a larger vehicles.per_agent," if needs.agents > max(_FEW_AGENTS, 2 * here.cores) else ""
+        yield warning(
+            "vehicles",
+            f"{scenario.vehicle_count:,} vehicles of {needs.agents} agents and {len(scenario.target_ids):,} targets"
+            f" at {hz:g} Hz keep about {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be"
+            f" late;{fewer} fewer of them, a lower vehicles.tick_hz, or more machines (docs/scale-figures.md)",
+        )
+    if here.free_bytes is not None and needs.memory_bytes > here.free_bytes:
+        yield warning(
+            "memory",
+            f"about {size(needs.memory_bytes)} are needed and {size(here.free_bytes)} are free: a larger"
+            " terrain.resolution_m, or fewer targets",
+        )
+    if here.disk_bytes is not None and needs.disk_bytes > here.disk_bytes:
+        # One that is meant to be ended by Ctrl-C names a time that never comes.
+        starts = needs.disk_bytes - needs.recording_bytes <= here.disk_bytes
+        yield (warning if starts else failure)(
+            "disk",
+            f"about {size(needs.disk_bytes)} are written to {runs} and {size(here.disk_bytes)} are free: another"
+            " --runs, or a shorter run",
+        )
+    folder = _nearest(runs)
+    if not folder.is_dir():
+        yield failure("runs", f"{folder} is not a folder; choose another --runs")
+    elif not os.access(folder, os.W_OK | os.X_OK):
+        yield failure("runs", f"{folder} cannot be written by this user; choose another --runs")
+
+
+def _nearest(runs: Path) -> Path:
+    """A folder of runs, or what is there of the path to it."""
+    return next(path for path in (runs.absolute(), *runs.absolute().parents) if path.exists())
+
+
+# --- swarm doctor: each check says how it is, and what to do if that is not well
+
+Said = tuple[Level, str]
+
 
 def examine(runs: Path) -> Iterator[Finding]:
     """Everything, one after the other. A thing that cannot be looked at is a warning, never an error."""
     for about, look in CHECKS.items():
         try:
-            yield look(about, runs)
+            level, text = look(runs)
+            yield Finding(level, about, text)
         except (SwarmError, OSError, ValueError, ImportError) as error:
             yield warning(about, f"cannot be looked at: {error}")
 
 
-def _python(about: str, runs: Path) -> Finding:
-    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"] or ""
+def _python(runs: Path) -> Said:
     from packaging.specifiers import SpecifierSet
 
+    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"] or ""
     here = platform.python_version()
     if not SpecifierSet(wanted).contains(here, prereleases=True):
-        return failure(about, f"{here}, expected {wanted}; make an environment with a newer one")
-    return ok(about, f"{here} ({wanted})")
+        return "failure", f"{here}, expected {wanted}; make an environment with a newer one"
+    return "ok", f"{here} ({wanted})"
 
 
-def _packages(about: str, runs: Path) -> Finding:
+def _packages(runs: Path) -> Said:
     from packaging.requirements import Requirement
 
     wrong, fine = [], 0
-    for text in importlib.metadata.requires(PACKAGE) or ():
-        wanted = Requirement(text)
+    for wanted in map(Requirement, importlib.metadata.requires(PACKAGE) or ()):
         asked = wanted.marker is None or any(wanted.marker.evaluate({"extra": extra}) for extra in _EXTRAS)
         if wanted.name == PACKAGE or not asked:
             continue
@@ -69,65 +190,69 @@ def _packages(about: str, runs: Path) -> Finding:
         else:
             fine += 1
     if wrong:
-        return failure(about, f"{'; '.join(wrong)}: pip install 'terrain-swarm[all]'")
-    return ok(about, f"{fine} are as pinned; {PACKAGE} {_version(PACKAGE)}, zenoh {_version('eclipse-zenoh')}")
+        return "failure", f"{'; '.join(wrong)}: pip install 'terrain-swarm[all]'"
+    return "ok", f"{fine} are as pinned; {PACKAGE} {_version(PACKAGE)}, zenoh {_version('eclipse-zenoh')}"
 
 
-def _kernels(about: str, runs: Path) -> Finding:
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _kernels(runs: Path) -> Said:
     from planner_service.kernel_build import all_kernels
     from planner_service.kernels.compile import cache_folder, code_folder, is_on_disk
 
-    folder = code_folder()
+    folder, kernels = code_folder(), list(all_kernels())
     if folder is None:
-        return failure(
-            about, "compiled planners can be kept nowhere, so every start compiles: set NUMBA_CACHE_DIR to a folder"
-        )
-    kernels = list(all_kernels())
+        kept = "compiled planners can be kept nowhere, so every start compiles"
+        return "failure", f"{kept}: set NUMBA_CACHE_DIR to a folder"
     cold = sum(not is_on_disk(kernel) for kernel in kernels)
     if cold and cache_folder() is None:
-        return failure(
-            about,
-            f"{cold} of {len(kernels)} are not in {folder}, which can only be read, so every start compiles them:"
-            " `python -m planner_service.kernel_build` makes them where it can be written to",
+        there = (
+            f"{cold} of {len(kernels)} are not in {folder}, which can only be read, so every start compiles them"
         )
+        return "failure", f"{there}: `python -m planner_service.kernel_build` makes them where it can be written to"
     if cold:
-        return warning(about, f"{cold} of {len(kernels)} are not compiled yet: the first start takes half a minute")
-    return ok(about, f"all {len(kernels)} are compiled, in {folder}")
+        return "warning", f"{cold} of {len(kernels)} are not compiled yet: the first start takes half a minute"
+    return "ok", f"all {len(kernels)} are compiled, in {folder}"
 
 
-def _cores(about: str, runs: Path) -> Finding:
+def _cores(runs: Path) -> Said:
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     if cores < 2:
-        return warning(about, "1: processes take turns, so ticks will be late; two are enough for the demo")
+        return "warning", "1: processes take turns, so ticks will be late; two are enough for the demo"
     if load > cores:
-        return warning(about, f"{cores}, with a load of {load:.1f} from other work: ticks will be late")
-    return ok(about, f"{cores}, load {load:.1f}")
+        return "warning", f"{cores}, with a load of {load:.1f} from other work: ticks will be late"
+    return "ok", f"{cores}, load {load:.1f}"
 
 
-def _memory(about: str, runs: Path) -> Finding:
+def _memory(runs: Path) -> Said:
     free = available_bytes()
     if free is None:
-        return warning(about, "not known on this system; the demo takes about 0.6 GB")
+        return "warning", "not known on this system; the demo takes about 0.6 GB"
     if free < _ENOUGH_BYTES:
-        return warning(about, f"{size(free)} are free; the demo takes about 0.6 GB: end something else first")
-    return ok(about, f"{size(free)} are free")
+        return "warning", f"{size(free)} are free; the demo takes about 0.6 GB: end something else first"
+    return "ok", f"{size(free)} are free"
 
 
-def _files(about: str, runs: Path) -> Finding:
+def _files(runs: Path) -> Said:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < _ENOUGH_FILES:
-        return warning(about, f"{soft} at a time, too few for a router of many: `ulimit -n {min(4096, hard)}`")
-    return ok(about, "any number at a time" if soft == resource.RLIM_INFINITY else f"{soft} at a time")
+        return "warning", f"{soft} at a time, too few for a router of many: `ulimit -n {min(4096, hard)}`"
+    return "ok", "any number at a time" if soft == resource.RLIM_INFINITY else f"{soft} at a time"
 
 
-def _shared_memory(about: str, runs: Path) -> Finding:
+def _shared_memory(runs: Path) -> Said:
     folder = Path("/dev/shm")
     if not folder.is_dir() or not os.access(folder, os.W_OK):
-        return warning(about, "/dev/shm cannot be written; in a container, mount a tmpfs there")
-    return ok(about, f"{size(shutil.disk_usage(folder).free)} are free")
+        return "warning", "/dev/shm cannot be written; in a container, mount a tmpfs there"
+    return "ok", f"{size(shutil.disk_usage(folder).free)} are free"
 
 
-def _zenoh(about: str, runs: Path) -> Finding:
+def _zenoh(runs: Path) -> Said:
     from launch_scripts.ports import free_ports
     from swarm.bus.zenoh_bus import open_bus
 
@@ -139,30 +264,30 @@ def _zenoh(about: str, runs: Path) -> Finding:
         with open_bus(network, mode="router"), open_bus(network):
             took_ms = (time.monotonic() - began_s) * 1e3
     except SwarmError as error:
-        return failure(about, f"no session over loopback: {error}; is there a firewall on 127.0.0.1?")
-    return ok(about, f"two sessions met on 127.0.0.1:{port} within {took_ms:.0f} ms")
+        return "failure", f"no session over loopback: {error}; is there a firewall on 127.0.0.1?"
+    return "ok", f"two sessions met on 127.0.0.1:{port} within {took_ms:.0f} ms"
 
 
-def _ports(about: str, runs: Path) -> Finding:
+def _ports(runs: Path) -> Said:
     from launch_scripts.ports import check_ports
     from swarm.errors import BusError
 
     try:
         check_ports(Scenario(), ("router", "monitor"))
     except BusError as error:
-        return warning(about, str(error))
-    return ok(about, "those of scenarios that name none are free")
+        return "warning", str(error)
+    return "ok", "those of scenarios that name none are free"
 
 
-def _clock(about: str, runs: Path) -> Finding:
+def _clock(runs: Path) -> Said:
     resolution_s = max(time.get_clock_info(name).resolution for name in ("monotonic", "time"))
     if resolution_s > _COARSE_S:
-        return warning(about, f"its resolution is {resolution_s * 1e3:g} ms, ticks need 1 ms")
+        return "warning", f"its resolution is {resolution_s * 1e3:g} ms, ticks need 1 ms"
     state = _clock_state()
     if state == _UNSYNCHRONISED:
-        return warning(about, "not synchronised (no NTP), which several machines need: start chrony or ntpd")
+        return "warning", "not synchronised (no NTP), which several machines need: start chrony or ntpd"
     known = "whether it is synchronised is not known" if state is None else "synchronised"
-    return ok(about, f"resolution {resolution_s * 1e9:.0f} ns, {known}")
+    return "ok", f"resolution {resolution_s * 1e9:.0f} ns, {known}"
 
 
 def _clock_state() -> int | None:
@@ -175,42 +300,32 @@ def _clock_state() -> int | None:
     return state if state >= 0 else None
 
 
-def _view(about: str, runs: Path) -> Finding:
+def _view(runs: Path) -> Said:
     here = shutil.which("rerun")
     native = f"; {here} opens recordings" if here else ""
     try:
         browser = webbrowser.get()
     except webbrowser.Error:
-        return warning(
-            about,
-            "no browser here: open the page that `swarm up` names from another computer, by the ssh line beside"
-            f" it{native}",
-        )
-    return ok(about, f"a browser for the live view: {getattr(browser, 'name', None) or 'yes'}{native}")
+        page = "open the page that `swarm up` names from another computer, by the ssh line beside it"
+        return "warning", f"no browser here: {page}{native}"
+    return "ok", f"a browser for the live view: {getattr(browser, 'name', None) or 'yes'}{native}"
 
 
-def _disk(about: str, runs: Path) -> Finding:
-    folder = next(path for path in (runs.absolute(), *runs.absolute().parents) if path.exists())
+def _disk(runs: Path) -> Said:
+    folder = _nearest(runs)
     if not folder.is_dir():
-        return failure(about, f"{folder} is not a folder; choose another --runs")
+        return "failure", f"{folder} is not a folder; choose another --runs"
     try:
         can_write(folder)
     except OSError as error:
-        return failure(about, f"{folder} cannot be written: {error.strerror or error}; choose another --runs")
+        return "failure", f"{folder} cannot be written: {error.strerror or error}; choose another --runs"
     free = shutil.disk_usage(folder).free
-    if free < _ENOUGH_DISK_BYTES:
-        return warning(about, f"{size(free)} are free in {folder}; a minute of a large swarm writes some 20 MB")
-    return ok(about, f"{size(free)} are free in {folder}")
+    if free < _ENOUGH_BYTES:
+        return "warning", f"{size(free)} are free in {folder}; a minute of a large swarm writes some 20 MB"
+    return "ok", f"{size(free)} are free in {folder}"
 
 
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-CHECKS: dict[str, Callable[[str, Path], Any]] = {
+CHECKS: dict[str, Callable[[Path], Said]] = {
     "python": _python,
     "packages": _packages,
     "planner kernels": _kernels,

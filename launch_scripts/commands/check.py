@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from launch_scripts.check import ground, needs, settings
+from launch_scripts.check import ground, machine, settings
 from launch_scripts.check.findings import STYLES, Finding, as_fields, counted, failure, warning
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import scenario_path, with_port
@@ -75,12 +75,12 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
         return
     yield from ground.places(scenario, terrain, truth)
     yield from ground.plots(scenario, terrain.grid)
-    wanted, here = needs.needs_of(scenario, terrain.grid.cells), needs.this_machine(runs)
-    yield from needs.against(scenario, wanted, here, runs)
+    wanted, here = machine.needs_of(scenario, terrain.grid.cells), machine.this_machine(runs)
+    yield from machine.against(scenario, wanted, here, runs)
     facts |= _facts(scenario, terrain, wanted, here)
 
 
-def _facts(scenario: Scenario, terrain: Terrain, wanted: needs.Needs, here: needs.Machine) -> dict[str, Any]:
+def _facts(scenario: Scenario, terrain: Terrain, wanted: machine.Needs, here: machine.Machine) -> dict[str, Any]:
     return {
         "targets": len(scenario.target_ids),
         "vehicles": scenario.vehicle_count,

@@ -197,9 +197,9 @@ def test_what_doctor_finds_says_what_to_do(
 ) -> None:
     owner, _, name = replaced.rpartition(".")
     monkeypatch.setattr(getattr(machine, owner) if owner else machine, name, value)
-    found = machine.CHECKS[about](about, tmp_path)
-    assert (found.level, found.about) == (level, about)
-    assert words in found.text
+    found, text = machine.CHECKS[about](tmp_path)
+    assert found == level
+    assert words in text
 
 
 def test_a_folder_that_cannot_be_written_is_a_failure_and_the_exit_code(
@@ -215,7 +215,7 @@ def test_a_folder_that_cannot_be_written_is_a_failure_and_the_exit_code(
 
 
 def test_a_check_that_fails_itself_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(about: str, runs: Path) -> object:
+    def broken(runs: Path) -> object:
         raise OSError("no such thing here")
 
     monkeypatch.setattr(machine, "CHECKS", {"clock": broken})

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from launch_scripts import ports
-from launch_scripts.check import needs
+from launch_scripts.check import machine
 from launch_scripts.check.ground import places, plots
 from launch_scripts.cli import main
 from launch_scripts.commands.new import Choices, _asked
@@ -33,7 +33,7 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from vehicle_agent.placement import spawn_cells
 
-ROOMY = needs.Machine(64, None, None)
+ROOMY = machine.Machine(64, None, None)
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def swarm(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
 def test_what_new_writes_is_what_was_chosen_and_check_accepts_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(needs, "this_machine", lambda runs: ROOMY)
+    monkeypatch.setattr(machine, "this_machine", lambda runs: ROOMY)
     line = "new my.toml --terrain synthetic --vehicles 7 --targets 2 --walk evade --preset hiker --seconds 12"
     code, out, err = swarm(line, monkeypatch, capsys)
     assert (code, err) == (0, "")
@@ -113,7 +113,7 @@ def _sections() -> list[type[typing.Any]]:
 def test_files_are_named_from_where_the_scenario_lies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(needs, "this_machine", lambda runs: ROOMY)
+    monkeypatch.setattr(machine, "this_machine", lambda runs: ROOMY)
     (tmp_path / "mine").mkdir()
     np.savez(tmp_path / "hill.npz", elevation=np.ones((24, 24), np.float32), resolution_m=10.0)
     assert swarm("new mine/a.toml --terrain hill.npz --vehicles 3", monkeypatch, capsys)[0] == 0
@@ -205,7 +205,7 @@ def test_a_commented_scenario_is_read_as_what_was_written(
 def test_check_says_all_at_once_in_the_order_of_weight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(needs, "this_machine", lambda runs: needs.Machine(1, 1 << 20, 1 << 10))
+    monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Machine(1, 1 << 20, 1 << 10))
     (tmp_path / "s.toml").write_text(
         '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n'
         "[[targets]]\nname = 'a'\nstart = [99, 1]\n[[targets]]\nname = 'b'\nstart = [1, 99]\n"
@@ -316,19 +316,19 @@ def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
             f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"
             f"[vehicles]\ntick_hz = 5\nper_agent = {min(vehicles // 4, 200)}\n"
         )
-        found = needs.needs_of(scenario, cells_a_side**2)
+        found = machine.needs_of(scenario, cells_a_side**2)
         assert found.cores == pytest.approx(cores, rel=0.15)
         assert found.memory_bytes / 1e6 == pytest.approx(megabytes, rel=0.35)
 
 
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
     scenario = parse_scenario("[[groups]]\nvehicles = 1200\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
-    wanted = needs.needs_of(scenario, 512**2)
-    (found,) = needs.against(scenario, wanted, needs.Machine(2, None, None), Path())
+    wanted = machine.needs_of(scenario, 512**2)
+    (found,) = machine.against(scenario, wanted, machine.Machine(2, None, None), Path())
     assert found.level == "warning"
     assert "1,200 vehicles of 48 agents and 10 targets at 5 Hz keep about 1.7 cores busy, and there" in found.text
     assert "there are 2: ticks will be late; a larger vehicles.per_agent, fewer of them, a lower" in found.text
-    assert list(needs.against(scenario, wanted, needs.Machine(4, None, None), Path())) == []
+    assert list(machine.against(scenario, wanted, machine.Machine(4, None, None), Path())) == []
 
 
 @pytest.mark.parametrize(
