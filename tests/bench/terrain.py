@@ -1,25 +1,20 @@
 """Elevation and photo to cost: time and memory, beside a plain NumPy and rasterio pass over the same files.
 
-    ./launch_scripts/bench terrain --size 4096
-
 Each pass is a process of its own, so that its peak memory is its own; they take turns, and the medians count.
 """
 
 from __future__ import annotations
 
-import json
 import statistics
-import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-from bench.isolated import measure
-from bench.machine import machine
+import typer
 
-if TYPE_CHECKING:
-    from bench.tables import Progress
+from bench.harness import benchmark, track
+from bench.isolated import isolated, status_bytes
 
 RESOLUTION_M = 10.0
 RESOLUTION_DEG = 0.0001
@@ -28,39 +23,36 @@ WIDE_M = 2.5 * RESOLUTION_M
 """Radius of vehicles larger than a cell: lethal cells are inflated by three cells."""
 
 
-def run(
-    size: int = 4096,
-    repeats: int = 3,
-    *,
-    degrees: bool = False,
-    progress: Progress = lambda done, total: None,
+@benchmark()
+def terrain(
+    size: Annotated[int, typer.Option(min=64, help="Cells a side.")] = 4096,
+    repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs of each pass.")] = 3,
+    degrees: Annotated[bool, typer.Option("--degrees", help="Files in degrees, which have to be warped.")] = False,
 ) -> dict[str, Any]:
-    """Measures seconds and peak memory of our passes and of the plain one.
+    """Elevation and photo to cost: seconds and memory, beside a plain pass.
 
-    degrees  the files are in degrees: ours are warped onto metres, the plain pass takes them as they are
+    ./launch_scripts/bench terrain --json
+
+    Files in degrees are warped onto metres by ours; the plain pass takes them as they are.
     """
-    passes: dict[str, list[dict[str, float]]] = {name: [] for name in PASSES}
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in PASSES}
     with tempfile.TemporaryDirectory() as folder:
         _make(Path(folder), size, degrees)
-        for turn in range(repeats):
-            for number, (name, results) in enumerate(passes.items(), 1):
-                results.append(measure("bench.terrain", name, folder))
-                progress(turn * len(passes) + number, repeats * len(passes))
-    report: dict[str, Any] = {"size": size, "degrees": degrees, **machine()}
-    report["passes"] = [
-        {
-            "pass": name,
-            "seconds": round(statistics.median(result["seconds"] for result in results), 2),
-            "cpu_s": round(statistics.median(result["cpu_s"] for result in results), 2),
-            "peak_mb": round(max(result["peak_mb"] for result in results)),
-            "import_s": round(statistics.median(result["import_s"] for result in results), 2),
-        }
-        for name, results in passes.items()
+        for _ in track(range(repeats)):
+            for name, results in track(found.items()):
+                results.append(isolated(one_pass, name, folder))
+    rows: list[dict[str, Any]] = [
+        {"pass": name, **{key: round(statistics.median(each[key] for each in results), 2) for key in results[0]}}
+        for name, results in found.items()
     ]
-    plain, ours = report["passes"][:2]
-    report["ratio"] = round(ours["seconds"] / plain["seconds"], 2)
-    report["cpu_ratio"] = round(ours["cpu_s"] / plain["cpu_s"], 2)
-    return report
+    plain, ours = rows[:2]
+    return {
+        "size": size,
+        "degrees": degrees,
+        "passes": rows,
+        "ratio": round(ours["seconds"] / plain["seconds"], 2),
+        "cpu_ratio": round(ours["cpu_s"] / plain["cpu_s"], 2),
+    }
 
 
 def _make(folder: Path, size: int, degrees: bool) -> None:
@@ -120,33 +112,22 @@ def _swarm(folder: Path, name: str) -> None:
     build_terrain(Scenario(terrain=TerrainConfig(source=str(folder / "dem.tif"), photo=photo), cost=cost))
 
 
-def _only(name: str, folder: Path) -> None:
+def one_pass(name: str, folder: str) -> dict[str, float]:
+    """Time of a pass, without imports and with them, s; and the most memory that this process has taken."""
     started = time.perf_counter()
     import rasterio  # noqa: F401
     import scipy.ndimage  # noqa: F401
 
     import shared_map.importers.sources  # noqa: F401
 
-    imported, cpu = time.perf_counter(), time.process_time()
+    imported, cpu_s = time.perf_counter(), time.process_time()
     if name == "plain":
-        _plain(folder)
+        _plain(Path(folder))
     else:
-        _swarm(folder, name)
-    done = time.perf_counter()
-    # Not ru_maxrss, which starts at what the parent held at the fork.
-    peak_kb = Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]
-    cpu_s = time.process_time() - cpu
-    print(
-        json.dumps(
-            {
-                "seconds": done - imported,
-                "cpu_s": cpu_s,
-                "import_s": imported - started,
-                "peak_mb": int(peak_kb) / 1024,
-            }
-        )
-    )
-
-
-if __name__ == "__main__":
-    _only(sys.argv[1], Path(sys.argv[2]))
+        _swarm(Path(folder), name)
+    return {
+        "seconds": time.perf_counter() - imported,
+        "cpu_s": time.process_time() - cpu_s,
+        "import_s": imported - started,
+        "peak_mb": status_bytes("VmHWM") / 2**20,
+    }

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from bench.planning.any_costs import paces_of_any_ratio
+from bench.planning.kernels import paces_of_any_ratio
 from bench.planning.fields import make_field
 from hypothesis import given, settings
 from hypothesis import strategies as st

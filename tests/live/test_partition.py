@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from bench.wire.partition import rounds, why_not
+from bench.wire.partition import partitions, why_not
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -14,6 +14,6 @@ def test_replicas_on_both_sides_of_a_partition_are_soon_equal_again(tmp_path: Pa
     reason = why_not()
     if reason is not None:
         pytest.skip(reason)
-    (figures,) = rounds(1, 5.0, tmp_path)
+    (figures,) = partitions(1, 5.0, tmp_path)
     assert figures["digests_apart"] >= 2
     assert figures["equal_after_s"] < 5.0

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from bench.wire.remote import Far
-from bench.wire.ros2_gateway import swarm_peer
+from bench.wire.ros2 import swarm_peer
 from support.live_swarm import SWARM, LiveSwarm
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
-from rich.table import Table
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from bench.machine import machine
-from bench.tables import table
+from bench.harness import Seed, benchmark, cpu_ms, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.arrays import Floats
@@ -31,16 +28,32 @@ _EVERY = 2
 """Of the terrain every second cell is taken, as flights are long."""
 
 
-def run(
-    source: str, cells: int, roots: int, starts: int, clearance_routes: int, grade: float | None, seed: int
-) -> dict[str, Any]:
-    """Costs of routes over those of the stack; the clearance along many; a tree beside scipy's and a level one.
+_ROOTS, _STARTS = 2, 150
+"""Trees, and routes of each, that are held against the stack."""
+_REPEATS = 7
 
-    source  a built-in terrain or a file
-    cells   a side of the crop
-    grade   of the surface; by the crop's relief if None
+
+@benchmark(fails=("clearance_broken",))
+def air(
+    dem: Annotated[str, typer.Option(help="A built-in terrain, or an elevation file.")] = "jacksboro",
+    cells: Annotated[int, typer.Option(min=16, max=160, help="A side of the crop.")] = 100,
+    grade: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface; by relief if not given."),
+    ] = None,
+    routes: Annotated[int, typer.Option(min=1, help="Routes whose clearance is looked at.")] = 100_000,
+    seed: Seed = 1,
+) -> dict[str, Any]:
+    """Flights over a surface that follows the terrain, beside the best way through 64 levels.
+
+    \b
+    ./launch_scripts/bench air
+    ./launch_scripts/bench air --dem ridge.tif --grade 0.2
+
+    Costs of routes over those of the stack; the clearance along many; a tree beside scipy's and beside one of level
+    ground. The status is 1 where a flight comes nearer to the ground than its clearance.
     """
-    terrain = build_terrain(Scenario(seed=seed, terrain=TerrainConfig(source=source)))
+    terrain = build_terrain(Scenario(seed=seed, terrain=TerrainConfig(source=dem)))
     heights: Floats = terrain.elevation_m[: _EVERY * cells : _EVERY, : _EVERY * cells : _EVERY].copy()
     heights[np.isnan(heights)] = np.nanmax(heights)
     rows, cols = heights.shape
@@ -51,14 +64,14 @@ def run(
     rng = np.random.default_rng(seed)
     ratios = np.concatenate(
         [
-            _over_stack(grid, heights, flown, flight, int(root), rng.choice(grid.cells, starts))
-            for root in rng.choice(grid.cells, roots)
+            _over_stack(grid, heights, flown, flight, int(root), rng.choice(grid.cells, _STARTS))
+            for root in track(rng.choice(grid.cells, _ROOTS))
         ]
     )
-    routes, lowest_m = _clearance(grid, heights, flown, clearance_routes, rng)
+    seen, lowest_m = _clearance(grid, heights, flown, routes, rng)
     tree, isotropic, error = _times(grid, flown, int(rng.choice(grid.cells)))
     return {
-        "source": source,
+        "source": dem,
         "rows": grid.rows,
         "cols": grid.cols,
         "resolution_m": grid.resolution_m,
@@ -68,31 +81,13 @@ def run(
         "routes": len(ratios),
         "over_stack_mean": round(float(ratios.mean()), 4),
         "over_stack_p95": round(float(np.quantile(ratios, 0.95)), 4),
-        "clearance_routes": routes,
+        "clearance_routes": seen,
         "clearance_m": flight.clearance_m,
         "lowest_m": round(lowest_m, 4),
         "clearance_broken": int(lowest_m < flight.clearance_m),
         "tree_over_isotropic": round(tree / isotropic, 2),
         "worst_over_scipy": float(f"{error:.2e}"),
-        **machine(),
     }
-
-
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """What people are shown."""
-    yield (
-        f"{report['source']}: {report['rows']} x {report['cols']} cells of {report['resolution_m']:g} m, relief"
-        f" {report['relief_m']} m; a surface of grade {report['grade']:g}."
-    )
-    found = table(f"Flights over the best way through {LEVELS} levels", "<what", "figure")
-    found.add_row("routes compared", f"{report['routes']}")
-    found.add_row("cost over the stack's, mean", f"{report['over_stack_mean']:.3f}")
-    found.add_row("p95", f"{report['over_stack_p95']:.3f}")
-    found.add_row("routes whose clearance was looked at", f"{report['clearance_routes']:,}")
-    found.add_row("lowest flight over ground, m", f"{report['lowest_m']:.2f} of {report['clearance_m']:g}")
-    found.add_row("tree over one of level ground, CPU", f"{report['tree_over_isotropic']:.2f}")
-    found.add_row("costs off scipy's at worst", f"{report['worst_over_scipy']:.1e}")
-    yield found
 
 
 def _neighbours(grid: GridSpec, south: int, east: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -186,15 +181,13 @@ def _clearance(
 def _times(grid: GridSpec, flown: AirGround, root: int) -> tuple[float, float, float]:
     """CPU of a tree over the surface and of one over level ground; and how far scipy's costs are off at worst."""
     took: dict[bool, list[float]] = {True: [], False: []}
-    for _ in range(7):
+    for _ in track(range(_REPEATS)):
         for climbs in (True, False):
             costs = CostGrid(grid, PlannerConfig(), flown.climb if climbs else None)
             costs.load(flown.pace_s_per_m)
             tree = CostToGoTree(costs)
             tree.grow(root)
-            began = time.thread_time()
-            tree.grow(root)
-            took[climbs].append(time.thread_time() - began)
+            took[climbs].append(cpu_ms(tree.grow, root))
     tree, costs = _grown(grid, flown, root)
     ours = tree.cost_at(costs.pad_all(np.arange(grid.cells)))
     heights = flown.height_m.astype(np.float64).ravel()

@@ -10,18 +10,17 @@ import dataclasses
 import math
 import random
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
-from bench.machine import memory_free
+from bench.harness import cpu_ms, track
 from bench.planning.fields import Field
 from bench.planning.route_oracle import drive
-from bench.tables import Progress
 from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWorld
 from planner_service.strategy import ROWS, STAGES
 from planner_service.target_tree import TargetTree
@@ -126,21 +125,17 @@ class Tally:
             self.updates[kind] = self.updates.get(kind, 0) + count
 
     def row(self) -> dict[str, Any]:
+        ms = np.array(self.frame_ms)
         gaps = np.concatenate([np.empty(0), *self.gaps])
         proven = np.concatenate([np.empty(0), *self.proven])
         return {
-            "frames": len(self.frame_ms),
-            "frame_ms_mean": round(float(np.mean(self.frame_ms)), 3),
-            "frame_ms_p50": round(float(np.median(self.frame_ms)), 3),
-            "frame_ms_p95": round(float(np.quantile(self.frame_ms, 0.95)), 3),
-            "frame_ms_max": round(float(np.max(self.frame_ms)), 3),
+            "frames": len(ms),
+            "frame_ms_mean": round(float(ms.mean()), 3),
+            **{f"frame_ms_{name}": round(float(np.quantile(ms, share)), 3) for name, share in _SHARES.items()},
             "start_ms": round(self.start_ms, 1),
-            "gap_mean": _figure(gaps, np.mean),
-            "gap_p50": _figure(gaps, _p50),
-            "gap_p95": _figure(gaps, _p95),
-            "gap_max": _figure(gaps, np.max),
-            "proven_p50": _figure(proven, _p50),
-            "proven_p95": _figure(proven, _p95),
+            "gap_mean": _rounded(float(gaps.mean()) if gaps.size else math.inf),
+            **{f"gap_{name}": _quantile(gaps, share) for name, share in _SHARES.items()},
+            **{f"proven_{name}": _quantile(proven, share) for name, share in _SHARES.items()},
             "routes_judged": int(gaps.size),
             "violations": dict(self.broken),
             "batches": self.batches,
@@ -148,9 +143,10 @@ class Tally:
         }
 
 
-def chase(
-    field: Field, entrants: Mapping[Strategy, PlannerConfig], plan: Plan, tell: Progress | None = None
-) -> dict[Strategy, Tally]:
+_SHARES = {"p50": 0.5, "p95": 0.95, "max": 1.0}
+
+
+def chase(field: Field, entrants: Mapping[Strategy, PlannerConfig], plan: Plan) -> dict[Strategy, Tally]:
     """Measure each entrant. Targets that do not fit into half of the free memory at once follow in batches: they do
     not depend on each other, and a frame's time is the sum over them. Raises ConfigError on more targets or
     vehicles than there are cells to stand on."""
@@ -161,11 +157,10 @@ def chase(
     rng = np.random.default_rng(plan.seed)
     roots = field.draw(plan.targets, rng).tolist()
     places = np.array_split(field.draw(plan.vehicles, rng), plan.targets)
-    trees_in_memory = memory_free() // 2 // (TREE_BYTES_PER_CELL * field.grid.cells)
+    trees_in_memory = psutil.virtual_memory().available // 2 // (TREE_BYTES_PER_CELL * field.grid.cells)
     at_once = max(1, trees_in_memory // len(entrants))
     batches = [range(plan.targets)[n : n + at_once] for n in range(0, plan.targets, at_once)]
     tallies = {name: Tally(batches=len(batches)) for name in entrants}
-    each = RUN_IN + plan.frames
     for done, batch in enumerate(batches):
         walkers = [_walker(field, plan, n, roots[n]) for n in batch]
         exact = msgspec.structs.replace(next(iter(entrants.values())), strategy="full")
@@ -174,25 +169,19 @@ def chase(
             _Racer(config, field, len(batch), tallies[name], plan, first=not done)
             for name, config in entrants.items()
         ]
-        _race(crowd, racers, plan, len(batches), partial(_tell, tell, done * each, len(batches) * each))
+        _race(crowd, racers, plan, len(batches))
     return tallies
 
 
-def _tell(tell: Progress | None, before: int, total: int, frame: int) -> None:
-    if tell is not None:
-        tell(before + frame, total)
-
-
-def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int, tell: Callable[[int], None]) -> None:
+def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int) -> None:
     for racer in racers:
         racer.start(crowd.targets)
     for frame in range(RUN_IN):
         crowd.step()
         for racer in racers:
             racer.run_in(frame, crowd.targets)
-        tell(frame + 1)
     running = list(racers)
-    for frame in range(plan.frames):
+    for frame in track(range(plan.frames)):
         crowd.step()
         for racer in running:
             racer.frame(frame, crowd)
@@ -202,10 +191,8 @@ def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int, tel
             for racer in running:
                 racer.judged(n, exact)
         running = [racer for racer in running if not racer.done(frame, plan.seconds / batches)]
-        tell(RUN_IN + frame + 1)
         if not running:
             break
-    tell(RUN_IN + plan.frames)
 
 
 def _walker(field: Field, plan: Plan, n: int, cell: int) -> Walker:
@@ -281,7 +268,7 @@ class _Racer:
             for n, cell in enumerate(targets):
                 self._follow(n, cell, count=False)
 
-        self.tally.start_ms += self._timed(grow) / self._plan.targets
+        self.tally.start_ms += cpu_ms(grow) / self._plan.targets
 
     def run_in(self, frame: int, targets: list[int]) -> None:
         """Strategies that grow the whole tree now and then do so once now, one target after the other, or all would
@@ -296,7 +283,7 @@ class _Racer:
             for n, cell in enumerate(targets):
                 self._follow(n, cell, grow=grows and frame == n % RUN_IN, count=False)
 
-        self.tally.start_ms += self._timed(follow) / self._plan.targets
+        self.tally.start_ms += cpu_ms(follow) / self._plan.targets
 
     def frame(self, frame: int, crowd: _Crowd) -> None:
         def follow_and_read() -> None:
@@ -304,7 +291,7 @@ class _Racer:
                 self._follow(n, cell, followed=crowd.places[n])
                 self._trees[n].routes(crowd.places[n], self._plan.max_cells)
 
-        took_ms = self._timed(follow_and_read)
+        took_ms = cpu_ms(follow_and_read)
         self._spent_ms += took_ms
         if self._frames is None:
             self.tally.frame_ms.append(took_ms)
@@ -322,11 +309,6 @@ class _Racer:
         if self._frames is not None:
             return frame + 1 >= self._frames
         return frame + 1 >= FEWEST and self._spent_ms > 1e3 * seconds
-
-    def _timed(self, work: Callable[[], Any]) -> float:
-        began_ns = time.thread_time_ns()
-        work()
-        return (time.thread_time_ns() - began_ns) / 1e6
 
     def _follow(self, n: int, cell: int, followed: Any = (), grow: bool = False, count: bool = True) -> None:
         """Follows a move of the target. A full growth, asked for or due by `grow`, is adopted at once."""
@@ -351,16 +333,11 @@ class _Racer:
             self.tally.count("job")
 
 
-def _p50(values: NDArray[np.float64]) -> float:
-    return float(np.quantile(values, 0.5, method="inverted_cdf"))
-
-
-def _p95(values: NDArray[np.float64]) -> float:
+def _quantile(values: NDArray[np.float64], share: float) -> float | None:
     # One of the values, not an interpolation: a proven gap may be infinite.
-    return float(np.quantile(values, 0.95, method="inverted_cdf"))
+    return _rounded(float(np.quantile(values, share, method="inverted_cdf")) if values.size else math.inf)
 
 
-def _figure(values: NDArray[np.float64], of: Callable[[NDArray[np.float64]], Any]) -> float | None:
-    """Rounded; None where there is no value or an infinite one."""
-    found = float(of(values)) if values.size else math.inf
-    return round(found, 5) if math.isfinite(found) else None
+def _rounded(value: float) -> float | None:
+    """None where there is no value or an infinite one."""
+    return round(value, 5) if math.isfinite(value) else None

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import resource
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from rich.table import Table
+import typer
 
-from bench.isolated import measure
-from bench.machine import machine
-from bench.planning.tree_process import MODULE
-from bench.tables import Progress, number, table
+from bench.harness import benchmark, track
+from bench.isolated import isolated
 from planner_service.kernels.compile import KERNELS
 
 STAGES = {
@@ -24,51 +22,65 @@ STAGES = {
 }
 
 
-def run_start(
-    size: int = 512, cold_runs: int = 1, runs: int = 7, kernels: bool = True, progress: Progress | None = None
+@benchmark()
+def start(
+    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side of the first tree.")] = 512,
+    runs: Annotated[int, typer.Option(min=1, help="Processes with a warm cache.")] = 7,
+    cold_runs: Annotated[int, typer.Option(min=1, help="Processes that compile all kernels.")] = 1,
+    kernels: Annotated[bool, typer.Option(help="Measure all kernels of a planner too.")] = True,
 ) -> dict[str, Any]:
-    """Medians of seconds from the process's beginning; CPU time is that of all that compile, to their end.
+    """Seconds from the start of a fresh process to its first tree and route, with numba's cache cold and warm.
 
-    Each cold run gets an empty cache folder (NUMBA_CACHE_DIR) of its own; the warm ones use what the last cold one
-    left there. compiled: how many functions that is, of which `kernels` are called from Python.
+    \b
+    ./launch_scripts/bench start --no-kernels
+
+    Medians; CPU time is that of all processes which compile, to their end. Each cold run gets an empty cache folder
+    (NUMBA_CACHE_DIR) of its own; the warm ones use what the last cold one left there. That of this installation is
+    left alone. compiled: how many functions that is, of which `kernels` are called from Python.
     """
     rows: list[dict[str, Any]] = []
-    stages = [name for name in STAGES if kernels or name != "kernels"]
-    total = len(stages) * (cold_runs + runs)
-    done = 0
-    for what in stages:
+    for what in track([name for name in STAGES if kernels or name != "kernels"]):
         took: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
         with tempfile.TemporaryDirectory() as folder:
-            for n in range(cold_runs + runs):
+            for n in track(range(cold_runs + runs)):
                 cache = f"{folder}/{min(n, cold_runs - 1)}"
-                started_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
-                found = measure(
-                    *(MODULE, "start", what, str(size), str(started_ns)), environment={"NUMBA_CACHE_DIR": cache}
-                )
+                began_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+                found = isolated(first_use, what, size, began_ns, environment={"NUMBA_CACHE_DIR": cache})
                 took["cold" if n < cold_runs else "warm"].append(found)
                 compiled = sum(1 for _ in Path(cache).rglob("*.nbc"))
-                done += 1
-                if progress is not None:
-                    progress(done, total)
         for state, starts in took.items():
-            rows.append(
-                {
-                    "until": what,
-                    "cache": state,
-                    "seconds": round(statistics.median(each["seconds"] for each in starts), 2),
-                    "cpu_s": round(statistics.median(each["cpu_s"] for each in starts), 2),
-                    "compiled": compiled,
-                    "runs": len(starts),
-                }
-            )
-    return {"size": size, "kernels": len(KERNELS), "rows": rows, **machine()}
+            row: dict[str, Any] = {"until": STAGES[what], "cache": state}
+            for name in ("seconds", "cpu_s"):
+                row[name] = round(statistics.median(each[name] for each in starts), 2)
+            rows.append({**row, "compiled": compiled, "runs": len(starts)})
+    return {"size": size, "kernels": len(KERNELS), "rows": rows}
 
 
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    shown = table("A fresh process", "<until", "<cache", "seconds", "CPU s", "compiled", "runs")
-    for row in report["rows"]:
-        shown.add_row(
-            *(STAGES[row["until"]], row["cache"], number(row["seconds"]), number(row["cpu_s"])),
-            *(str(row["compiled"]), str(row["runs"])),
-        )
-    yield shown
+def first_use(what: str, size: int, began_ns: int) -> dict[str, float]:
+    """Seconds since the process was begun, on the clock, and of CPU with all that it started to compile.
+
+    what  `tree`: until a tree of size x size is grown, its kernels compiled by this process alone; `route`: until a
+          certified route is given, as a planner gives its first one; `kernels`: until it may call every kernel
+    """
+    import numpy as np
+
+    from planner_service.kernel_build import KernelLoader, needed_kernels
+    from planner_service.target_tree import TargetTree
+    from swarm.config.scenario import PlannerConfig, Scenario
+    from swarm.grid import GridSpec
+
+    grid, target = GridSpec(size, size, 1.0), size * size // 2
+    loader = KernelLoader(needed_kernels(Scenario()), whole=False)
+    if what != "tree":
+        loader.load_first()
+    tree = TargetTree(grid, PlannerConfig(strategy="full"))
+    tree.update(np.ones((size, size), np.float32), target, [], 0)
+    if what != "tree":
+        assert tree.routes([0])[0].lower_bound_s > 0
+    if what == "kernels":
+        loader.wait()
+    now_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+    for builder in loader.builders:
+        builder.wait()
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return {"seconds": (now_ns - began_ns) / 1e9, "cpu_s": sum(each.ru_utime + each.ru_stime for each in used)}

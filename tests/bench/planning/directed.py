@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import statistics
-import time
-from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from bench.machine import machine
+from bench.harness import Seed, benchmark, cpu_ms, numbers_of, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -28,15 +27,25 @@ _PLACES = 3
 """Windows and patches of each kind for each tree."""
 
 
-def run(sizes: tuple[int, ...], repeats: int, seed: int) -> dict[str, Any]:
-    """CPU milliseconds, in pairs: the same roots, windows and patches, in turn; the first pair is not counted."""
-    rows = _rows("jacksboro", TerrainConfig(), repeats, seed)
-    for size in sizes:
-        terrain = TerrainConfig(
+@benchmark()
+def directed(
+    sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
+    repeats: Annotated[int, typer.Option(min=1, help="Roots, the same for both.")] = 7,
+    seed: Seed = 1,
+) -> dict[str, Any]:
+    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is.
+
+    ./launch_scripts/bench directed --json
+
+    CPU milliseconds, in pairs: the same roots, windows and patches, in turn; the first pair is not counted.
+    """
+    sources = {"jacksboro": TerrainConfig()}
+    for size in numbers_of(sizes, "sizes", 16):
+        sources[f"synthetic {size} x {size}"] = TerrainConfig(
             source="synthetic", rows=size, cols=size, resolution_m=30, relief_m=2.0 * size, roads=6
         )
-        rows += _rows(f"synthetic {size} x {size}", terrain, repeats, seed)
-    return {"slope_rule": "energy", "repeats": repeats, "rows": rows, **machine()}
+    rows = [row for name, source in track(sources.items()) for row in _rows(name, source, repeats, seed)]
+    return {"slope_rule": "energy", "repeats": repeats, "rows": rows}
 
 
 class _Side:
@@ -53,10 +62,9 @@ class _Side:
         """Whether the tree was repaired; `took_ms` says what that took."""
         self.pace[window.row0 : window.row1, window.col0 : window.col1] *= np.float32(factor)
         changes = self.costs.apply(self.pace, [window])
-        began = time.thread_time()
-        done = self.tree.repair(changes) >= 0
-        self.took_ms = (time.thread_time() - began) * 1e3
-        return done
+        done = []
+        self.took_ms = cpu_ms(lambda: done.append(self.tree.repair(changes) >= 0))
+        return done[0]
 
 
 def _rows(name: str, source: TerrainConfig, repeats: int, seed: int) -> list[dict[str, Any]]:
@@ -72,7 +80,7 @@ def _rows(name: str, source: TerrainConfig, repeats: int, seed: int) -> list[dic
     took: dict[str, list[tuple[float, float]]] = {}
     for _ in range(repeats + 1):
         root = int(rng.choice(free))
-        _note(took, "full tree", [_timed(side.tree.grow, root) for side in sides])
+        _note(took, "full tree", [cpu_ms(side.tree.grow, root) for side in sides])
         for half in _HALVES:
             _windows(took, sides, half, rng, free)
         for side in sides:
@@ -102,7 +110,7 @@ def _windows(
             side.tree.grow(here)
         for n in range(_MOVES):
             cell = here if n % 2 else there[0]
-            pair = [_timed(side.tree.move, cell, window) for side in sides]
+            pair = [cpu_ms(side.tree.move, cell, window) for side in sides]
             if n and all(side.tree.root == cell for side in sides):
                 _note(took, f"window {2 * half + 1} x {2 * half + 1}", pair)
 
@@ -124,12 +132,6 @@ def _patches(
                 continue
             side_ms = [side.took_ms for side in sides]
             _note(took, f"repair, {what} {becomes}", side_ms)
-
-
-def _timed(work: Callable[..., object], *arguments: object) -> float:
-    began = time.thread_time()
-    work(*arguments)
-    return (time.thread_time() - began) * 1e3
 
 
 def _note(took: dict[str, list[tuple[float, float]]], what: str, pair: list[float]) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
@@ -17,6 +18,9 @@ from swarm.grid import GridSpec
 
 Pace = NDArray[np.float32]
 FIELDS = ("terrain", "uniform", "maze")
+FieldOption = Annotated[
+    str, typer.Option(help="terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces in s/m.")
+]
 
 
 def make_field(name: str, size: int, seed: int = 1) -> Pace:

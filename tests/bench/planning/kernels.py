@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
-from rich.table import Table
 
-from bench.machine import machine
-from bench.planning.any_costs import growths_of_any_ratio
-from bench.planning.fields import Field, make_field
-from bench.tables import Progress, number, table, times
+from bench.harness import Seed, benchmark, cpu_ms, track
+from bench.planning.fields import Field, FieldOption, Pace, make_field
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -24,6 +21,10 @@ from swarm.grid import GridSpec, Window
 
 CHANGES: dict[str, float] = {"x 0.7": 0.7, "x 1.5": 1.5, "x 3": 3.0, "lethal": np.inf}
 """Changes of all paces of a patch."""
+MARKS = {"mark": 2.0, "lethal mark": np.inf}
+"""Changes of a single cell."""
+_PATCHES = 4
+_SHARES = {"p50": 0.5, "p95": 0.95, "max": 1.0}
 BATCHES = (1, 10, 100, 1000)
 STEPS = 500
 """Length of the routes by which the time of one route is measured."""
@@ -44,9 +45,7 @@ class _Bench:
 
     def time(self, name: str, what: Callable[[], Any]) -> float:
         """Records CPU microseconds of this thread under a name."""
-        begin = time.thread_time_ns()
-        what()
-        took_us = (time.thread_time_ns() - begin) / 1e3
+        took_us = 1e3 * cpu_ms(what)
         self.took.setdefault(name, []).append(took_us)
         return took_us
 
@@ -111,22 +110,24 @@ class _Bench:
         return not grown
 
 
-def run(
-    size: int = 512,
-    field: str = "terrain",
-    repeats: int = 15,
-    side: int = 17,
-    seed: int = 1,
-    progress: Progress | None = None,
+@benchmark()
+def kernels(
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
+    field: FieldOption = "terrain",
+    repeats: Annotated[int, typer.Option(min=1, help="Roots; every measurement is taken from each.")] = 15,
+    side: Annotated[int, typer.Option(min=1, max=32, help="Cells a side of a patch that changes.")] = 17,
+    seed: Seed = 1,
 ) -> dict[str, Any]:
-    """Medians over `repeats` roots, each with a growth, windows, routes, and four repairs of each kind, in turn.
+    """The parts of a frame: batches of routes, windows, and repairs beside the growth that they replace.
 
-    growth_ms  a full tree; window_us  a window of 33 x 33 cells, its parents and its certificate
-    walk_us    500 steps of a route, of a hundred that are read at once, without certificates
-    routes     by how many at once: a whole route with its certificate, and its mean number of steps
-    repairs    of a patch, the map's part of it included, and a growth where it gave way: CPU time, and over the
-               median growth; given_way: share of the changes
-    costs      growths where costs differ by any ratio, over growths of the field
+    \b
+    ./launch_scripts/bench kernels
+    ./launch_scripts/bench kernels --size 2048 --field maze --json
+
+    Medians over the roots, each with a growth, windows of 33 x 33 cells with their certificate, routes with theirs,
+    and four repairs of each kind, in turn. walk: 500 steps of a route, of a hundred which are read at once, without
+    certificates. A repair is of a patch, the map's part of it included, and a growth where it gave way. costs:
+    growths where costs differ by any ratio, over growths of the field.
     """
     bench = _Bench(make_field(field, size, seed).copy(), seed)
     bench.grow()
@@ -136,35 +137,27 @@ def run(
         bench.patch(side, factor, "")
     bench.took.clear()
     given_way = dict.fromkeys(CHANGES, 0)
-    patches = 4
-    for turn in range(repeats):
+    for _ in track(range(repeats)):
         bench.grow()
         bench.routes()
         bench.window()
-        for _ in range(patches):
+        for _ in range(_PATCHES):
             for name, factor in CHANGES.items():
                 given_way[name] += not bench.patch(side, factor, name)
             bench.time("growth", lambda: bench.tree.grow(bench.root))
-        for name in ("mark", "lethal mark"):
-            bench.patch(1, 2.0 if name == "mark" else np.inf, name)
-        if progress is not None:
-            progress(turn + 1, repeats)
+        for name, factor in MARKS.items():
+            bench.patch(1, factor, name)
     took = {name: np.array(times_us) for name, times_us in bench.took.items()}
     growth_us = float(np.median(took["growth"]))
     repairs = []
-    for name in (*CHANGES, "mark", "lethal mark"):
-        row: dict[str, Any] = {"change": name, "side": side if name in CHANGES else 1}
-        row |= {"p50_us": round(float(np.median(took[name])), 1), "mean_us": round(float(took[name].mean()), 1)}
-        row |= {
-            "p95_us": round(float(np.quantile(took[name], 0.95)), 1),
-            "max_us": round(float(took[name].max()), 1),
-        }
-        row["worst_over_growth"] = round(float(took[name].max()) / growth_us, 2)
-        row["given_way"] = round(given_way[name] / (patches * repeats), 3) if name in CHANGES else None
+    for name in (*CHANGES, *MARKS):
+        us = took[name]
+        row: dict[str, Any] = {"change": name, "side": side if name in CHANGES else 1, "mean_us": float(us.mean())}
+        row |= {f"{part}_us": float(np.quantile(us, share)) for part, share in _SHARES.items()}
+        row = {key: round(value, 1) if isinstance(value, float) else value for key, value in row.items()}
+        row["max_over_growth"] = round(float(us.max()) / growth_us, 2)
+        row["given_way"] = round(given_way[name] / (_PATCHES * repeats), 3) if name in CHANGES else None
         repairs.append(row)
-    routes = [
-        {"at_once": many, "us_each": round(float(np.median(took[f"route of {many}"])), 2)} for many in BATCHES
-    ]
     return {
         "size": list(bench.pace.shape),
         "field": field,
@@ -173,31 +166,63 @@ def run(
         "window_us": round(float(np.median(took["window"])), 1),
         "walk_us": round(float(np.median(took["walk"])), 2),
         "steps": STEPS,
-        "routes": routes,
+        "routes": [
+            {"at_once": many, "us_each": round(float(np.median(took[f"route of {many}"])), 2)} for many in BATCHES
+        ],
         "repairs": repairs,
-        "costs": growths_of_any_ratio(bench.pace, max(repeats // 3, 1), seed),
-        **machine(),
+        "costs": _growths_of_any_ratio(bench.pace, max(repeats // 3, 1), seed),
     }
 
 
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    rows, cols = report["size"]
-    window, walk = number(report["window_us"]), number(report["walk_us"])
-    yield f"{report['field']} {rows} x {cols}: a full tree takes {number(report['growth_ms'])} ms,"
-    yield f"a window of 33 x 33 cells {window} us, {report['steps']} steps of a route {walk} us."
-    found = table("Routes, certified", "at once", "us each")
-    for row in report["routes"]:
-        found.add_row(str(row["at_once"]), number(row["us_each"]))
-    yield found
-    found = table(
-        "Repair of a patch, us", "<paces", "side", "p50", "mean", "p95", "max", "max / growth", "gave way"
-    )
-    for row in report["repairs"]:
-        share = "" if row["given_way"] is None else f"{100 * row['given_way']:.0f} %"
-        figures = (number(row[f"{name}_us"]) for name in ("p50", "mean", "p95", "max"))
-        found.add_row(row["change"], str(row["side"]), *figures, times(row["worst_over_growth"]), share)
-    yield found
-    found = table("A full tree where costs differ by any ratio", "<paces", "ms", "/ the field's")
-    for row in report["costs"]:
-        found.add_row(row["costs"], number(row["growth_ms"]), times(row["over_usual"]))
-    yield found
+def paces_of_any_ratio(pace: Pace, rng: np.random.Generator) -> Iterator[tuple[str, Pace]]:
+    """What is met on real maps, and what is made against a queue of buckets. Lethal cells stay so."""
+    rows, cols = pace.shape
+    usual = np.float32(np.median(pace[np.isfinite(pace)]))
+    middle = int(np.flatnonzero(np.isfinite(pace))[np.isfinite(pace).sum() // 3])
+    for name, value in (("one dear cell, x 1e5", 1e5), ("one cheap cell, x 1e-5", 1e-5)):
+        marked = pace.copy()
+        marked.flat[middle] = usual * np.float32(value)
+        yield name, marked
+    marked = pace.copy()
+    marked[rows // 2] = usual * np.float32(1e-3)
+    yield "a road, x 1e-3", marked
+    yield "one cell in 35, x 30,000", pace * np.where(rng.random(pace.shape) < 1 / 35, 30_000, 1).astype(np.float32)
+    for value in (1e-3, 1e-5):
+        yield (
+            f"the left half, x {value:g}",
+            pace * np.where(np.arange(cols) < cols // 2, value, 1).astype(np.float32),
+        )
+        yield (
+            f"every other cell, x {value:g}",
+            pace * np.where(rng.random(pace.shape) < 0.5, value, 1).astype(np.float32),
+        )
+    for ratio in (1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7):
+        random = (ratio ** rng.random(pace.shape)).astype(np.float32)
+        yield f"log-uniform, 1 to {ratio:g}", np.where(np.isfinite(pace), random, pace)
+
+
+def _growths_of_any_ratio(pace: Pace, repeats: int, seed: int) -> list[dict[str, Any]]:
+    """A row per kind of costs: medians over `repeats` roots, in turn with growths of `pace` itself.
+
+    growth_ms     CPU time of a whole tree
+    over_usual    the same over that of `pace`
+    """
+    rng = np.random.default_rng(seed + 2)
+    roots = rng.choice(np.flatnonzero(np.isfinite(pace)), repeats).tolist()
+    usual = _tree(pace)
+    rows = []
+    for name, paces in paces_of_any_ratio(pace, rng):
+        took: tuple[list[float], list[float]] = [], []
+        other = _tree(paces)
+        for root in (roots[0], *roots):
+            for tree, times_ms in zip((usual, other), took, strict=True):
+                times_ms.append(cpu_ms(tree.grow, root))
+        usual_ms, other_ms = (float(np.median(times_ms[1:])) for times_ms in took)
+        rows.append({"costs": name, "growth_ms": round(other_ms, 3), "over_usual": round(other_ms / usual_ms, 2)})
+    return rows
+
+
+def _tree(pace: Pace) -> CostToGoTree:
+    cost_grid = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig())
+    cost_grid.load(pace)
+    return CostToGoTree(cost_grid)

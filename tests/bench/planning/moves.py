@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from typing import Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
-from rich.table import Table
 
-from bench.machine import machine
-from bench.planning.fields import Field, make_field
-from bench.tables import Progress, number, table, times
+from bench.harness import Seed, benchmark, cpu_ms, track
+from bench.planning.fields import Field, FieldOption, make_field
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.pieces import PieceTree
@@ -68,9 +67,7 @@ class _Walk:
             self.pieces.take(self.cell, self.grown.parent.copy())
         self._note("pieces", began)
         self.gave_way["pieces"] += not followed
-        began = time.thread_time_ns()
-        self.grown.grow(self.cell)
-        self._note("growth", began)
+        self.took_ms["growth"].append(cpu_ms(self.grown.grow, self.cell))
         same = np.array_equal(self.mended.parent, self.grown.parent)
         self.bit_equal += same and np.array_equal(self.mended.cost, self.grown.cost)
         self.lowered.append(max(visited / self.costs.size - 1.0, 0.0))
@@ -91,29 +88,43 @@ class _Walk:
         self.took_ms[what].append((time.thread_time_ns() - began_ns) / 1e6)
 
 
-def run(size: int, field: str, moves: int, seed: int, progress: Progress | None = None) -> dict[str, Any]:
-    """CPU milliseconds a move, in turn in one process, of two walks from one root each.
+@benchmark()
+def moves(
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
+    field: FieldOption = "terrain",
+    dem: Annotated[Path | None, typer.Option(help="An elevation file, in place of --field.")] = None,
+    moves: Annotated[int, typer.Option(min=1, help="Moves of each walk, one cell each.")] = 100,
+    seed: Seed = 1,
+) -> dict[str, Any]:
+    """Exact trees that follow a target, beside trees that are grown anew.
 
-    lowered    share of the map whose costs fell once they had been computed along the parents, mean
-    gave_way   share of the moves at which the tree was grown; that is in the times
-    bit_equal  share of the moves after which costs and parents were those of the growth
+    \b
+    ./launch_scripts/bench moves
+    ./launch_scripts/bench moves --size 2048 --moves 30
+    ./launch_scripts/bench moves --dem ridge.tif --json
+
+    The same roots in turn in one process, on a random walk and straight on: a tree that is made exact by its
+    parents, one that lies in pieces, and a growth. CPU ms a move, and how many times as long a growth takes. gave
+    way: share of the moves at which the tree was grown, which is in the times; bit equal: after which it was the
+    growth's; lowered: mean share of the map whose costs fell once they had been computed along the parents.
     """
-    stage = Field(make_field(field, size, seed))
+    stage = Field(make_field(field if dem is None else str(dem), size, seed))
     rows: list[dict[str, Any]] = []
-    for n, course in enumerate(COURSES):
+    many = RUN_IN + moves
+    for course in track(COURSES):
         walk = _Walk(stage, course, np.random.default_rng(seed + 1))
-        for done in range(RUN_IN + moves):
+        for _ in track(range(many)):
             walk.move()
-            if progress is not None:
-                progress(n * (RUN_IN + moves) + done + 1, len(COURSES) * (RUN_IN + moves))
         took = {what: np.array(times_ms[RUN_IN:]) for what, times_ms in walk.took_ms.items()}
         for by in ("parents", "pieces"):
-            rows.append(_row(course, by, took[by], took["growth"], walk.gave_way[by] / (RUN_IN + moves)))
-        rows[-2] |= {
-            "lowered": round(float(np.mean(walk.lowered[RUN_IN:])), 4),
-            "bit_equal": walk.bit_equal / (RUN_IN + moves),
-        }
-    return {"field": field, "size": list(stage.pace.shape), "moves": moves, "rows": rows, **machine()}
+            rows.append(_row(course, by, took[by], took["growth"], walk.gave_way[by] / many))
+        rows[-2] |= {"lowered": round(float(np.mean(walk.lowered[RUN_IN:])), 4), "bit_equal": walk.bit_equal / many}
+    return {
+        "field": field if dem is None else dem.name,
+        "size": list(stage.pace.shape),
+        "moves": moves,
+        "rows": rows,
+    }
 
 
 def _row(
@@ -132,21 +143,3 @@ def _row(
         "lowered": None,
         "bit_equal": None,
     }
-
-
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    rows, cols = report["size"]
-    growth = number(report["rows"][0]["growth_p50_ms"])
-    yield f"{report['field']}, {rows} x {cols} cells, {report['moves']} moves; a growth takes {growth} ms."
-    found = table(
-        "Exact moves, CPU ms, and how many times as long a growth takes",
-        *("<course", "<by", "p50", "mean", "p95", "growth /\nmove p50", "\nmean", "gave\nway", "bit-\nequal"),
-    )
-    for row in report["rows"]:
-        found.add_row(
-            *(row["course"], row["by"]),
-            *(number(row[key]) for key in ("p50_ms", "mean_ms", "p95_ms")),
-            *(times(row["ratio_p50"]), times(row["ratio_mean"]), f"{100 * row['gave_way']:.0f} %"),
-            "" if row["bit_equal"] is None else f"{100 * row['bit_equal']:.0f} %",
-        )
-    yield found

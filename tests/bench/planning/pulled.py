@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
-from rich.table import Table
 
-from bench.machine import machine
+from bench.harness import Seed, benchmark, cpu_ms
 from bench.planning.fields import Pace, make_field
-from bench.tables import Progress, table
 from planner_service.route_finder import PulledRoute, RouteFinder
+from swarm.errors import TerrainError
 from swarm.wire.routes import RouteStatus
 
 _ROUTES = 400
@@ -27,8 +26,26 @@ _EQUAL = 1e-9
 """Relative; what the two prices of a route may differ by."""
 
 
-def run(field: str, size: int, routes: int, seconds: float, seed: int, progress: Progress) -> dict[str, Any]:
-    """Routes from random cells to random roots; ended after so many seconds, however many were pulled."""
+@benchmark(fails=("dearer", "priced_again_wrong"))
+def pulled(
+    routes: Annotated[int, typer.Option(min=1, help="Routes to pull.")] = 20_000,
+    field: Annotated[
+        str, typer.Option(help="open, terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces.")
+    ] = "terrain",
+    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side; of a file, its middle.")] = 256,
+    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were pulled.")] = 100,
+    seed: Seed = 1,
+) -> dict[str, Any]:
+    """Routes of straight segments beside those over neighbours: saving, time, and that none is dearer.
+
+    \b
+    ./launch_scripts/bench pulled --field open
+    ./launch_scripts/bench pulled --field ridge.tif --routes 100000
+
+    Routes lead from random cells to random roots. Both kinds are priced by the integral of the pace. One route in
+    twenty is priced again, apart from the kernel. The status is 1 where one was dearer, wrong or through what is
+    lethal. Pulling some 150 steps is timed beside growing the tree.
+    """
     pace = _field(field, size, seed)
     random = np.random.default_rng(seed)
     passable = np.argwhere(np.isfinite(pace))
@@ -39,27 +56,26 @@ def run(field: str, size: int, routes: int, seconds: float, seed: int, progress:
     finder = RouteFinder(pace, tuple(passable[0].tolist()))
     while len(savings) < routes and time.monotonic() - began < seconds:
         finder.move(tuple(random.choice(passable).tolist()))
-        growth_s = _growth_s(finder, tuple(random.choice(passable).tolist()))
+        growth_ms = cpu_ms(finder.move, tuple(random.choice(passable).tolist()))
         for start in random.choice(passable, _ROUTES):
             route = finder.route(*start)
             if route.status is not RouteStatus.OK or len(route.cells) < 2:
                 continue
-            before = time.thread_time()
-            pulled = finder.pull(route)
-            took_s = time.thread_time() - before
+            began_ns = time.thread_time_ns()
+            straight = finder.pull(route)
+            took_ms = (time.thread_time_ns() - began_ns) / 1e6
             steps = len(route.cells) - 1
             if _STEPS[0] <= steps <= _STEPS[1]:
-                shares.append(took_s / growth_s)
-            savings.append(1 - pulled.cost_s / pulled.grid_cost_s)
-            dearer += pulled.cost_s > pulled.grid_cost_s
+                shares.append(took_ms / growth_ms)
+            savings.append(1 - straight.cost_s / straight.grid_cost_s)
+            dearer += straight.cost_s > straight.grid_cost_s
             if len(savings) % _CHECKED == 0:
                 checked += 1
-                broken += not _holds(pace, pulled)
+                broken += not _holds(pace, straight)
             if len(savings) == routes:
                 break
-        progress(len(savings), routes)
     if not savings:
-        raise ValueError(f"no cell of {field!r} has a route")
+        raise TerrainError(f"no cell of {field!r} has a route")
     return {
         "field": field,
         "rows": pace.shape[0],
@@ -72,24 +88,7 @@ def run(field: str, size: int, routes: int, seconds: float, seed: int, progress:
         "saving_p95": float(np.quantile(savings, 0.95)),
         "timed": len(shares),
         "pull_over_growth": statistics.median(shares) if shares else None,
-        **machine(),
     }
-
-
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    shown = table("Pulled routes", "<map", "routes", "saving", "p95", "dearer", "checked", "wrong", "pulling")
-    share = report["pull_over_growth"]
-    shown.add_row(
-        f"{report['field']} {report['rows']} x {report['cols']}",
-        f"{report['routes']:,}",
-        f"{100 * report['saving_mean']:.2f} %",
-        f"{100 * report['saving_p95']:.2f} %",
-        str(report["dearer"]),
-        f"{report['priced_again']:,}",
-        str(report["priced_again_wrong"]),
-        "-" if share is None else f"{share:.3f}",
-    )
-    yield shown
 
 
 def segment_cost_s(pace: Pace, start: NDArray[np.int64], end: NDArray[np.int64]) -> float:
@@ -114,12 +113,6 @@ def segment_cost_s(pace: Pace, start: NDArray[np.int64], end: NDArray[np.int64])
 def _holds(pace: Pace, pulled: PulledRoute) -> bool:
     again = sum(segment_cost_s(pace, a, b) for a, b in zip(pulled.turns, pulled.turns[1:], strict=False))
     return abs(again - pulled.cost_s) <= _EQUAL * pulled.cost_s
-
-
-def _growth_s(finder: RouteFinder, target: tuple[int, int]) -> float:
-    before = time.thread_time()
-    finder.move(target)
-    return time.thread_time() - before
 
 
 def _field(name: str, size: int, seed: int) -> Pace:

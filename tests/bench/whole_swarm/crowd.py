@@ -9,15 +9,17 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any
 
-from rich.table import Table
+import typer
 
+from bench.harness import benchmark, names_of, track
 from bench.isolated import TimeLimit
-from bench.machine import machine
-from bench.tables import Progress, table
-from launch_scripts.simulation.campaign import in_processes
+from launch_scripts.simulation import worlds as crowded
+from launch_scripts.simulation.campaign import in_processes, parse_seeds
+from launch_scripts.simulation.worlds import CROWDS
+from swarm.errors import ConfigError
 from swarm.runtime.garbage import collected_rarely
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet, VehicleState
@@ -27,6 +29,20 @@ STEP_S = 0.1
 LONG_S = 10.0
 WANTED_LONGEST_S, WANTED_LONG_SHARE = 15.0, 0.005
 """Goals of the project."""
+COLUMNS = (
+    "world",
+    "cells_per_step",
+    "longest_wait_s",
+    "longest_wait_seed",
+    "waited_long_share",
+    "confined_long_share",
+    "arrivals_per_vehicle_and_100_s",
+)
+_NOTES = (
+    "Cells a step: while the target is not within reach; 1 is a straight drive at full speed.",
+    f"A wait: on one cell, target not within reach; long is over {LONG_S:g} s. Confined: within 5 x 5 cells.",
+    f"Wanted: no wait over {WANTED_LONGEST_S:g} s, at most {100 * WANTED_LONG_SHARE:g} % of vehicles ever so long.",
+)
 LIMIT_S = 120.0
 """Seconds of CPU for a drive; what is not done by then is left out."""
 _BOX_CELLS = 2
@@ -73,15 +89,14 @@ class Drives:
         self.longest_confined[id] = max(self.longest_confined.get(id, 0), inside + 1)
 
 
-def try_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tuple[str, int]) -> dict[str, Any]:
-    """Drive one crowd: a world and a seed."""
+def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tuple[str, int]) -> dict[str, Any]:
+    """Drives one crowd: a world and a seed."""
     from launch_scripts.simulation.simulate import Simulation
-    from launch_scripts.simulation.worlds import crowd
     from swarm.bus.bus import Event, Heard
     from swarm.wire.topics import FLEET
 
     kind, seed = which
-    scenario, terrain = crowd(kind, seed, vehicles, -(-vehicles // agents), side)
+    scenario, terrain = crowded.crowd(kind, seed, vehicles, -(-vehicles // agents), side)
     began_s = time.perf_counter()
     simulation, limit = Simulation(scenario, terrain=terrain), TimeLimit(LIMIT_S)
     drives = Drives(terrain.grid.cols)
@@ -116,37 +131,58 @@ def try_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tupl
     }
 
 
-def run(
-    worlds: Sequence[str],
-    seeds: Sequence[int],
-    *,
-    vehicles: int,
-    agents: int,
-    side: int,
-    seconds: float,
-    jobs: int,
-    progress: Progress,
+@benchmark(fails=("collisions", "lethal_entries"), columns=COLUMNS)
+def crowd(
+    worlds: Annotated[str, typer.Option(help="open, doors, corridor, maze; several with commas.")] = (
+        "open,doors,corridor,maze"
+    ),
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="The seeds A to B - 1, each in every world.")] = "0:5",
+    vehicles: Annotated[int, typer.Option(min=2, max=1000, help="Vehicles.")] = 200,
+    agents: Annotated[int, typer.Option(min=1, max=100, help="Agents that host them.")] = 8,
+    size: Annotated[int, typer.Option(min=16, max=256, help="Cells a side.")] = 40,
+    seconds: Annotated[float, typer.Option(min=1, max=3600, help="Simulated seconds of each drive.")] = 40.0,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="Drives at the same time.")] = 2,
 ) -> dict[str, Any]:
-    """Every seed of every world; a row for each world, and one for all. The single drives are in `drives`."""
-    items = [(kind, seed) for seed in seeds for kind in worlds]
-    drives = []
-    for drive in in_processes(functools.partial(try_crowd, vehicles, agents, side, seconds), items, jobs):
-        drives.append(drive)
-        progress(len(drives), len(items))
-    drives.sort(key=lambda each: (worlds.index(each["world"]), each["seed"]))
-    rows = [row_of(kind, [each for each in drives if each["world"] == kind]) for kind in worlds]
-    if len(worlds) > 1:
+    """How crowds drive: cells a step, longest waits, arrivals, in dense worlds over many seeds. Some seven minutes.
+
+    \b
+    ./launch_scripts/bench crowd
+    ./launch_scripts/bench crowd --worlds doors --seeds 0:20 --jobs 4 --json
+
+    Simulated, without faults. 200 vehicles on 40 x 40 cells are an eighth of all cells: a hall, rooms with doors of
+    one cell, halls joined by corridors of one cell, pillars. A drive gets 120 seconds of CPU at most. Exit code
+    1 if vehicles met or entered lethal cells.
+    """
+    chosen = names_of(worlds, "worlds", CROWDS)
+    some = parse_seeds(seeds)
+    if agents > vehicles:
+        raise ConfigError(f"--agents is {agents}, expected at most as many as --vehicles, {vehicles}")
+    if 4 * vehicles > size * size:
+        raise ConfigError(f"--vehicles is {vehicles}, expected at most a quarter of {size} x {size} cells")
+    items = [(kind, seed) for seed in some for kind in chosen]
+    work = functools.partial(drive_crowd, vehicles, agents, size, seconds)
+    results = in_processes(work, items, jobs)
+    drives = [next(results) for _ in track(items)]
+    drives.sort(key=lambda each: (chosen.index(each["world"]), each["seed"]))
+    rows = [row_of(kind, [each for each in drives if each["world"] == kind]) for kind in chosen]
+    if len(chosen) > 1:
         rows.append(row_of("all", drives))
+    notes = list(_NOTES)
+    if cut := sum(each["cut_short"] for each in drives):
+        notes.append(f"Not measured to their end: {cut} drives, for each of which {LIMIT_S:g} s of CPU were up.")
     return {
+        "heading": "Crowds",
         "vehicles": vehicles,
         "agents": agents,
-        "side": side,
+        "side": size,
         "seconds": seconds,
-        "seeds": [seeds[0], seeds[-1] + 1],
-        "wanted": {"longest_wait_s": WANTED_LONGEST_S, "waited_long_share": WANTED_LONG_SHARE},
+        "seeds": seeds,
+        "collisions": sum(each["collisions"] or 0 for each in drives),
+        "lethal_entries": sum(each["lethal_entries"] or 0 for each in drives),
         "rows": rows,
         "drives": drives,
-        **machine(),
+        "shown": {"rows": rows},
+        "notes": notes,
     }
 
 
@@ -168,52 +204,3 @@ def row_of(name: str, drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "collisions": sum(each["collisions"] or 0 for each in drives),
         "lethal_entries": sum(each["lethal_entries"] or 0 for each in drives),
     }
-
-
-_MEANING = (
-    "Cells a step: while the target is not within reach; 1 is a straight drive at full speed. A wait: on one cell, "
-    "target not within reach. Confined: within 5 x 5 cells. Arrivals: a vehicle and 100 s."
-)
-COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
-    ("world", lambda row: str(row["world"])),
-    ("cells\na step", lambda row: f"{row['cells_per_step']:.2f}"),
-    ("longest\nwait, s", lambda row: f"{row['longest_wait_s']:.1f}"),
-    ("in\nseed", lambda row: str(row["longest_wait_seed"])),
-    ("waited\n> 10 s, %", lambda row: f"{100 * row['waited_long_share']:.2f}"),
-    ("confined\n> 10 s, %", lambda row: f"{100 * row['confined_long_share']:.2f}"),
-    ("arri-\nvals", lambda row: f"{row['arrivals_per_vehicle_and_100_s']:.2f}"),
-    ("colli-\nsions", lambda row: str(row["collisions"])),
-    ("lethal\nentries", lambda row: str(row["lethal_entries"])),
-)
-"""Heading and value of each column."""
-
-
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    headings = (f"<{heading}" if heading in ("world", "in\nseed") else heading for heading, _ in COLUMNS)
-    found = table("How crowds drive", *headings)
-    for row in report["rows"]:
-        found.add_row(*(write(row) for _, write in COLUMNS))
-    yield found
-    yield from remarks(report)
-
-
-def remarks(report: dict[str, Any]) -> list[str]:
-    """What has to be known to read the figures."""
-    first, end = report["seeds"]
-    which = (
-        f"{report['vehicles']} vehicles of {report['agents']} agents on {report['side']} x {report['side']} cells, "
-        f"seeds {first} to {end - 1}, {report['seconds']:g} simulated seconds each, no faults."
-    )
-    wanted = (
-        f"Wanted: no wait over {WANTED_LONGEST_S:g} s, at most {100 * WANTED_LONG_SHARE:g} % of vehicles ever over "
-        f"{LONG_S:g} s."
-    )
-    found = [which, _MEANING, wanted]
-    if cut := sum(each["cut_short"] for each in report["drives"]):
-        found.append(f"Not measured to their end: {cut} drives, for each of which {LIMIT_S:g} s of CPU were up.")
-    return found
-
-
-def broken(report: dict[str, Any]) -> bool:
-    """Whether vehicles met or drove where nobody can."""
-    return any(each["collisions"] or each["lethal_entries"] for each in report["drives"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from support.process_usage import cpu_s, in_session, machine_cpu_s, pss_bytes
 from support.up_process import UpProcess
 
+from bench.harness import tell
 from bench.whole_swarm.route_client import raw_answerer, route_client
 from bench.whole_swarm.size import Size, scenario_text
 from bench.whole_swarm.stats_window import StatsSpan, StatsWindow, histogram, ticks
@@ -46,11 +47,9 @@ _UP = "all processes are alive"
 _COUNTED = ("messages_out", "messages_in", "bytes_out", "bytes_in")
 """What every bus counts."""
 
-Tell = Callable[[str], None]
 
-
-def measure_live(size: Size, seconds: float, tell: Tell) -> dict[str, Any]:
-    """Start a swarm, measure it for some seconds once every vehicle has a route, and end it.
+def measure_live(size: Size, seconds: float) -> dict[str, Any]:
+    """Starts a swarm, measures it for some seconds once every vehicle has a route, and end it.
 
     Raises SwarmError if it does not come up. Leaves no process and no file, however it ends.
     """
@@ -68,7 +67,7 @@ def measure_live(size: Size, seconds: float, tell: Tell) -> dict[str, Any]:
             helpers = [far.start(raw_answerer), far.start(route_client)]
             began_s = time.monotonic()
             launcher = UpProcess(str(file), run_dir, UP_WITHIN_S + ROUTED_WITHIN_S + seconds + _MARGIN_S)
-            run = _Run(size, scenario, seconds, launcher, began_s, helpers, tell)
+            run = _Run(size, scenario, seconds, launcher, began_s, helpers)
             try:
                 figures = run.measure()
             finally:
@@ -81,7 +80,7 @@ class _Cpu(NamedTuple):
 
     at_s: float
     by_pid: dict[int, tuple[str, float]]
-    machine_s: float | None
+    machine_s: float
 
 
 class _Run:
@@ -95,7 +94,6 @@ class _Run:
         launcher: UpProcess,
         began_s: float,
         helpers: list[Connection],
-        tell: Tell,
     ) -> None:
         self._size = size
         self._seconds = seconds
@@ -103,7 +101,6 @@ class _Run:
         self._began_s = began_s
         self._helpers = helpers
         """To the processes that measure routes: the one that answers raw queries, and the client."""
-        self._tell = tell
         self._scenario = scenario
         self._network = scenario.network
         self._window = StatsWindow()
@@ -123,7 +120,7 @@ class _Run:
             self._listen(SETTLE_S)
             cells, route_cells = sorted(self._cells.values()), self._scenario.vehicles.route_cells
             question = (self._scenario.target_ids, cells, route_cells, self._seconds, self._size.seed)
-            self._tell(f"measuring for {self._seconds:g} s")
+            tell(f"measuring for {self._seconds:g} s")
             self._window.begin()
             before = self._cpu()
             if asks:
@@ -185,12 +182,12 @@ class _Run:
             if up_s is None:
                 if any(line.startswith(_UP) for line in self._launcher.lines()):
                     up_s = now_s
-                    self._tell(f"up after {now_s - self._began_s:.1f} s")
+                    tell(f"up after {now_s - self._began_s:.1f} s")
                 else:
                     self._check_time("all processes are alive")
             if routed_s is None and len(self._answered) >= self._size.vehicles:
                 routed_s = now_s - self._began_s
-                self._tell(f"every vehicle has a route after {routed_s:.1f} s")
+                tell(f"every vehicle has a route after {routed_s:.1f} s")
             if up_s is not None and now_s - up_s > ROUTED_WITHIN_S:
                 break
         if routed_s is None:
@@ -264,9 +261,7 @@ class _Run:
             role, used_s = after.by_pid[pid]
             by_role[role] = by_role.get(role, 0.0) + ms_per_s * (used_s - before.by_pid[pid][1])
         every = sum(by_role.values()) if by_role else None
-        others = None
-        if every is not None and before.machine_s is not None and after.machine_s is not None:
-            others = max(ms_per_s * (after.machine_s - before.machine_s) - every, 0.0)
+        others = None if every is None else max(ms_per_s * (after.machine_s - before.machine_s) - every, 0.0)
         agents, planners = by_role.get("agent"), by_role.get("planner")
         size = self._size
         return {
@@ -305,7 +300,7 @@ class _Run:
     def _name_what_is_missing(self, figures: dict[str, Any]) -> None:
         for name, what in (("cpu_all_ms_per_s", "CPU"), ("pss_mb_all", "memory")):
             if figures[name] is None:
-                self._not_measured.append(f"{what}: this system does not tell it in /proc")
+                self._not_measured.append(f"{what}: this system does not tell it")
         route = figures["route"]
         if not route.get("queries"):
             self._not_measured.append("route latency: no query was answered")

@@ -11,7 +11,7 @@ import numpy as np
 import zenoh
 
 from bench.wire.queries import ask_route
-from bench.wire.remote import RAW, read_on_thread
+from bench.wire.remote import RAW, beside, read_on_thread
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig
 from swarm.runtime.inbox import Inbox
@@ -44,7 +44,7 @@ def raw_answerer(network: NetworkConfig, pipe: Connection) -> None:
 def route_client(network: NetworkConfig, pipe: Connection) -> None:
     """Joins when asked to; then asks for routes, and raw, in turn.
 
-    Answers (targets, cells, route_cells, seconds, seed) with `_summary`.
+    Answers (targets, cells, route_cells, seconds, seed) with quantiles in microseconds, and ours over raw.
     """
     pipe.send("ready")
     if pipe.recv() == "end":
@@ -79,7 +79,9 @@ def _ask_for(
             raw_us.append(raw_took_us)
             reply_bytes.append(len(encode(reply)))
         time.sleep(_EVERY_S / 2)
-    return _summary(ours_us, raw_us, reply_bytes, unanswered)
+    mean_bytes = round(float(np.mean(reply_bytes))) if reply_bytes else None
+    told = {"queries": len(ours_us), "unanswered": unanswered, "reply_bytes": mean_bytes}
+    return {**told, **beside(ours_us, raw_us, "us")}
 
 
 def _raw(bus: ZenohBus, request: RouteRequest, reply: RouteReply) -> float | None:
@@ -91,14 +93,3 @@ def _raw(bus: ZenohBus, request: RouteRequest, reply: RouteReply) -> float | Non
     )
     sizes = [len(each.ok.payload.to_bytes()) for each in answers if each.ok is not None]
     return (time.monotonic_ns() - began_ns) / 1e3 if sizes == [size] else None
-
-
-def _summary(ours_us: list[float], raw_us: list[float], reply_bytes: list[int], unanswered: int) -> dict[str, Any]:
-    """Quantiles in microseconds, and ours over raw; None without answers."""
-    found: dict[str, Any] = {"queries": len(ours_us), "unanswered": unanswered}
-    found["reply_bytes"] = round(float(np.mean(reply_bytes))) if reply_bytes else None
-    for name, percent in (("p50", 50), ("p99", 99)):
-        ours, raw = (float(np.percentile(each, percent)) if each else None for each in (ours_us, raw_us))
-        found[f"ours_{name}_us"], found[f"raw_{name}_us"] = ours, raw
-        found[f"ratio_{name}"] = None if ours is None or raw is None else ours / raw
-    return found

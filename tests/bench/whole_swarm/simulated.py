@@ -1,20 +1,16 @@
-"""The same swarm in one process, on a memory bus and a manual clock.
-
-python -m bench.whole_swarm.simulated SIZE SECONDS LIMIT_S      prints one JSON object
-"""
+"""The same swarm in one process, on a memory bus and a manual clock."""
 
 from __future__ import annotations
 
-import json
 import resource
 import signal
-import sys
 import time
+from collections import Counter
 from typing import Any
 
 import msgspec
 
-from bench.isolated import TimeLimit, measure
+from bench.isolated import TimeLimit, isolated
 from bench.whole_swarm.size import Size, scenario_of, size_of
 from launch_scripts.parent_death import end_with_parent
 from swarm.runtime.garbage import collected_rarely
@@ -28,32 +24,29 @@ _STEP_S = 0.1
 
 
 def measure_simulated(size: Size, seconds: float, limit_s: float = LIMIT_S) -> dict[str, Any]:
-    """Measure a simulation in a process of its own. Raises SwarmError if it fails."""
-    return measure(__name__, msgspec.json.encode(size).decode(), f"{seconds:g}", f"{limit_s:g}")
+    """Measures a simulation in a process of its own. Raises SwarmError if it fails."""
+    found: dict[str, Any] = isolated(simulate, msgspec.structs.asdict(size), seconds, limit_s)
+    return found
 
 
-class _Delivered:
-    """Messages and bytes by topic."""
-
-    def __init__(self) -> None:
-        self.messages: dict[str, int] = {}
-        self.bytes: dict[str, int] = {}
-
-    def add(self, topic: str, payload: bytes) -> None:
-        self.messages[topic] = self.messages.get(topic, 0) + 1
-        self.bytes[topic] = self.bytes.get(topic, 0) + len(payload)
-
-
-def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
+def simulate(fields: dict[str, Any], seconds: float, limit_s: float) -> dict[str, Any]:
+    """Figures of a simulation of a size, given by its fields; ended with the process which asked for it."""
     from launch_scripts.simulation.simulate import Simulation
 
+    end_with_parent(signal.SIGKILL)
+    size = Size(**fields)
     # A small one first, in which kernels are loaded, or compiled.
     Simulation(scenario_of(size_of(20, 2, seed=size.seed))).run_until(_LOADING_S)
     began_s = time.perf_counter()
     simulation = Simulation(scenario_of(size))
     built_s = time.perf_counter() - began_s
-    delivered = _Delivered()
+    messages: Counter[str] = Counter()
+    payloads: Counter[str] = Counter()
     limit = TimeLimit(limit_s)
+
+    def deliver(now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
+        messages[topic] += 1
+        payloads[topic] += len(payload)
 
     def run_until(until_s: float) -> None:
         while simulation.now_s < until_s and not limit.is_up:
@@ -61,7 +54,7 @@ def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
 
     with collected_rarely():  # as `simulate` does
         run_until(WARM_UP_S)
-        simulation.network.trace = lambda _, source, destination, topic, payload: delivered.add(topic, payload)
+        simulation.network.trace = deliver
         from_s, wall_s, cpu_s = simulation.now_s, time.perf_counter(), time.process_time()
         run_until(WARM_UP_S + seconds)
         passed_s = simulation.now_s - from_s
@@ -79,14 +72,14 @@ def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
         "times_real_time_of_cpu": passed_s / cpu_s if passed_s else None,
         "cpu_all_ms_per_s": 1000 * cpu_s / passed_s if passed_s else None,
         "cpu_all_per_vehicle_ms_per_s": 1000 * cpu_s / passed_s / size.vehicles if passed_s else None,
-        "deliveries_per_s": sum(delivered.messages.values()) / passed_s if passed_s else None,
-        "bytes_in_per_s": sum(delivered.bytes.values()) / passed_s if passed_s else None,
+        "deliveries_per_s": messages.total() / passed_s if passed_s else None,
+        "bytes_in_per_s": payloads.total() / passed_s if passed_s else None,
         "topics": {
             topic: {
-                "deliveries_per_s": delivered.messages[topic] / passed_s,
-                "bytes_per_s": delivered.bytes[topic] / passed_s,
+                "deliveries_per_s": messages[topic] / passed_s,
+                "bytes_per_s": size_bytes / passed_s,
             }
-            for topic in sorted(delivered.bytes, key=lambda each: -delivered.bytes[each])
+            for topic, size_bytes in payloads.most_common()
             if passed_s
         },
         "routed_share": report["vehicles_routed"] / size.vehicles,
@@ -94,10 +87,3 @@ def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000,
         "not_measured": not_measured,
     }
-
-
-if __name__ == "__main__":
-    end_with_parent(signal.SIGKILL)
-    found = run(msgspec.json.decode(sys.argv[1], type=Size), float(sys.argv[2]), float(sys.argv[3]))
-    json.dump(found, sys.stdout)
-    sys.stdout.write("\n")

@@ -2,27 +2,21 @@
 
 The payloads are those of a simulated run, so that sizes and shares of the message types are real. Hostile payloads
 are decoded in processes of their own: what counts is by how much the resident memory rises.
-
-    python -m bench.wire.codec decode WAY NAME      one hostile payload; prints one JSON object
 """
 
 from __future__ import annotations
 
-import json
-import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import msgpack
 import msgspec
-from rich.table import Table
 
-from bench.isolated import measure, peak_bytes
-from bench.tables import number, table, times
+from bench.harness import cpu_ms
+from bench.isolated import isolated, peak_bytes
 from swarm.config.load import load_scenario
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_PAYLOAD_BYTES, decode, encode
@@ -41,7 +35,7 @@ _TYPES = {
 }
 
 
-def run() -> dict[str, Any]:
+def measure() -> dict[str, Any]:
     """Microseconds for a message of each type that a run of the synthetic scenario sends, and of the mean message;
     memory that hostile payloads of at most 8 MiB take."""
     counts, samples = _traffic()
@@ -52,30 +46,17 @@ def run() -> dict[str, Any]:
     report: dict[str, Any] = {"types": [{name: _short(value) for name, value in row.items()} for row in rows]}
     for way in ("encode", "decode"):
         ours, raw = (sum(row["share"] * row[f"{whose}_{way}_us"] for row in rows) for whose in ("ours", "raw"))
-        report |= {f"ours_{way}_us": _short(ours), f"raw_{way}_us": _short(raw), f"ratio_{way}": _short(ours / raw)}
+        report |= {
+            f"ours_{way}_us": _short(ours),
+            f"raw_{way}_us": _short(raw),
+            f"ratio_{way}_us": _short(ours / raw),
+        }
     report["hostile"] = [
         {"payload": name, "mib": _short(len(payload) / _MIB)}
-        | {f"{way}_mib": measure(__name__, "decode", way, name)["mib"] for way in ("ours", "raw")}
+        | {f"{way}_mib": isolated(hostile_mib, way, name) for way in ("ours", "raw")}
         for name, payload in hostile().items()
     ]
     return report
-
-
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    found = table(
-        "Microseconds a message", "<", "share", "bytes", "encode", "raw", "ratio", "decode", "raw", "ratio"
-    )
-    for row in report["types"]:
-        cells = [row["message"], f"{100 * row['share']:.1f} %", number(row["bytes"])]
-        for way in ("encode", "decode"):
-            ours, raw = row[f"ours_{way}_us"], row[f"raw_{way}_us"]
-            cells += [number(ours), number(raw), times(ours / raw)]
-        found.add_row(*cells)
-    yield found
-    found = table("MiB that a hostile payload takes", "<", "payload", "ours", "raw")
-    for row in report["hostile"]:
-        found.add_row(row["payload"], *(number(row[name]) for name in ("mib", "ours_mib", "raw_mib")))
-    yield found
 
 
 def hostile() -> dict[str, bytes]:
@@ -143,14 +124,16 @@ def _timed(kind: type[Message], payloads: list[bytes]) -> dict[str, float]:
     repeats = max(1, 500 // len(payloads))
     for _ in range(_ROUNDS):
         for name, way in ways.items():
-            began_ns = time.thread_time_ns()
-            for _ in range(repeats):
-                way()
-            took[name].append((time.thread_time_ns() - began_ns) / 1e3 / repeats / len(payloads))
+            took[name].append(1e3 * cpu_ms(_repeatedly, way, repeats) / repeats / len(payloads))
     return {"bytes": sum(map(len, payloads)) / len(payloads), **{name: median(each) for name, each in took.items()}}
 
 
-def _decode_hostile(way: str, name: str) -> dict[str, float]:
+def _repeatedly(work: Callable[[], object], times: int) -> None:
+    for _ in range(times):
+        work()
+
+
+def hostile_mib(way: str, name: str) -> float:
     """By how many MiB the resident memory of this process rises."""
     payload = hostile()[name]
     decoder = msgspec.msgpack.Decoder(CostRequest)
@@ -164,13 +147,8 @@ def _decode_hostile(way: str, name: str) -> dict[str, float]:
         except (ProtocolError, msgspec.MsgspecError, RecursionError):
             pass
 
-    return {"mib": _short(peak_bytes(attempt) / _MIB)}
+    return round(peak_bytes(attempt) / _MIB, 4)
 
 
 def _short(value: Any) -> Any:
     return round(value, 4) if isinstance(value, float) else value
-
-
-if __name__ == "__main__":
-    json.dump(_decode_hostile(*sys.argv[2:]), sys.stdout)
-    sys.stdout.write("\n")

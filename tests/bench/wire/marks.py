@@ -15,6 +15,7 @@ from bench.wire.remote import (
     RAW,
     Far,
     asked,
+    beside,
     map_holder,
     map_key,
     map_peer,
@@ -47,14 +48,14 @@ def latency(far: Far, marks: int) -> dict[str, float]:
         replica = MapReplica(GRID, author=_AUTHOR, publish_hz=1e6)
         put_ns: dict[tuple[int, int], int] = {}  # (tile, seq) -> when
         raw_ns: list[int] = []
-        write_us: list[float] = []
+        took_us: list[float] = []
         _settle(bus, peer)
         for n in range(marks):
             window = GRID.tile_window(n % 64)
             cell = window.row0 * GRID.cols + window.col0 + n // 64
             began_ns = time.monotonic_ns()
             [action] = replica.write([cell], MarkKind.LETHAL, 0.0, began_ns)
-            write_us.append((time.monotonic_ns() - began_ns) / 1e3)
+            took_us.append((time.monotonic_ns() - began_ns) / 1e3)
             out = action.mark_set
 
             def ours(out: Any = out) -> None:
@@ -74,15 +75,8 @@ def latency(far: Far, marks: int) -> dict[str, float]:
     far.end()
     ours_us = np.array([when - put_ns[tile, seq] for tile, seq, when in applied]) / 1e3
     raw_us = (np.array(received_ns) - np.array(raw_ns)[: len(received_ns)]) / 1e3
-    figures = {
-        "ours_p50": np.percentile(ours_us, 50),
-        "ours_p99": np.percentile(ours_us, 99),
-        "raw_p50": np.percentile(raw_us, 50),
-        "raw_p99": np.percentile(raw_us, 99),
-        "write_p50": np.percentile(write_us, 50),
-        "lost": marks - len(applied),
-    }
-    return rounded(figures) | ratios(figures, "p50", "p99")
+    write_us = {"write_p50_us": round(float(np.percentile(took_us, 50)), 2)}
+    return beside(ours_us, raw_us, "us") | write_us | {"lost": marks - len(applied)}
 
 
 def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
@@ -113,17 +107,16 @@ def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
                 cpu_us[name].append(used_ns / 1e3 / len(arrived_ns))
                 lost += sets - len(arrived_ns) if name == "ours" else 0
     far.end()
-    return rounded(
-        {
-            "bytes": len(payloads[0]),
-            "ours_per_s": median(per_s["ours"]),
-            "raw_per_s": median(per_s["raw"]),
-            "ratio": median(ours / raw for ours, raw in zip(per_s["ours"], per_s["raw"], strict=True)),
-            "ours_cpu_us_per_set": median(cpu_us["ours"]),
-            "raw_cpu_us_per_set": median(cpu_us["raw"]),
-            "superseded_or_lost": lost,
-        }
-    )
+    figures = {
+        "bytes": len(payloads[0]),
+        "ours_per_s": median(per_s["ours"]),
+        "raw_per_s": median(per_s["raw"]),
+        "ratio_per_s": median(ours / raw for ours, raw in zip(per_s["ours"], per_s["raw"], strict=True)),
+        "ours_cpu_us_per_set": median(cpu_us["ours"]),
+        "raw_cpu_us_per_set": median(cpu_us["raw"]),
+        "superseded_or_lost": lost,
+    }
+    return {name: round(value, 2) for name, value in figures.items()}
 
 
 def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
@@ -156,17 +149,9 @@ def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
             if len(replica.held.tiles) != sets:
                 raise SwarmError(f"a late join had {len(replica.held.tiles)} of {sets} sets")
     far.end()
-    figures = {
-        "sets": sets,
-        "ours_p50": median(times["ours"]),
-        "ours_first": times["ours"][0],
-        "raw_p50": median(times["sets"]),
-        "raw_first": times["sets"][0],
-        "raw_in_few_replies_p50": median(times["bulk"]),
-        "ours_cpu_p50": median(cpu["ours"]),
-        "raw_cpu_p50": median(cpu["sets"]),
-    }
-    return rounded(figures) | ratios(figures, "p50", "cpu_p50")
+    cpu_ms = beside(cpu["ours"], cpu["sets"], "ms", "cpu_")
+    few = {"raw_in_few_replies_p50_ms": round(median(times["bulk"]), 2)}
+    return {"sets": sets, **beside(times["ours"], times["sets"], "ms"), **cpu_ms, **few}
 
 
 def _raw_get(bus: ZenohBus, key: str, sets: int) -> int:
@@ -200,11 +185,3 @@ def _until_still(peer: Any, sets: int, which: int) -> None:
         elif time.monotonic() - since_s > _STALLED_S:
             return
         time.sleep(0.01)
-
-
-def ratios(figures: dict[str, Any], *names: str) -> dict[str, float]:
-    return {f"ratio_{name}": round(float(figures[f"ours_{name}"] / figures[f"raw_{name}"]), 2) for name in names}
-
-
-def rounded(figures: dict[str, Any]) -> dict[str, float]:
-    return {name: round(float(value), 2) for name, value in figures.items()}

@@ -19,16 +19,16 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from bench.machine import machine
-from bench.tables import Progress
+from bench.harness import benchmark, track
 from bench.wire import partition_side
 from bench.wire.partition_side import ADDRESSES, SIDES
 from launch_scripts.deploy.certificates import issue
@@ -159,7 +159,7 @@ class TwoSides:
             self._told.put((child, json.loads(line)))
 
 
-def rounds(count: int, seconds: float, folder: Path) -> Iterator[dict[str, float]]:
+def partitions(count: int, seconds: float, folder: Path) -> Generator[dict[str, float]]:
     """For each round: seconds from the cable's return until all are equal, and the number of digests before it."""
     with TwoSides(folder) as sides:
         sides.say("write")
@@ -202,17 +202,25 @@ def _ip(*arguments: str) -> None:
         raise SwarmError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 
 
-def run(count: int, seconds: float, progress: Progress | None = None) -> dict[str, Any]:
-    """Quantiles over all rounds. Raises SwarmError where two namespaces cannot run."""
-    reason = why_not()
-    if reason is not None:
+@benchmark()
+def partition(
+    rounds: Annotated[int, typer.Option(min=1, help="Partitions, one after the other.")] = 20,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long each lasts, with writes on both sides.")] = 30.0,
+) -> dict[str, Any]:
+    """How soon all replicas are equal after a partition heals. Needs root and iproute2; some eleven minutes.
+
+    \b
+    ./launch_scripts/bench partition --rounds 2 --seconds 5
+
+    Two network namespaces stand for two machines, each with a router, a keeper,
+    two authors and a listener; they meet over mutual TLS.
+    """
+    if (reason := why_not()) is not None:
         raise SwarmError(f"this machine cannot run two network namespaces: {reason}")
-    found: list[float] = []
     with tempfile.TemporaryDirectory() as name:
-        for figures in rounds(count, seconds, Path(name)):
-            found.append(figures["equal_after_s"])
-            if progress is not None:
-                progress(len(found), count)
+        healed = partitions(rounds, seconds, Path(name))
+        found = [next(healed)["equal_after_s"] for _ in track(range(rounds))]
+        healed.close()
     p50, p99 = (round(float(np.percentile(found, q)), 3) for q in (50, 99))
     measured = {"p50_s": p50, "p99_s": p99, "max_s": max(found)}
-    return {"rounds": len(found), "partition_s": seconds, **measured, "equal_after_s": found, **machine()}
+    return {"rounds": rounds, "partition_s": seconds, **measured, "equal_after_s": found}

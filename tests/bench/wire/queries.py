@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from bench.wire.marks import ratios, rounded
-from bench.wire.remote import RAW, Far, asked, read_on_thread, run_service
+from bench.wire.remote import RAW, Far, Parts, asked, beside, read_on_thread, run_service
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -22,7 +21,6 @@ from swarm.errors import SwarmError
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import ThreadWorker
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
@@ -93,14 +91,7 @@ def route_queries(far: Far, queries: int) -> dict[str, float]:
             raw_us.append((time.monotonic_ns() - began_ns) / 1e3)
             time.sleep(0.002)
     far.end()
-    figures = {
-        "reply_bytes": len(encode(reply)),
-        "ours_p50": np.percentile(ours_us, 50),
-        "ours_p99": np.percentile(ours_us, 99),
-        "raw_p50": np.percentile(raw_us, 50),
-        "raw_p99": np.percentile(raw_us, 99),
-    }
-    return rounded(figures) | ratios(figures, "p50", "p99")
+    return {"reply_bytes": len(encode(reply)), **beside(ours_us, raw_us, "us")}
 
 
 def _first_route(bus: ZenohBus, inbox: Inbox) -> RouteReply:
@@ -182,43 +173,25 @@ def _fleet(author: str, region: int, seq: int, vehicles: int) -> Fleet:
     )
 
 
-class _Watcher:
-    """Keeps the newest positions of each agent and region, as an agent does."""
-
-    def __init__(self, bus: ZenohBus, inbox: Inbox) -> None:
-        self.counters = Counters()
-        self.received = 0
-        self.newest: dict[tuple[int, str], Fleet] = {}
-        self._bus = bus
-        self._inbox = inbox
-
-    def start(self, now_ns: int) -> None:
-        self._bus.subscribe(FLEET, self._inbox.post)
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        if isinstance(event, Heard) and isinstance(event.message, Fleet):
-            self.received += 1
-            self.newest[event.message.region, event.message.author] = event.message
-
-    def tick(self, now_ns: int) -> None:
-        pass
-
-    def stop(self, now_ns: int) -> None:
-        pass
-
-
 def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
     """Receives positions, ours parsed and newest only, raw ones through a FIFO; reports counts and CPU time."""
+    received: list[int] = []
     raw_received: list[int] = []
+    newest: dict[tuple[int, str], Fleet] = {}
     with open_bus(network) as bus:
         inbox = Inbox()
-        watcher = _Watcher(bus, inbox)
-        raw = bus.session.declare_subscriber(f"{RAW}/fleet/**", zenoh.handlers.FifoChannel(1 << 14))
-        kept = read_on_thread(raw, lambda sample: raw_received.append(len(sample.payload.to_bytes())))
+
+        def handle(event: Event, now_ns: int) -> None:
+            if isinstance(event, Heard) and isinstance(event.message, Fleet):
+                received.append(now_ns)
+                newest[event.message.region, event.message.author] = event.message
 
         def answer(_: str) -> tuple[int, int, int, int]:
-            return watcher.received, inbox.superseded, len(raw_received), time.process_time_ns()
+            return len(received), inbox.superseded, len(raw_received), time.process_time_ns()
 
+        watcher = Parts(lambda now_ns: bus.subscribe(FLEET, inbox.post), handle)
+        raw = bus.session.declare_subscriber(f"{RAW}/fleet/**", zenoh.handlers.FifoChannel(1 << 14))
+        kept = read_on_thread(raw, lambda sample: raw_received.append(len(sample.payload.to_bytes())))
         pipe.send("ready")
         run_service(watcher, inbox, pipe, answer)
         del kept
@@ -247,8 +220,8 @@ def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str,
             figures["raw_lost"] = sent - raw_count
     for _ in range(len(senders) + 1):
         far.end()
-    figures["ratio_cpu"] = figures["ours_cpu_ms_per_s"] / figures["raw_cpu_ms_per_s"]
-    return rounded(figures)
+    figures["ratio_cpu_ms_per_s"] = figures["ours_cpu_ms_per_s"] / figures["raw_cpu_ms_per_s"]
+    return {name: round(float(value), 2) for name, value in figures.items()}
 
 
 def _all_answers(pipes: list[Connection], question: Any, seconds: float) -> list[int]:

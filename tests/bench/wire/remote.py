@@ -1,20 +1,22 @@
-"""The processes of `bench.wire` beside the measuring one: a router, and peers that receive, hold and answer."""
+"""Processes beside the measuring one: a router, and peers which receive, hold and answer; quantiles of both
+ways."""
 
 from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
 import numpy as np
+import psutil
 import zenoh
+from numpy.typing import NDArray
 
 from launch_scripts.ports import free_ports
 from shared_map.cost_map import CostMap
@@ -117,6 +119,19 @@ def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:
     return far.recv()
 
 
+def beside(
+    ours: Sequence[float] | NDArray[Any], raw: Sequence[float] | NDArray[Any], unit: str, what: str = ""
+) -> dict[str, Any]:
+    """Quantiles of ours and raw as `ours_p50_us` and so on, and ours over raw; None without values."""
+    found: dict[str, Any] = {}
+    for percent in (50, 99):
+        one, other = (float(np.percentile(each, percent)) if len(each) else None for each in (ours, raw))
+        name = f"{what}p{percent}_{unit}"
+        found |= {f"ours_{name}": one, f"raw_{name}": other}
+        found[f"ratio_{name}"] = None if one is None or not other else one / other
+    return {name: None if value is None else round(value, 2) for name, value in found.items()}
+
+
 def _router(network: NetworkConfig, pipe: Connection) -> None:
     with open_bus(network, mode="router"):
         pipe.send("ready")
@@ -151,26 +166,28 @@ def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[.
     process.run()
 
 
-class _MapPeer:
-    """A service which is nothing but a replica."""
+class Parts:
+    """A service made of functions: what is done at the start, with an event and at a tick."""
 
-    def __init__(self, sync: MapSync, pipe: Connection) -> None:
+    def __init__(
+        self,
+        start: Callable[[int], object],
+        handle: Callable[[Event, int], object],
+        tick: Callable[[int], object] = lambda now_ns: None,
+    ) -> None:
         self.counters = Counters()
-        self._sync = sync
-        self._pipe = pipe
-
-    def start(self, now_ns: int) -> None:
-        self._sync.start(now_ns)
-        self._pipe.send("ready")
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        self._sync.handle(event, now_ns)
-
-    def tick(self, now_ns: int) -> None:
-        self._sync.tick(now_ns)
+        self.start, self.handle, self.tick = start, handle, tick
 
     def stop(self, now_ns: int) -> None:
         pass
+
+
+def _map_service(sync: MapSync, pipe: Connection) -> Parts:
+    def start(now_ns: int) -> None:
+        sync.start(now_ns)
+        pipe.send("ready")
+
+    return Parts(start, sync.handle, sync.tick)
 
 
 def map_peer(network: NetworkConfig, pipe: Connection) -> None:
@@ -205,7 +222,7 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
         sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
         raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
         kept = read_on_thread(raw, received)
-        run_service(_MapPeer(sync, pipe), inbox, pipe, answer)
+        run_service(_map_service(sync, pipe), inbox, pipe, answer)
         del kept
 
 
@@ -221,7 +238,7 @@ def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) 
             _serve_raw(bus, f"{RAW}/sets", [encode(each) for each in held]),
             _serve_raw(bus, f"{RAW}/bulk", [encode(each) for each in packed(held)]),
         ]
-        run_service(_MapPeer(sync, pipe), inbox, pipe, lambda *_: None)
+        run_service(_map_service(sync, pipe), inbox, pipe, lambda *_: None)
         del kept
 
 
@@ -240,12 +257,12 @@ def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
     replica = MapReplica(grid)
     replica.merge([some_set(tile, 0, 61) for tile in range(16)])
     replica.held.ledger.held()
-    before = resident_bytes()
+    before = psutil.Process().memory_info().rss
     cpu_s = time.process_time()
     for tile in range(grid.tiles):
         replica.merge([some_set(tile, 1, 61, f"a{tile % 8}.1")])
     one_by_one_s = time.process_time() - cpu_s
-    held = resident_bytes() - before
+    held = psutil.Process().memory_info().rss - before
     marks = grid.tiles * 61
     began_s = time.perf_counter()
     digest = replica.held.ledger.held()
@@ -273,8 +290,3 @@ def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
         }
     )
     pipe.recv()
-
-
-def resident_bytes() -> int:
-    with open("/proc/self/statm", encoding="ascii") as statm:
-        return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -1,273 +1,164 @@
-"""Plans that ROS asks a gateway for, beside the same asked of the swarm; and the swarm's while ROS floods it."""
+"""CPU that the gateway to ROS takes for vehicles: a made-up swarm, `swarm ros2` as users start it, one hearer."""
 
 from __future__ import annotations
 
-import itertools
-import math
-import threading
+import contextlib
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
-from rich.table import Table
+import psutil
+import typer
 
-from bench.machine import machine
-from bench.tables import Progress, number, table
-from bench.wire.queries import planner_peer
-from bench.wire.remote import Far, asked
-from launch_scripts.gateways.ros2.frames import RosMap
-from launch_scripts.gateways.ros2.incoming.incoming import Incoming
-from launch_scripts.gateways.ros2.incoming.settings import IncomingSettings, Robots
-from launch_scripts.gateways.ros2.messages import RosMessages
-from launch_scripts.gateways.ros2.node import Node, open_ros
-from launch_scripts.gateways.ros2.types import Distribution, types_of
-from swarm.client import Route, Swarm, connect
+from bench.harness import benchmark, track
+from bench.wire.remote import GRID, Far, some_set
+from launch_scripts.ports import free_ports
+from swarm.bus.bus import Asked
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import SwarmError
+from swarm.runtime.inbox import Inbox
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, RUN
 
-_TYPES = types_of(Distribution.JAZZY)
-_ROBOT, _TARGET, _GOAL, _OWN_GOAL = "uav1", "t0", "goal0", "goal1"
-_TICK_S = 0.02
-_LONGEST_S = 10.0
-_BATCH = 50
-_WANTED = {"plan": 2.0, "goal": 2.0, "flood": 1.05}
-_PLAN, _POSE, _ODOMETRY = "nav_msgs/srv/GetPlan", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+_PER_AGENT = 25
+_HZ = 10.0
+_ROUTE_CELLS, _NEW_ROUTE_S = 200, 2.0
+_MARK_SETS_A_TICK, _MARKS = 1, 20
+_WEST_M, _NORTH_M, _CRS = 500_000.0, 5_300_000.0, "EPSG:32632"
+_WARM_S = 3.0
+_START_S = 60.0
 
 
-def gateway_peer(ros: NetworkConfig, pipe: Connection, network: NetworkConfig) -> None:
-    """What comes in from ROS, as `swarm ros2` has it at work, until told to end."""
-    settings = IncomingSettings(robots=(Robots(),), goal_targets=(_GOAL,))
-    ended = threading.Event()
-    with (
-        connect(network.connect[0], namespace=network.namespace) as swarm,
-        open_ros(ros.connect[0]) as session,
-    ):
-        node = Node(session, "swarm_gateway", _TYPES)
-        incoming = Incoming(node, swarm, settings)
-
-        def wait_for_the_end() -> None:
-            pipe.recv()
-            ended.set()
-
-        threading.Thread(target=wait_for_the_end, daemon=True).start()
+def swarm_peer(
+    network: NetworkConfig, pipe: Connection, vehicles: int, seconds: float, run_id: str = "bench"
+) -> None:
+    """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, and a target,
+    for so long. Answers which run it is."""
+    inbox, now_ns = Inbox(), time.time_ns()
+    info = RunInfo(
+        run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
+        cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=_WEST_M, north_m=_NORTH_M,
+        crs=_CRS,
+    )  # fmt: skip
+    with open_bus(network) as bus:
+        bus.serve(RUN, inbox.post, role="keeper", id="0")
         pipe.send("ready")
-        while not ended.wait(_TICK_S):
-            incoming.tick(time.monotonic_ns())
-        incoming.close()
-        node.close()
+        began_s = time.monotonic()
+        tick = 0
+        while time.monotonic() < began_s + seconds and not pipe.poll():
+            tick += 1
+            _tell(bus, tick, vehicles)
+            target = TargetPose(
+                target="t0", incarnation=now_ns, seq=tick, stamp_ns=time.time_ns(), cell=0,
+                x_m=_WEST_M + 5.0, y_m=_NORTH_M - 5.0,
+            )  # fmt: skip
+            bus.publish(POSE, target, target="t0")
+            while (event := inbox.take(max(0.0, began_s + tick / _HZ - time.monotonic()))) is not None:
+                if isinstance(event, Asked):
+                    event.answer(msgspec.structs.replace(info, now_ns=time.time_ns()), role="keeper", id="0")
+                    event.end()
 
 
-def flood_peer(ros: NetworkConfig, pipe: Connection) -> None:
-    """Puts odometry of the robot: once where it is asked to, or for so many seconds at so many a second."""
-    with open_ros(ros.connect[0]) as session:
-        node = Node(session, "robot", _TYPES)
-        publisher = node.publisher(f"/{_ROBOT}/odom", _ODOMETRY)
-        pipe.send("ready")
-        while (question := pipe.recv()) != "end":
-            content, seconds, hz = question
-            sent, due_s = 0, time.monotonic()
-            until_s = due_s + seconds
-            while sent == 0 or time.monotonic() < until_s:
-                for _ in range(_BATCH if seconds else 1):
-                    publisher.put_packed(content)
-                    sent += 1
-                due_s += _BATCH / hz
-                time.sleep(max(0.0, due_s - time.monotonic()))
-            pipe.send(sent)
-        node.close()
-
-
-def run(
-    questions: int = 200,
-    seconds: float = 4.0,
-    rounds: int = 5,
-    hz: int = 5000,
-    progress: Progress = lambda done, total: None,
-) -> dict[str, Any]:
-    """Milliseconds of plans and goals, by ROS and by the swarm's own, and of queries in quiet and in the flood."""
-    report: dict[str, Any] = machine()
-    with Far() as far, Far() as ros:
-        for target in (_TARGET, _GOAL, _OWN_GOAL):
-            far.start(planner_peer, target)
-        robot = ros.start(flood_peer)
-        with (
-            connect(far.network.connect[0], namespace=far.network.namespace) as swarm,
-            swarm.target(_TARGET) as target_of_all,
-        ):
-            ros.start(gateway_peer, far.network)
-            grid = swarm.frame.grid
-            target_of_all.at(*grid.centre_m(grid.cell(grid.rows // 2, grid.cols // 2)))
-            with open_ros(ros.network.connect[0]) as session:
-                node = Node(session, "client", _TYPES)
-                side = _Sides(swarm, node, robot)
-                side.begin()
-                progress(0, 3)
-                report["plan"] = _in_turn(questions, side.plan_of_ros, side.plan_of_swarm)
-                progress(1, 3)
-                with swarm.target(_OWN_GOAL) as own:
-                    report["goal"] = _in_turn(
-                        questions // 2, side.goal_of_ros, lambda cell: side.goal_of_swarm(own, cell)
-                    )
-                progress(2, 3)
-                report["flood"] = side.flooded(rounds, seconds, hz)
-                progress(3, 3)
-                node.close()
-    return report
-
-
-class _Sides:
-    """The client of ROS and that of the swarm, who ask for the same."""
-
-    def __init__(self, swarm: Swarm, node: Node, robot: Connection) -> None:
-        self._swarm, self._robot = swarm, robot
-        self._messages = RosMessages(_TYPES, RosMap(swarm.frame.grid))
-        self._start = swarm.frame.grid.centre_m(swarm.frame.grid.cell(7, 9))
-        self._ask = node.packed_client(f"/{_ROBOT}/get_plan", _PLAN)
-        self._goal = node.publisher(f"/{_ROBOT}/goal_pose", _POSE)
-        self._ends: list[int] = []
-        """Last cells of the plans that were heard."""
-        self._heard = threading.Condition()
-        node.subscribe(f"/{_ROBOT}/plan", "nav_msgs/msg/Path", self._hear)
-
-    def begin(self) -> None:
-        """Wait until the robot is a vehicle and both sides get routes."""
-        until_s = time.monotonic() + 6 * _LONGEST_S
-        while time.monotonic() < until_s:
-            self._flood(0.0, 1000)
-            time.sleep(0.2)
-            if self.plan_of_ros(0) is not None and self.plan_of_swarm(0) is not None:
-                return
-        raise SwarmError("the gateway and the planners were not ready in time")
-
-    def plan_of_ros(self, _: int) -> float | None:
-        """GetPlan to a target: milliseconds until the response's bytes are there. What a client takes to read
-        them is its own."""
-        there = self._messages.pose_stamped(0, *self._start)
-        goal = self._messages.pose_stamped(0, *self._start)
-        goal.header.frame_id = f"targets/{_TARGET}"
-        request = _TYPES.make(f"{_PLAN}_Request", start=there, goal=goal, tolerance=0.0)
-        began_ns = time.monotonic_ns()
-        try:
-            response = self._ask(request, _LONGEST_S)
-        except SwarmError:
-            return None
-        took_ms = (time.monotonic_ns() - began_ns) / 1e6
-        return took_ms if _TYPES.unpack(response, f"{_PLAN}_Response").plan.poses else None
-
-    def plan_of_swarm(self, _: int) -> float | None:
-        """A route query to the same target."""
-        began_ns = time.monotonic_ns()
-        route = self._route(_TARGET)
-        return (time.monotonic_ns() - began_ns) / 1e6 if route is not None and route.ok else None
-
-    def goal_of_ros(self, cell: int) -> float | None:
-        """From a goal that is put to the first plan that ends there."""
-        self._flood(0.0, 1000)  # or the robot's lease would end
-        message = self._messages.pose_stamped(0, *self._swarm.frame.centre_m(cell))
-        with self._heard:
-            self._ends.clear()
-            began_ns = time.monotonic_ns()
-            self._goal.put(message)
-            if not self._heard.wait_for(lambda: cell in self._ends, _LONGEST_S):
-                return None
-        return (time.monotonic_ns() - began_ns) / 1e6
-
-    def goal_of_swarm(self, target: Any, cell: int) -> float | None:
-        """From a target that is put somewhere to the first route there, asked for as the gateway does."""
-        began_ns = time.monotonic_ns()
-        target.at(*self._swarm.frame.centre_m(cell))
-        while time.monotonic_ns() - began_ns < _LONGEST_S * 1e9:
-            route = self._route(_OWN_GOAL)
-            if route is not None and route.target_cell == cell:
-                return (time.monotonic_ns() - began_ns) / 1e6
-        return None
-
-    def flooded(self, rounds: int, seconds: float, hz: int) -> dict[str, Any]:
-        """Route queries of the swarm's own, quiet and while ROS floods the robot's topic, in turn."""
-        took_ms: dict[str, list[float]] = {"quiet": [], "flood": []}
-        sent = 0
-        for _, what in itertools.product(range(rounds), took_ms):
-            self._robot.send((self._odometry(), seconds if what == "flood" else 0.0, hz))
-            until_s = time.monotonic() + seconds
-            while time.monotonic() < until_s:
-                found = self.plan_of_swarm(0)
-                if found is not None:
-                    took_ms[what].append(found)
-                time.sleep(0.01)
-            sent += self._robot.recv()
-        figures = _figures({"ros": took_ms["flood"], "swarm": took_ms["quiet"]})
-        return figures | {"messages": sent, "hz": hz}
-
-    def _route(self, target: str) -> Route | None:
-        """None if there is no answer in time: the machine may be busy."""
-        try:
-            return self._swarm.route_soon(target, *self._start).result(_LONGEST_S)
-        except (SwarmError, TimeoutError):
-            return None
-
-    def _flood(self, seconds: float, hz: int) -> None:
-        asked(self._robot, self._odometry(), seconds, hz)
-
-    def _odometry(self) -> bytes:
-        message = self._messages.odometry(0, _ROBOT, *self._start, 0.0)
-        return _TYPES.pack(message, _ODOMETRY)
-
-    def _hear(self, path: Any) -> None:
-        if not path.poses:
-            return
-        at = path.poses[-1].pose.position
-        with self._heard:
-            self._ends.append(self._swarm.frame.grid.cell_at(*self._messages.map.to_terrain(at.x, at.y)))
-            self._heard.notify_all()
-
-
-def _in_turn(
-    many: int, of_ros: Callable[[int], float | None], of_swarm: Callable[[int], float | None]
-) -> dict[str, Any]:
-    """Both, one after the other, for the same cells."""
-    chance = np.random.default_rng(3)
-    took_ms: dict[str, list[float]] = {"ros": [], "swarm": []}
-    unanswered = 0
-    for cell in chance.integers(0, 512 * 512, many).tolist():
-        for name, ask in (("ros", of_ros), ("swarm", of_swarm)):
-            found = ask(cell)
-            if found is None:
-                unanswered += 1
-            else:
-                took_ms[name].append(found)
-            time.sleep(0.003)
-    return _figures(took_ms) | {"unanswered": unanswered}
-
-
-def _figures(took_ms: dict[str, list[float]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, percent in (("p50", 50), ("p99", 99)):
-        ros, swarm = (
-            float(np.percentile(took_ms[side], percent)) if took_ms[side] else math.nan for side in took_ms
-        )
-        found[f"ros_{name}_ms"], found[f"swarm_{name}_ms"] = round(ros, 3), round(swarm, 3)
-        found[f"ratio_{name}"] = round(ros / swarm, 3)
-    return found
-
-
-def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """One row for each figure."""
-    found = table("ROS beside the swarm's own", "<", "ROS", "swarm", "ratio", "wanted")
-    for what, part, name in (
-        ("GetPlan to a target, p50, ms", "plan", "p50"),
-        ("GetPlan to a target, p99, ms", "plan", "p99"),
-        ("goal -> its plan, p50, ms", "goal", "p50"),
-        ("goal -> its plan, p99, ms", "goal", "p99"),
-        ("route query, flood and quiet, p50, ms", "flood", "p50"),
-        ("route query, flood and quiet, p99, ms", "flood", "p99"),
-    ):
-        of = report[part]
-        wanted = _WANTED[part] if (name == "p50") == (part != "flood") else None
-        found.add_row(
-            what, number(of[f"ros_{name}_ms"]), number(of[f"swarm_{name}_ms"]), f"{of[f'ratio_{name}']:.2f}",
-            "" if wanted is None else f"{wanted:g}",
+def _tell(bus: ZenohBus, tick: int, vehicles: int) -> None:
+    for agent in range(vehicles // _PER_AGENT):
+        author = f"a{agent}.1"
+        numbers = np.arange(_PER_AGENT)
+        east_m = 500.0 + 40.0 * numbers + tick * 10.0 / _HZ
+        south_m = np.full(_PER_AGENT, 500.0 + 100.0 * agent)
+        cells = (south_m // GRID.resolution_m).astype(int) * GRID.cols + (east_m // GRID.resolution_m).astype(int)
+        ids = [f"a{agent}-{n:02d}" for n in numbers]
+        fleet = Fleet(
+            author=author, group="all", region=agent, seq=tick, stamp_ns=time.time_ns(), ids=ids, target_ids=["t0"],
+            cells=pack_column(cells, "<u4"), east_m=pack_column(east_m, "<f4"),
+            south_m=pack_column(south_m, "<f4"), heading_rad=pack_column(np.full(_PER_AGENT, np.pi / 2), "<f4"),
+            states=bytes([VehicleState.FOLLOWING] * _PER_AGENT), targets=bytes(_PER_AGENT),
         )  # fmt: skip
-    yield found
-    yield f"The flood was {report['flood']['messages']} messages at {report['flood']['hz']} a second."
+        bus.publish(FLEET, fleet, region=agent, author=author)
+        for n in range(tick % int(_NEW_ROUTE_S * _HZ), _PER_AGENT, int(_NEW_ROUTE_S * _HZ)):
+            steps = bytes((np.arange(_ROUTE_CELLS) // 7 % 2 + 2).astype(np.uint8))  # east and south-east
+            followed = Followed(
+                vehicle=ids[n], target="t0", start=int(cells[n]), directions=steps, cost_s=1.0, lower_bound_s=1.0
+            )
+            bus.publish(FOLLOWED, followed, agent=f"a{agent}", vehicle=ids[n])
+    for n in range(_MARK_SETS_A_TICK):
+        tile = (tick * _MARK_SETS_A_TICK + n) % GRID.tiles
+        marks = some_set(tile, tick, _MARKS, author="all.a0.1")
+        bus.publish(MARKS, marks, region=GRID.region_of_tile(tile), tile=tile, author=marks.author)
+
+
+@contextlib.contextmanager
+def _gateway(swarm: str, ros: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    program = "import sys; from launch_scripts.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "ros2", "--connect", swarm, "--namespace", "bench", "--ros", ros]
+    with (folder / "ros2.log").open("w") as log:
+        process = subprocess.Popen([*command, "--runs", str(folder)], stdout=log, stderr=log, text=True)
+    try:
+        until_s = time.monotonic() + _START_S
+        while "run bench" not in (said := (folder / "ros2.log").read_text()):
+            if process.poll() is not None or time.monotonic() > until_s:
+                raise SwarmError(f"the gateway does not start: {said.strip()}")
+            time.sleep(0.1)
+        yield process
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+@benchmark()
+def ros2(
+    vehicles: Annotated[int, typer.Option(min=25, help="A multiple of 25.")] = 100,
+    seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 20.0,
+) -> dict[str, Any]:
+    """CPU that `swarm ros2` takes for many vehicles, each at 10 Hz, with plans, map and markers.
+
+    \b
+    ./launch_scripts/bench ros2 --vehicles 100
+
+    As a share of one core, and what a hearer of all topics gets meanwhile.
+    """
+    from launch_scripts.gateways.ros2.node import close_ros, open_ros
+
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    ros_side = NetworkConfig(namespace="ros", listen=(endpoint,), connect=(endpoint,))
+    heard: Counter[str] = Counter()
+    with Far() as far, open_bus(ros_side, mode="router"), tempfile.TemporaryDirectory() as folder:
+        far.start(swarm_peer, vehicles, 2 * _START_S + seconds)
+        hearer = open_ros(endpoint)
+        try:
+            subscriber = hearer.declare_subscriber("0/**", lambda sample: heard.update([str(sample.key_expr)]))
+            with _gateway(far.network.connect[0], endpoint, Path(folder)) as process:
+                time.sleep(_WARM_S)
+                before, gateway = heard.copy(), psutil.Process(process.pid)
+                used, began_s = gateway.cpu_times(), time.monotonic()
+                for _ in track(range(10)):
+                    time.sleep(seconds / 10)
+                now, took_s = gateway.cpu_times(), time.monotonic() - began_s
+                spent_s = now.user + now.system - used.user - used.system
+                heard.subtract(before)
+            del subscriber
+        finally:
+            close_ros(hearer)
+    rows = Counter[str]()
+    for key, times in heard.items():
+        rows[key.split("/")[-3]] += times
+    odom_hz = rows["odom"] / vehicles / took_s
+    return {
+        "vehicles": vehicles,
+        "cpu_percent_of_a_core": round(100 * spent_s / took_s, 1),
+        "messages_per_s": round(heard.total() / took_s),
+        "odom_hz_per_vehicle": round(odom_hz, 2),
+        "cpu_us_per_message": round(1e6 * spent_s / max(heard.total(), 1), 1),
+        "heard": [{"topic": topic, "per_s": round(times / took_s, 1)} for topic, times in rows.most_common()],
+    }
