@@ -67,7 +67,6 @@ app = typer.Typer(
 Seed = Annotated[int, typer.Option(min=0, max=2**53, help="Seed of everything random.")]
 
 _MACHINE = ("cores", "machine", "python", "load")
-_WIDTH = 80
 _T = TypeVar("_T")
 _bar: Progress | None = None
 """The progress of the benchmark which runs as a command."""
@@ -292,13 +291,14 @@ def _cell(value: Any) -> str:
 
 
 def _print(tables: Sequence[tuple[str, list[str], list[list[str]]]], notes: Iterable[str], report: Any) -> None:
-    console = Console(soft_wrap=False, highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
+    console = Console(highlight=False)
     for title, headings, cells in tables:
         table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
         table.show_header = bool(title)
         table.padding = (0, 1, 0, 0)
         for n, heading in enumerate(headings):
-            table.add_column(heading, justify="right" if n and title else "left", overflow="fold")
+            widest = max(map(len, heading.split()), default=1)
+            table.add_column(heading, justify="right" if n and title else "left", overflow="fold", min_width=widest)
         for line in cells:
             table.add_row(*line)
         console.print(table)

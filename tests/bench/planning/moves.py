@@ -88,7 +88,9 @@ class _Walk:
         self.took_ms[what].append((time.thread_time_ns() - began_ns) / 1e6)
 
 
-@benchmark()
+@benchmark(
+    columns=("course", "by", "p50_ms", "mean_ms", "p95_ms", "ratio_p50", "ratio_mean", "gave_way", "bit_equal")
+)
 def moves(
     size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
     field: FieldOption = "terrain",

@@ -27,8 +27,8 @@ from swarm.config.scenario import NetworkConfig
 from swarm.errors import SwarmError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, RUN
 

@@ -1,31 +1,27 @@
-"""`swarm bench`: each command runs small, its JSON has the promised shape, its figures keep what must hold."""
+"""Benchmarks of planning run small, and their figures keep what must hold."""
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
-from bench.cli import app
-from bench.isolated import measure
+from bench.isolated import isolated
 from bench.planning import library_adapters as rivals
 from bench.planning.certificate_checks import LAWS
 from bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
-from bench.planning.cold_start import tables
 from bench.planning.fields import FIELDS, Field, make_field
-from bench.planning.scale import points_of
-from bench.planning.tree_process import MODULE
-from bench.wire import partition
-from rich.console import Console
-from typer.testing import CliRunner
+from bench.planning.peers import tree_memory_mb
+from bench.planning.strategies import points_of
+from support.benchmarks import assert_fits, bench, run
 
 from planner_service.tree.bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
-from swarm.errors import ConfigError, SwarmError, TerrainError
+from swarm.errors import TerrainError
 from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, RouteStatus
 
 STRATEGIES = (
@@ -39,55 +35,26 @@ STRATEGIES = (
 DEM = Path(__file__).parents[4] / "shared" / "data" / "dem"
 
 
-def bench(*words: str) -> dict[str, Any]:
-    done = CliRunner().invoke(app, [*words, "--json"], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    report: dict[str, Any] = json.loads(done.stdout)
-    return report
-
-
-def words_of(*words: str) -> str:
-    done = CliRunner().invoke(app, list(words), catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.output
-
-
-def assert_fits(text: str) -> None:
-    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80, text
-    assert "…" not in text, text
-
-
 # --- peers -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("field", FIELDS)
 def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) -> None:
     report = bench("peers", "--size", "96", "--field", field, "--repeats", "3", "--no-memory")
-    assert list(report)[:8] == [
-        *("size", "field", "ours_ms", "breadth_first_ms", "peers", "ratios", "agreement", "memory_mb"),
-    ]
-    assert report["size"] == 96
-    assert report["field"] == field
+    rows = {row["library"]: row for row in report["rows"]}
     peers = set(rivals.present_peers("paper"))
     assert {"scipy.csgraph.dijkstra", "skimage.graph.MCP"} <= peers
-    assert peers == set(report["peers"]) == set(report["ratios"]) == set(report["agreement"])
+    assert set(rows) == {"ours", "breadth_first", *peers}
     for name in peers:
-        assert report["ratios"][name] == pytest.approx(report["peers"][name] / report["ours_ms"], rel=0.05)
-        assert report["agreement"][name] < (1e-3 if name.startswith("tcod") else 1e-5), name
-    assert report["over_breadth_first"] == pytest.approx(report["ours_ms"] / report["breadth_first_ms"], rel=0.1)
+        assert rows[name]["over_ours"] == pytest.approx(rows[name]["cpu_ms"] / rows["ours"]["cpu_ms"], rel=0.05)
+        assert rows[name]["differs_from_ours"] < (1e-3 if name.startswith("tcod") else 1e-5), name
 
 
 def test_with_octile_edges_scipy_agrees() -> None:
     report = bench("peers", "--size", "64", "--edge", "octile", "--repeats", "1", "--no-memory")
-    assert report["agreement"]["scipy.csgraph.dijkstra"] < 1e-5
-    assert not any(name.startswith("dijkstra3d") for name in report["peers"])
-
-
-@pytest.mark.slow
-def test_peers_show_a_table_with_versions_and_memory() -> None:
-    text = words_of("peers", "--size", "64", "--repeats", "1")
-    assert_fits(text)
-    assert rivals.versions()["scipy"] in text
+    rows = {row["library"]: row for row in report["rows"]}
+    assert rows["scipy.csgraph.dijkstra"]["differs_from_ours"] < 1e-5
+    assert not any(name.startswith("dijkstra3d") for name in rows)
 
 
 def test_a_peer_that_is_not_installed_is_said_to_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,28 +62,23 @@ def test_a_peer_that_is_not_installed_is_said_to_be_left_out(monkeypatch: pytest
     monkeypatch.setattr(
         rivals.importlib.util, "find_spec", lambda name: None if name in rivals.EXTRA else find(name)
     )
-    done = CliRunner().invoke(app, ["peers", "--size", "64", "--repeats", "1", "--no-memory", "--json"])
-    assert done.exit_code == 0
-    for name in rivals.EXTRA:
-        assert f"{name} is not installed, so it is not measured: `uv sync --extra bench` brings it." in done.stderr
-    report = json.loads(done.stdout)
-    assert report["missing"] == list(rivals.EXTRA)
-    assert set(report["peers"]) == {"scipy.csgraph.dijkstra", "skimage.graph.MCP"}
+    report = bench("peers", "--size", "64", "--repeats", "1", "--no-memory")
+    assert report["notes"] == [
+        f"{name} is not installed, so it is not measured: `uv sync --extra bench` brings it."
+        for name in rivals.EXTRA
+    ]
+    libraries = {row["library"] for row in report["rows"]}
+    assert libraries == {"ours", "breadth_first", "scipy.csgraph.dijkstra", "skimage.graph.MCP"}
 
 
 def test_the_peak_of_memory_is_what_a_tree_needs(tmp_path: Path) -> None:
     """Padded weights, costs and parents take 9 bytes a cell; no more than five times that is passed through."""
     pace = make_field("uniform", 1024)
     np.save(tmp_path / "pace.npy", pace)
-    found = measure(MODULE, "memory", str(tmp_path / "pace.npy"), "ours", "5000", "paper")["mb"]
+    found = isolated(tree_memory_mb, str(tmp_path / "pace.npy"), "ours", 5000, "paper")
     if found is None:
         pytest.skip("the system does not tell a process's peak of memory")
     assert 9 * pace.size / 1e6 <= found <= 45 * pace.size / 1e6
-
-
-def test_a_process_that_fails_is_told_in_a_sentence() -> None:
-    with pytest.raises(SwarmError, match="exit code 1: expected memory FIELD"):
-        measure(MODULE, "nonsense")
 
 
 def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
@@ -212,15 +174,15 @@ def test_certificates_are_checked_by_a_command() -> None:
     report = bench("certificates", "--checks", "2000", "--seed", "3")
     assert report["checks"] >= 2000
     assert report["violations"] == 0
-    assert set(report["laws"]) == set(LAWS)
+    assert [row["law"] for row in report["laws"]] == list(LAWS)
 
 
 def test_the_command_says_which_life_broke_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
     true = LowerBounds.at
     monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1e9)
-    done = CliRunner().invoke(app, ["certificates", "--checks", "2000", "--seed", "4", "--json"])
+    done = run("certificates", "--checks", "2000", "--seed", "4", "--json")
     assert done.exit_code == 1
-    found = json.loads(done.stdout)["laws"]["bound"]
+    [found] = [row for row in json.loads(done.stdout)["laws"] if row["law"] == "bound"]
     assert found["violations"] > 0
     assert found["seed"] == 4
 
@@ -241,7 +203,8 @@ def test_targets_that_do_not_fit_into_memory_are_run_in_groups(monkeypatch: pyte
     plan = Plan(targets=5, vehicles=10, frames=4, probes=20)
     entrants = {"full": PlannerConfig(strategy="full")}
     assert chase(field, entrants, plan)["full"].batches == 1
-    monkeypatch.setattr("bench.planning.chase.memory_free", lambda: 0)
+    none = psutil.virtual_memory()._replace(available=0)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: none)
     tally = chase(field, entrants, plan)["full"]
     assert tally.batches == 5
     assert len(tally.frame_ms) == 4
@@ -286,17 +249,25 @@ def test_the_paper_s_tables_have_its_rows() -> None:
     assert [(row["targets"], row["vehicles"]) for row in report["table_1"]] == [
         (targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)
     ]
-    assert {row["strategy"] for row in report["table_2"]} == set(STRATEGIES)
-    assert [row["printed_s"] for row in report["table_1"]] == [
-        *(0.0102, 0.0103, 0.0104, 0.0470, 0.0480, 0.0490, 0.0802, 0.0848, 0.0882),
+    assert [row["printed_ms"] for row in report["table_1"]] == [
+        10.2,
+        10.3,
+        10.4,
+        47.0,
+        48.0,
+        49.0,
+        80.2,
+        84.8,
+        88.2,
     ]
-    assert {row["strategy"]: row["printed_s"] for row in report["table_2"] if row["printed_s"]} == {
-        "full": 0.8926,
-        "variable_range": 0.3194,
-        "variable_range+multi_resolution": 0.0882,
+    assert {row["strategy"]: row["printed_ms"] for row in report["table_2"]} == {
+        **dict.fromkeys(STRATEGIES),
+        "full": 892.6,
+        "variable_range": 319.4,
+        "variable_range+multi_resolution": 88.2,
     }
-    assert "16 R10000 processors" in report["printed"]["on"]
-    assert "does not state all of its motion, its k_min and its block rule" in report["printed"]["not_stated"]
+    assert "16 R10000 processors" in report["notes"][0]
+    assert "does not state all of its motion, its k_min and its block rule" in report["notes"][1]
     exact = next(row for row in report["table_2"] if row["strategy"] == "full")
     assert exact["gap_max"] < 1 + 1e-5
     assert exact["updates"] == {"full": 60}
@@ -325,42 +296,34 @@ def test_scale_has_a_row_per_point_and_strategy_and_draws_them(tmp_path: Path) -
     assert larger[128, "full"] > larger[32, "full"]
 
 
-def test_gap_draws_a_picture(tmp_path: Path) -> None:
-    picture = tmp_path / "gap.png"
-    bench(
-        *("gap", "--dem", "maze", "--frames", "4", "--runs", "2", "--strategies", "full,variable_range"),
-        *("--walk", "random,evade", "--vehicles", "20", "--picture", str(picture)),
-    )
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
 @pytest.mark.parametrize(
     "words",
     [
-        ("paper", "--size", "48", "--frames", "6"),
-        ("scale", "--sizes", "32", "--targets", "2", "--vehicles", "10", "--frames", "4"),
-        ("gap", "--dem", "uniform", "--frames", "4", "--runs", "1"),
+        "paper --size 48 --frames 6",
+        "scale --sizes 32 --targets 2 --vehicles 10 --frames 4",
+        "gap --dem uniform --frames 4 --runs 1",
+        "peers --size 64 --repeats 1 --no-memory",
+        "moves --size 64 --moves 2",
+        "kernels --size 64 --repeats 1",
+        "certificates --checks 100",
+        "compaction --lives 2",
+        "presence --vehicles 25 --rounds 1",
     ],
-    ids=["paper", "scale", "gap"],
 )
-def test_tables_fit_into_eighty_columns(words: tuple[str, ...]) -> None:
-    assert_fits(words_of(*words))
+def test_tables_fit_into_eighty_columns(words: str) -> None:
+    assert_fits(*words.split())
 
 
 @pytest.mark.slow
 @pytest.mark.thorough
 def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
     report = bench("start", "--size", "64", "--runs", "1", "--no-kernels")
-    assert [row["until"] for row in report["rows"]] == ["tree", "tree", "route", "route"]
+    assert [row["cache"] for row in report["rows"]] == ["cold", "warm", "cold", "warm"]
     for cold, warm in (report["rows"][:2], report["rows"][2:]):
         assert (cold["cache"], warm["cache"]) == ("cold", "warm")
         assert cold["cpu_s"] > 1.5 * warm["cpu_s"] > 0
     # The first tree takes some kernels, and builders go on to the last of them.
     assert report["rows"][0]["compiled"] < report["kernels"] <= report["rows"][2]["compiled"]
-    console = Console(width=80, record=True, file=io.StringIO())
-    for part in tables(report):
-        console.print(part)
-    assert_fits(console.export_text())
 
 
 # --- the map and its fleets --------------------------------------------------------------------------------------
@@ -370,64 +333,12 @@ def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> N
     without, compacted = bench("compaction", "--lives", "8")["rows"]
     assert (without["compact"], compacted["compact"]) == ("no", "yes")
     assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
-    assert_fits(words_of("compaction", "--lives", "2"))
 
 
 def test_presence_has_a_row_per_number_of_vehicles() -> None:
     report = bench("presence", "--vehicles", "25,50", "--rounds", "3")
     assert [row["vehicles"] for row in report["rows"]] == [25, 50]
     assert all(value >= 0 for row in report["rows"] for value in row.values())
-    assert_fits(words_of("presence", "--vehicles", "25", "--rounds", "1"))
-
-
-def test_a_machine_that_cannot_play_two_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(partition, "why_not", lambda: "there is no command ip (iproute2)")
-    with pytest.raises(SwarmError, match=r"this machine cannot run two network namespaces: there is no command ip"):
-        CliRunner().invoke(app, ["partition", "--rounds", "1"], catch_exceptions=False)
-
-
-# --- what a user may do wrong ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (("peers", "--field", "moon"), "field 'moon' is neither of terrain, uniform, maze nor a file"),
-        (("peers", "--edge", "4"), "--edge is '4', expected paper or octile"),
-        (("gap", "--dem", "no/such.tif"), "field 'no/such.tif' is neither of"),
-        (("gap", "--walk", "fly"), "--walk: 'fly' is not one of random, waypoints, evade"),
-        (("gap", "--strategies", "best"), "--strategies: 'best' is not one of auto, exact, full"),
-        (("gap", "--strategies", ","), "--strategies is ','"),
-        (("gap", "--dem", "maze", "--vehicles", "999999"), "--vehicles is 999999; the field has"),
-        (("gap", "--picture", "no/such/gap.png"), "--picture is no/such/gap.png: there is no folder"),
-        (("scale", "--picture", "scale.pdf"), "expected a name that ends in .png"),
-        (("presence", "--vehicles", "24"), "--vehicles is '24', expected numbers of at least 25"),
-        (("scale", "--sizes", "0"), "--sizes is '0', expected numbers of at least 16"),
-        (("scale", "--targets", "many"), "--targets is 'many', expected numbers of at least 1"),
-        (("scale", "--field", "a.tif"), "--field is 'a.tif', expected terrain, uniform, maze"),
-        (("scale", "--sizes", "16", "--targets", "999", "--vehicles", "1"), "--targets is 999; the field has"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
-)
-def test_bad_input_is_one_sentence(words: tuple[str, ...], complaint: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        CliRunner().invoke(app, list(words), catch_exceptions=False)
-    assert complaint in str(caught.value)
-    assert caught.value.exit_code == 2
-
-
-@pytest.mark.parametrize("words", [("peers", "--size", "0"), ("gap", "--frames", "0"), ("start", "--runs", "x")])
-def test_a_number_out_of_range_is_refused_by_name(words: tuple[str, ...]) -> None:
-    done = CliRunner().invoke(app, list(words))
-    assert done.exit_code == 2
-    assert words[1] in done.stderr
-
-
-@pytest.mark.parametrize("command", ["peers", "start", "paper", "scale", "gap"])
-def test_help_teaches_with_an_example(command: str) -> None:
-    assert f"./launch_scripts/bench {command}" in words_of(command, "--help").replace(
-        f"Usage: ./launch_scripts/bench {command}", "", 1
-    )
 
 
 def test_exact_moves_are_those_that_would_have_grown_and_are_counted() -> None:
@@ -447,3 +358,18 @@ def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance(
     assert report["lowest_m"] >= report["clearance_m"]
     assert 1.0 <= report["over_stack_mean"] <= report["over_stack_p95"] < 2
     assert report["worst_over_scipy"] < 1e-3
+
+
+@pytest.mark.parametrize("field", ["terrain", "maze"])
+def test_kernels_are_measured_and_a_repair_gives_way_to_a_growth_at_most(field: str) -> None:
+    report = bench("kernels", "--size", "96", "--field", field, "--repeats", "2", "--side", "5")
+    assert report["size"] == [96, 96]
+    assert {row["change"] for row in report["repairs"]} == {
+        *("x 0.7", "x 1.5", "x 3", "lethal", "mark", "lethal mark")
+    }
+    for row in report["repairs"]:
+        assert 0 < row["p50_us"] <= row["p95_us"] <= row["max_us"]
+        assert row["given_way"] is None or 0 <= row["given_way"] <= 1
+    one, *_, thousand = report["routes"]
+    assert (one["at_once"], thousand["at_once"]) == (1, 1000)
+    assert 0 < thousand["us_each"] < one["us_each"]

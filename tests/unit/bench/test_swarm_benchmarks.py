@@ -1,33 +1,28 @@
-"""`bench swarm` and `bench crowd`: sizes, what is read out of counters, exponents, the page."""
+"""`bench swarm` and `bench crowd`: sizes, what is read out of counters, exponents, what is shown."""
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import multiprocessing
 import time
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from bench.cli import app
-from bench.whole_swarm import crowd, series
-from bench.whole_swarm.figures import LIVE, SIMULATED, Figure, exponent, exponents, topic_figures
-from bench.whole_swarm.page import write_sizes
+from bench.whole_swarm import crowd, sizes
 from bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
+from bench.whole_swarm.sizes import LIVE, SIMULATED, Figure, exponent, exponents, topic_figures
 from bench.whole_swarm.stats_window import StatsWindow, ticks
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
-from typer.testing import CliRunner
+from support.benchmarks import assert_fits, bench
 
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.simulation.campaign import in_processes
 from swarm.config.agents import plan_agents
-from swarm.errors import ConfigError, SwarmError
+from swarm.errors import SwarmError
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.processes import Stats
@@ -76,48 +71,6 @@ def test_agents_or_vehicles_of_an_agent_may_be_given() -> None:
     assert size_of(1000, agents=40).per_agent == 25
 
 
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        (["--vehicles", "0"], "--vehicles is '0', expected numbers of at least 1"),
-        (["--vehicles", "10,many"], "--vehicles is '10,many'"),
-        (["--vehicles", "100001"], "--vehicles is 100001, expected 1 to 100000"),
-        (["--vehicles", "10", "--series"], "--series is --vehicles 100,300,1000,3000,10000: give one of the two"),
-        (["--targets", "0"], "--targets is 0, expected 1 to 1000"),
-        (["--agents", "3", "--per-agent", "4"], "--agents and --per-agent: give at most one"),
-        (["--vehicles", "10", "--agents", "11"], "--agents is 11, expected 1 to 10"),
-        (["--vehicles", "5000", "--agents", "4"], "--agents is 4, expected 5 or more"),
-        (["--per-agent", "1001"], "--per-agent is 1001, expected 1 to 1000"),
-        (["--size", "20"], "--size is 20, expected 32 to 16384"),
-        (["--vehicles", "1000", "--size", "40"], "--size is 40, expected 64 or more for 1000 vehicles"),
-        (["--tick-hz", "0"], "--tick-hz is 0, expected 0.1 to 100"),
-        (["--tick-hz", "nan"], "--tick-hz is nan"),
-        (["--write", "page.txt"], "--write is page.txt, expected a name that ends in .md"),
-        (["--write", "no/such/folder/page.md"], "in a folder that is there"),
-    ],
-)
-def test_an_option_of_bench_swarm_that_cannot_be_is_named(options: list[str], complaint: str) -> None:
-    ran = CliRunner().invoke(app, ["swarm", *options])
-    assert isinstance(ran.exception, ConfigError)
-    assert complaint in str(ran.exception)
-
-
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        (["--worlds", "open,sea"], "--worlds: 'sea' is not one of open, doors, corridor, maze"),
-        (["--seeds", "5"], "--seeds: '5' is not A:B"),
-        (["--seeds", "5:5"], "--seeds: '5:5' is not A:B"),
-        (["--vehicles", "4", "--agents", "5"], "--agents is 5, expected at most as many as --vehicles, 4"),
-        (["--vehicles", "401"], "--vehicles is 401, expected at most a quarter of 40 x 40 cells"),
-    ],
-)
-def test_an_option_of_bench_crowd_that_cannot_be_is_named(options: list[str], complaint: str) -> None:
-    ran = CliRunner().invoke(app, ["crowd", *options])
-    assert isinstance(ran.exception, ConfigError)
-    assert complaint in str(ran.exception)
-
-
 # --- exponents ---------------------------------------------------------------------------------------------------
 
 
@@ -150,20 +103,14 @@ def test_a_run_that_is_late_is_left_out_of_exponents_and_named() -> None:
     figure = Figure("cpu_all_ms_per_s", "CPU", fitted=True)
     assert exponents([figure], rows)["cpu_all_ms_per_s"] == pytest.approx(1.0)
     report = {"simulated": False, "rows": rows, "interrupted": False, "exponents": {}}
-    [remark] = series.remarks(report)
+    [remark] = sizes.remarks(report)
     assert "fitted without 400 vehicles" in remark
 
 
-@pytest.mark.parametrize(
-    ("value", "times", "shown"),
-    [(None, 1, "-"), (0, 1, "0"), (0.0, 100, "0"), (3, 1, "3"), (0.01234, 100, "1.23"), (12_345.6, 1, "12,346")],
-)
-def test_a_figure_is_shown_with_three_digits_and_one_that_was_not_measured_by_a_stroke(
-    value: float | None, times: float, shown: str
-) -> None:
-    figure = Figure("a.b", "b", times=times)
-    assert figure.shown({"a": {"b": value}}) == shown
-    assert figure.shown({"a": {}}) == figure.shown({}) == "-"
+def test_a_figure_is_found_by_its_path_and_shown_in_its_unit() -> None:
+    one = Figure("a.b", "b", times=100)
+    assert one.shown({"a": {"b": 0.01234}}) == "1.23"
+    assert one.shown({"a": {"b": None}}) == one.shown({"a": {}}) == one.shown({}) == "-"
 
 
 def test_labels_and_five_sizes_fit_into_eighty_columns() -> None:
@@ -222,64 +169,24 @@ def test_of_nobody_no_share_is_told() -> None:
     assert found["late_share"] is found["worst_late_share"] is found["p50_ms"] is None
 
 
-# --- the page ----------------------------------------------------------------------------------------------------
+# --- several sizes ----------------------------------------------------------------------------------------------
 
 
-def report(simulated: bool, *rows: dict[str, Any]) -> dict[str, Any]:
-    machine = {"cores": 2, "machine": "a machine", "python": "3.11", "load": 0.1}
-    return {
-        "simulated": simulated,
-        "seconds": 5.0,
-        "interrupted": False,
-        "exponents": {},
-        "rows": [*rows],
-        **machine,
-    }
-
-
-def test_a_run_replaces_the_section_of_its_kind_and_keeps_the_others(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    write_sizes(page, report(True, row(100, times_real_time=4.0)), "first")
-    write_sizes(page, report(False, row(100, up_s=7.0), row(300, up_s=8.0)), "second")
-    several = [{**row(n), "per_agent": 25} for n in (100, 200)]
-    write_sizes(page, report(True, *several), "third")
-    write_sizes(page, report(True, row(1000, times_real_time=0.5)), "fourth")
-    text = page.read_text()
-    headings = [line.removeprefix("## ") for line in text.splitlines() if line.startswith("## ")]
-    assert headings == ["What the rows say", "Live processes", "Simulation", "Simulation, 25 vehicles an agent"]
-    assert "`first`" not in text
-    assert all(f"`{command}`" in text for command in ("second", "third", "fourth"))
-    assert "| up, s | 7 | 8 |  |" in text
-    assert "| times real time, by the clock | 0.500 |" in text
-    again = text
-    write_sizes(page, report(True, row(1000, times_real_time=0.5)), "fourth")
-    assert page.read_text() == again
-
-
-def test_another_page_is_not_written_over(tmp_path: Path) -> None:
-    (tmp_path / "README.md").write_text("# Mine\n")
-    (tmp_path / "page.md").write_bytes(b"\xff\xfe")
-    for name, complaint in (("README.md", "which is another page"), ("page.md", "which cannot be read")):
-        ran = CliRunner().invoke(app, ["swarm", "--vehicles", "5", "--write", str(tmp_path / name)])
-        assert isinstance(ran.exception, ConfigError)
-        assert complaint in str(ran.exception)
-    assert (tmp_path / "README.md").read_text() == "# Mine\n"
-
-
-def test_every_line_of_a_table_has_as_many_cells_as_its_head(tmp_path: Path) -> None:
+def test_topics_are_the_largest_first_and_a_size_that_failed_has_strokes() -> None:
     topics = {"fleet": {"bytes_per_s": 2000.0}, "pose": {"bytes_per_s": 9000.0}}
     rows = [
         row(100, topics=topics),
         row(300, topics={"fleet": {"bytes_per_s": 1.0}}),
         row(1000, failed="no memory"),
     ]
-    assert [figure.label for figure in topic_figures(rows)] == ["pose", "fleet"]
-    write_sizes(tmp_path / "page.md", report(True, *rows), "command")
-    text = (tmp_path / "page.md").read_text()
-    tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
-    assert len(tables) == 3
-    assert all(len({line.count("|") for line in table}) == 1 for table in tables)
-    assert "1,000 vehicles: not measured: no memory." in text
+    figures = topic_figures(rows)
+    assert [figure.label for figure in figures] == ["pose", "fleet"]
+    report = {"rows": rows, "exponents": {figures[1].key: -1.5}, "interrupted": False}
+    assert sizes.lines_of(report, figures) == [
+        {"vehicles": "pose", "100": "9", "300": "-", "1,000": "-", "power": ""},
+        {"vehicles": "fleet", "100": "2", "300": "0.001", "1,000": "-", "power": "-1.50"},
+    ]
+    assert "1,000 vehicles: not measured: no memory." in sizes.remarks(report)
 
 
 def test_what_must_not_be_is_named_and_a_series_goes_on_after_a_size_that_fails(monkeypatch) -> None:
@@ -290,19 +197,18 @@ def test_what_must_not_be_is_named_and_a_series_goes_on_after_a_size_that_fails(
             raise KeyboardInterrupt
         return {"collisions": 2 if size.vehicles == 300 else 0, "lethal_entries": None}
 
-    monkeypatch.setattr(series, "measure_live", measure)
-    told: list[str] = []
-    found = series.run_series([size_of(n) for n in (100, 200, 300, 400, 500)], 1.0, False, told.append)
+    monkeypatch.setattr(sizes, "measure_live", measure)
+    found = sizes.run_sizes([size_of(n) for n in (100, 200, 300, 400, 500)], 1.0, False)
     assert [each["vehicles"] for each in found["rows"]] == [100, 200, 300]
-    assert series.broken(found) == [
+    assert found["heading"] == "Live processes"
+    assert found["broken"] == [
         "interrupted",
         "200 vehicles: not measured: it did not come up",
         "300 vehicles: 2 collisions",
     ]
-    assert "not measured: it did not come up" in told
     json.dumps(found, allow_nan=False)
     with pytest.raises(SwarmError, match="it did not come up"):
-        series.run_series([size_of(200)], 1.0, False, told.append)
+        sizes.run_sizes([size_of(200)], 1.0, False)
 
 
 # --- crowds ------------------------------------------------------------------------------------------------------
@@ -352,11 +258,10 @@ def test_the_worst_wait_of_several_drives_counts_and_shares_are_of_all_vehicles(
     assert found["collisions"] == 0
 
 
-def test_a_small_crowd_is_driven_shown_and_written_into_the_page(tmp_path: Path) -> None:
-    words = "crowd --worlds open --seeds 1:2 --vehicles 12 --agents 3 --size 16 --seconds 8 --jobs 1 --json --write"
-    ran = CliRunner().invoke(app, [*words.split(), str(tmp_path / "page.md")], catch_exceptions=False)
-    assert ran.exit_code == 0, ran.output
-    found = json.loads(ran.stdout)
+def test_a_small_crowd_is_driven() -> None:
+    found = bench(
+        *["crowd", "--worlds", "open", "--seeds", "1:2", "--vehicles", "12", "--agents", "3", "--size", "16", "--seconds", "8", "--jobs", "1"]
+    )
     [drive], [shown] = found["drives"], found["rows"]
     assert (drive["world"], drive["seed"], drive["vehicles"]) == ("open", 1, 12)
     assert drive["simulated_s"] == pytest.approx(8.0)
@@ -364,21 +269,12 @@ def test_a_small_crowd_is_driven_shown_and_written_into_the_page(tmp_path: Path)
     assert drive["longest_wait_s"] < 8.0
     assert drive["arrivals"] > 0
     assert (drive["collisions"], drive["lethal_entries"]) == (0, 0)
-    text = (tmp_path / "page.md").read_text()
-    assert "## Crowds\n\n`./launch_scripts/bench crowd --worlds open --seeds 1:2" in text
-    assert f"| open | {shown['cells_per_step']:.2f} |" in text
-    lines = Console(width=80, file=io.StringIO())
-    for part in crowd.tables(found):
-        lines.print(part)
-    assert isinstance(lines.file, io.StringIO)
-    assert "…" not in lines.file.getvalue()
+    assert_fits(*["crowd", "--worlds", "open,maze", "--seeds", "1:2", "--vehicles", "12", "--agents", "3", "--size", "16", "--seconds", "1"])
 
 
 def test_a_simulated_swarm_is_measured() -> None:
-    options = ["--vehicles", "20", "--targets", "2", "--simulated", "--seconds", "2", "--json"]
-    ran = CliRunner().invoke(app, ["swarm", *options], catch_exceptions=False)
-    assert ran.exit_code == 0, ran.output
-    found = json.loads(ran.stdout)
+    found = bench("swarm", "--vehicles", "20", "--targets", "2", "--simulated", "--seconds", "2")
+    assert found["heading"] == "Simulation"
     [figures] = found["rows"]
     assert figures["simulated_s"] == pytest.approx(2.0)
     assert figures["cpu_all_per_vehicle_ms_per_s"] * 20 == pytest.approx(figures["cpu_all_ms_per_s"])

@@ -1,0 +1,155 @@
+"""The harness of benchmarks: each command runs small, fits 80 columns, and says in a sentence what is wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from bench import harness
+from bench.harness import BENCHMARKS, Lines, benchmark, figure, load
+from bench.isolated import isolated
+from support.benchmarks import bench, run
+
+from swarm.errors import ConfigError, SwarmError
+
+BASE = {"size": 1, "many": 10}
+ROWS = [
+    {"size": size, "many": many, "kind": kind, "took_ms": size * many, "left_out": 1}
+    for kind in ("a", "b")
+    for size, many in ((1, 10), (2, 10), (1, 20))
+]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command group of one benchmark, `made`."""
+    monkeypatch.setattr(harness, "app", typer.Typer())
+    harness.app.callback()(lambda: None)
+
+    @benchmark(
+        "made",
+        columns=("kind", "took_ms"),
+        plot=Lines(("size", "many"), {"took_ms": "ms"}, "kind"),
+        fails=("wrong",),
+    )
+    def made(wrong: int = 0) -> dict[str, Any]:
+        """Nothing."""
+        rows = list(harness.track(ROWS))
+        return {"base": BASE, "rows": rows, "share": 0.123456789, "wrong": wrong, "notes": ["A note."]}
+
+
+def test_each_benchmark_is_listed_and_teaches_with_an_example() -> None:
+    load()
+    listed = run().output
+    for name in BENCHMARKS:
+        assert name in listed
+        assert f"./launch_scripts/bench {name}" in run(name, "--help").output.partition("\n\n")[2]
+
+
+def test_a_report_is_one_object_with_its_machine_or_tables_with_the_chosen_columns(made: None) -> None:
+    report = json.loads(run("made", "--json").stdout)
+    assert report["rows"] == ROWS
+    assert {"cores", "machine", "python", "load"} <= report.keys()
+    text = run("made").output
+    assert "took" in text
+    assert "left" not in text
+    assert "0.12346" in text
+    assert "A note." in text
+
+
+def test_a_figure_that_must_be_nothing_is_the_exit_code(made: None) -> None:
+    assert run("made").exit_code == 0
+    assert run("made", "--wrong", "1").exit_code == 1
+
+
+def test_a_page_gets_the_section_of_the_benchmark_and_keeps_the_others(made: None, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# Mine\n\nText.\n\n## made\n\nold\n\n## other\n\nkept\n")
+    run("made", "--wrong", "0", "--write", str(page))
+    text = page.read_text()
+    assert text.startswith("# Mine\n\nText.\n\n## made\n\n`./launch_scripts/bench made --wrong 0`\n")
+    assert text.endswith("\n\n## other\n\nkept\n")
+    assert "old" not in text
+    assert "| a | 20 |" in text
+    tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
+    assert all(len({line.count("|") for line in table}) == 1 for table in tables)
+    run("made", "--wrong", "0", "--write", str(page))
+    assert page.read_text() == text
+
+
+def test_a_plot_has_a_panel_for_each_axis(made: None, tmp_path: Path) -> None:
+    run("made", "--picture", str(tmp_path / "made.png"))
+    assert (tmp_path / "made.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(None, "-"), (0, "0"), (3.0, "3"), (1.234, "1.23"), (12_345.6, "12,346"), (0.05123, "0.051")],
+)
+def test_a_figure_is_shown_with_three_digits_and_one_that_was_not_measured_by_a_stroke(
+    value: float | None, shown: str
+) -> None:
+    assert figure(value) == shown
+
+
+def fail() -> None:
+    raise ValueError("a reason")
+
+
+def test_a_process_that_fails_is_told_in_a_sentence() -> None:
+    with pytest.raises(SwarmError, match=r"fail failed with exit code 1: .*"):
+        isolated(fail)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("peers --field moon", "field 'moon' is neither of terrain, uniform, maze nor a file"),
+        ("peers --edge 4", "--edge is '4', expected paper or octile"),
+        ("gap --dem no/such.tif", "field 'no/such.tif' is neither of"),
+        ("gap --walk fly", "--walk: 'fly' is not one of random, waypoints, evade"),
+        ("gap --strategies best", "--strategies: 'best' is not one of auto, exact, full"),
+        ("gap --strategies ,", "--strategies is ','"),
+        ("gap --dem maze --vehicles 999999", "--vehicles is 999999; the field has"),
+        ("scale --picture no/such/scale.png", "in a folder that is there"),
+        ("scale --picture scale.pdf", "expected a name that ends in .png"),
+        ("presence --vehicles 24", "--vehicles is '24', expected numbers of at least 25"),
+        ("scale --sizes 0", "--sizes is '0', expected numbers of at least 16"),
+        ("scale --targets many", "--targets is 'many', expected numbers of at least 1"),
+        ("scale --field a.tif", "--field is 'a.tif', expected terrain, uniform, maze"),
+        ("scale --sizes 16 --targets 999 --vehicles 1", "--targets is 999; the field has"),
+        ("wire --parts latency,speed", "'speed' is not one of latency, throughput"),
+        ("crowd --worlds open,sea", "--worlds: 'sea' is not one of open, doors, corridor, maze"),
+        ("crowd --seeds 5", "--seeds: '5' is not A:B"),
+        ("crowd --vehicles 4 --agents 5", "--agents is 5, expected at most as many as --vehicles, 4"),
+        ("crowd --vehicles 401", "--vehicles is 401, expected at most a quarter of 40 x 40 cells"),
+        ("swarm --vehicles 0", "--vehicles is '0', expected numbers of at least 1"),
+        ("swarm --vehicles 10,many", "--vehicles is '10,many'"),
+        ("swarm --vehicles 100001", "--vehicles is 100001, expected 1 to 100000"),
+        ("swarm --vehicles 10 --series", "--series is --vehicles 100,300,1000,3000,10000: give one of the two"),
+        ("swarm --targets 0", "--targets is 0, expected 1 to 1000"),
+        ("swarm --agents 3 --per-agent 4", "--agents and --per-agent: give at most one"),
+        ("swarm --vehicles 10 --agents 11", "--agents is 11, expected 1 to 10"),
+        ("swarm --vehicles 5000 --agents 4", "--agents is 4, expected 5 or more"),
+        ("swarm --per-agent 1001", "--per-agent is 1001, expected 1 to 1000"),
+        ("swarm --size 20", "--size is 20, expected 32 to 16384"),
+        ("swarm --vehicles 1000 --size 40", "--size is 40, expected 64 or more for 1000 vehicles"),
+        ("swarm --tick-hz nan", "--tick-hz is nan"),
+        ("swarm --write page.txt", "--write is page.txt, expected a name that ends in .md"),
+    ],
+)
+def test_bad_input_is_one_sentence(words: str, complaint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        bench(*words.split())
+    assert complaint in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("words", ["peers --size 0", "gap --frames 0", "start --runs x"])
+def test_a_number_out_of_range_is_refused_by_name(words: str) -> None:
+    done = run(*words.split())
+    assert done.exit_code == 2
+    assert words.split()[1] in done.stderr
