@@ -353,7 +353,7 @@ def _draw(plot: Lines, report: dict[str, Any], path: Path) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    from launch_scripts.observe.plot_style import STYLE
+    from launch_scripts.observe.palette import STYLE
 
     base, rows = report["base"], report["rows"]
     with mpl.rc_context(STYLE):

@@ -7,12 +7,14 @@ Nothing is imported here but what the interpreter has loaded anyway, so that a p
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -55,6 +57,8 @@ class TimeLimit:
 
 def peak_bytes(work: Callable[[], object]) -> int:
     """By how much the resident memory of this process rises at most. Raises OSError where it is not known."""
+    with suppress(OSError, AttributeError):  # only glibc has it: what was freed before is not to be taken again
+        ctypes.CDLL(None).malloc_trim(0)
     # The kernel alone keeps the highest mark, and psutil does not read it. It starts again at what is resident now.
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     before = status_bytes("VmRSS")

@@ -8,8 +8,8 @@ from collections.abc import Collection
 from typing import Any
 
 import msgpack
+from support.message_fuzzer import MessageFuzzer
 
-from chaos.lies import Lies
 from swarm.wire.codec import encode
 from swarm.wire.topics import TOPICS
 
@@ -31,10 +31,15 @@ class Hostile:
     """
 
     def __init__(
-        self, namespace: str, lies: Lies, seed: int, kinds: Collection[str] = KINDS, spared: Collection[str] = ()
+        self,
+        namespace: str,
+        fuzzer: MessageFuzzer,
+        seed: int,
+        kinds: Collection[str] = KINDS,
+        spared: Collection[str] = (),
     ) -> None:
         self._namespace = namespace
-        self._lies = lies
+        self._fuzzer = fuzzer
         self._kinds = [kind for kind in KINDS if kind in kinds]
         self._chance = random.Random(f"hostile/{seed}")
         self._spared = [topic for topic in TOPICS if topic.name in spared]
@@ -59,8 +64,13 @@ class Hostile:
         kind = chance.choice(self._kinds)
         if kind == "lies" or not self._keys:
             topic = chance.choice(self._topics)
-            message = self._lies.lie(topic.message)
-            return "lies", topic.keyed(self._namespace, **self._lies.fields(topic, message)), encode(message), None
+            message = self._fuzzer.message(topic.message)
+            return (
+                "lies",
+                topic.keyed(self._namespace, **self._fuzzer.fields(topic, message)),
+                encode(message),
+                None,
+            )
         key = chance.choice(self._keys)
         payload, code = chance.choice(self._heard[key])
         if kind == "flipped":

@@ -1,4 +1,4 @@
-"""After a blow: since when do vehicles move, and have routes, again. Pure."""
+"""After a fault: since when do vehicles move, and have routes, again. Pure."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ class _Report:
 class Recovery:
     """Watches the vehicles of a run.
 
-    Times are seconds on one clock. A blow ends at `over`; a vehicle is routed again with the first report from then
-    on which says that it follows a route or has arrived, and moves again with the first one from another place.
+    Times are seconds on one clock. A fault ends at `over`; a vehicle is routed again with the first report from
+    then on which says that it follows a route or has arrived, and moves again with the first one from another
+    place.
     """
 
     def __init__(self, vehicles: Iterable[str]) -> None:
@@ -32,7 +33,7 @@ class Recovery:
         self._last: dict[str, _Report] = {}
         self._over_s: float | None = None
         self._stood: dict[str, tuple[float, float]] = {}
-        """Vehicle -> its place in the first report since the blow was over."""
+        """Vehicle -> its place in the first report since the fault was over."""
         self._routed_s: dict[str, float] = {}
         self._moved_s: dict[str, float] = {}
 
@@ -42,7 +43,7 @@ class Recovery:
         return len(self._last) >= len(self._vehicles)
 
     def over(self, at_s: float) -> None:
-        """The blow is over: count from now."""
+        """The fault is over: count from now."""
         self._over_s = at_s
         self._stood.clear()
         self._routed_s.clear()

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from bench.planning.kernels import paces_of_any_ratio
 from bench.planning.fields import make_field
+from bench.planning.kernels import paces_of_any_ratio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 import rerun as rr
-from chaos.lies import NAMES, ROLES, Lies
 from support.effort import few
 from support.liar import Liar, asked, published
+from support.message_fuzzer import NAMES, ROLES, MessageFuzzer
 from support.swarm_model import SwarmModel
 from support.wire_strategies import types_of_the_wire
 
@@ -160,8 +160,8 @@ class Lied(SwarmModel):
         self.promises = {id: MemoryPromiseStore(n) for n, id in enumerate(agents, 1)}
         classes = [each.name for each in scenario.classes]
         names = tuple(dict.fromkeys((*NAMES, *NAMED, *AUTHORS)))
-        lies = Lies(terrain.grid, seed, names, classes, lambda: self.now_ns)
-        self.liar = Liar(self.bus("liar"), lies, seed)
+        fuzzer = MessageFuzzer(terrain.grid, seed, names, classes, lambda: self.now_ns)
+        self.liar = Liar(self.bus("liar"), fuzzer, seed)
         for role in ROLES:
             for id in {"agent": agents, "planner": planners}.get(role, ["0"]):
                 if not (role == "targets" and state == "without target"):

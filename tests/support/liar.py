@@ -6,7 +6,7 @@ import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 
-from chaos.lies import Lies
+from support.message_fuzzer import MessageFuzzer
 
 from swarm.bus.bus import Asked, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryBus
@@ -21,9 +21,9 @@ _KEPT = 20
 class Liar:
     """Tells lies from a bus of its own."""
 
-    def __init__(self, bus: MemoryBus, lies: Lies, seed: int) -> None:
+    def __init__(self, bus: MemoryBus, fuzzer: MessageFuzzer, seed: int) -> None:
         self.bus = bus
-        self.lies = lies
+        self.fuzzer = fuzzer
         self._chance = random.Random(f"liar/{seed}")
         self._heard: dict[str, deque[tuple[dict[str, str], Message]]] = defaultdict(lambda: deque(maxlen=_KEPT))
         """Topic -> what was put and answered last, with the fields of its key."""
@@ -46,11 +46,11 @@ class Liar:
         """A lie of this type, and the fields of its key."""
         known = [(fields, each) for fields, each in self._heard[topic.name] if type(each) is kind]
         if not known or self._chance.random() < 0.5:
-            message = self.lies.lie(kind)
+            message = self.fuzzer.message(kind)
             self._own.add(encode(message))
-            return message, self.lies.fields(topic, message)
+            return message, self.fuzzer.fields(topic, message)
         fields, heard = self._chance.choice(known)
-        message = self.lies.altered(heard)
+        message = self.fuzzer.altered(heard)
         self._own.add(encode(message))
         said = {name: value for name in topic.fields if (value := getattr(message, name, None)) is not None}
         self.altered += 1
@@ -88,7 +88,7 @@ class Liar:
             self.bus.serve(topic, answer)
 
     def token(self, role: str) -> None:
-        self.bus.declare_alive(self.lies.token(role))
+        self.bus.declare_alive(self.fuzzer.token(role))
 
 
 def published() -> Iterator[Topic]:

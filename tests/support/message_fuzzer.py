@@ -1,4 +1,7 @@
-"""Well-formed lies: any message that decodes, made of the bounds in its type."""
+"""Messages of every type of the wire, at random: any that decodes, made of the bounds in its type.
+
+Tests draw them as properties (`wire_strategies`), services are lied to with them, and a live swarm is attacked.
+"""
 
 from __future__ import annotations
 
@@ -51,13 +54,13 @@ _TRIES = 1000
 M = TypeVar("M")
 
 
-class Lies:
-    """Makes lies from a seed: the same seed, the same lies.
+class MessageFuzzer:
+    """Makes messages from a seed: the same seed, the same messages.
 
-    grid     lies name cells, tiles and places in it, at its end and beyond
-    names    ids that lies use: of those who exist, and others
+    grid     messages name cells, tiles and places in it, at its end and beyond
+    names    ids that are used: of those who exist, and others
     classes  of vehicles beside "ground", in the order of their numbers
-    now_ns   of the clock around which lies are stamped
+    now_ns   of the clock around which messages are stamped
     """
 
     def __init__(
@@ -78,8 +81,8 @@ class Lies:
         self._chance = random.Random(seed)
 
     def fields(self, topic: Topic, message: Message) -> dict[str, Any]:
-        """The fields of the lie's key: what the message says itself, the region of its tile and the agent of its
-        vehicle, else any name."""
+        """The fields of the message's key: what the message says itself, the region of its tile and the agent of
+        its vehicle, else any name."""
         named = {name: getattr(message, name, None) for name in topic.fields}
         if isinstance(message, MarkSet):
             with contextlib.suppress(OutsideGridError):
@@ -93,7 +96,7 @@ class Lies:
 
     # --- making ---------------------------------------------------------------------------------------------
 
-    def lie(self, kind: type[M]) -> M:
+    def message(self, kind: type[M]) -> M:
         """A message of this type which decodes."""
         for _ in range(_TRIES):
             try:
@@ -104,7 +107,7 @@ class Lies:
         raise AssertionError(f"no {kind.__name__} of {_TRIES} decodes: its types say less than its checks")
 
     def altered(self, message: M) -> M:
-        """A message with one thing in it, at any depth, replaced by a lie, so that it decodes; itself where nothing
+        """A message with one thing in it, at any depth, replaced, so that it decodes; itself where nothing
         in it can be."""
         for _ in range(20):
             with contextlib.suppress(ProtocolError, ValueError):

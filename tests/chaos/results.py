@@ -1,4 +1,5 @@
-"""What a siege came to: one outcome per blow, samples of what the processes take up, and the laws. Pure."""
+"""What a run under faults came to: one outcome for each, samples of what the processes take up, and the laws.
+Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from chaos.blows import CALM
+from chaos.fault_schedule import CALM
 
 GROWTH_LIMIT = 0.05
 """Memory, threads and files may grow by this share once a run has settled."""
@@ -20,7 +21,7 @@ QUICK_S = 2.0
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """One blow and what followed. Seconds count from the blow; of a hang or burst, from its end.
+    """One fault and what followed. Seconds count from it; of a hang or burst, from its end.
 
     back_s    until every killed process ran again
     routed_s  until every vehicle had a route; None: not while it was watched
@@ -60,8 +61,8 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     files: int
 
 
-class Tally(msgspec.Struct, kw_only=True):
-    """A whole siege."""
+class Results(msgspec.Struct, kw_only=True):
+    """Outcomes and samples of a whole run."""
 
     scenario: str
     seed: int
@@ -113,7 +114,7 @@ class Tally(msgspec.Struct, kw_only=True):
         return growth
 
     def rows(self) -> list[dict[str, Any]]:
-        """Per kind of blow: how many, and seconds until all had recovered."""
+        """Per kind of fault: how many, and seconds until all had recovered."""
         rows = []
         for kind in dict.fromkeys(each.kind for each in self.outcomes):
             some = [each for each in self.outcomes if each.kind == kind]

@@ -1,4 +1,4 @@
-"""A stranger on the router: hears everything that is said, and says anything at all."""
+"""An attacker on the router, which hears everything that is said and says anything at all."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _WAITING = 10_000
 _KEYS = 5000
 
 
-class Stranger:
+class Attacker:
     """A session of its own. What it says itself it does not hear, so what it hears is genuine."""
 
     def __init__(self, network: NetworkConfig) -> None:
-        # The router may be dead for a while: a stranger waits longer than a process.
+        # The router may be dead for a while: an attacker waits longer than a process.
         self._bus = open_bus(msgspec.structs.replace(network, connect_timeout_s=60.0))
         self._waiting: deque[bytes] = deque(maxlen=_WAITING)
         self._there = threading.Event()

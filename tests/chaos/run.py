@@ -1,24 +1,28 @@
-"""A live swarm of real processes under blows, from its start to its end."""
+"""A live swarm of real processes under faults, from its start to its end."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
+import typer
+from bench.harness import Seed, benchmark, tell
+from support.message_fuzzer import NAMES, MessageFuzzer
 from support.process_usage import Usage, usage
 from support.up_process import UpProcess
 
-from chaos.blows import BLOWS, Blow, blows
+from chaos.attacker import Attacker
+from chaos.fault_schedule import FAULTS, Fault, faults
 from chaos.hostile import KINDS, Hostile
-from chaos.lies import NAMES, Lies
 from chaos.recovery import Recovery
-from chaos.stranger import Stranger
-from chaos.tally import Ended, Outcome, Sample, Tally, name_of
+from chaos.results import Ended, Outcome, Results, Sample, name_of
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
@@ -29,14 +33,14 @@ from swarm.bus.endpoints import listening
 from swarm.config.agents import plan_agents
 from swarm.config.classes import aloft_classes
 from swarm.config.scenario import Scenario
-from swarm.errors import BusError, ProtocolError
+from swarm.errors import BusError, ConfigError, ProtocolError, StoreError
 from swarm.wire.codec import decode
-from swarm.wire.topics import FLEET
+from swarm.wire.topics import FLEET, TOPICS
 
 _UP_WITHIN_S = 180.0
 _SETTLE_S = 5.0
 _WATCH_S = 30.0
-"""A blow that has not recovered by then never does."""
+"""A fault that has not recovered by then never does."""
 _SCAN_S = 0.2
 _SAMPLE_S = 1.0
 _AT_ONCE = 100
@@ -49,37 +53,113 @@ _MARGIN_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
-class SiegeOptions:
-    """How a swarm is besieged.
+class Options:
+    """How a swarm is tried.
 
     scenario  a file or a built-in name
-    seconds   the siege ends after so long; None: with the messages
-    messages  the siege ends with so many hostile messages; None: with the seconds
-    every_s   from one blow to the next, at least
-    kinds     which blows
+    seconds   the run ends after so long; None: with the messages
+    messages  the run ends with so many hostile messages; None: with the seconds
+    every_s   from one fault to the next, at least
+    kinds     which faults
     hostile   which hostile messages
     spared    topics under which nothing hostile is said
-    within_s  a blow from which the swarm recovers later breaks a law
+    within_s  a fault from which the swarm recovers later breaks a law
     """
 
     scenario: str
     seconds: float | None
     messages: int | None
-    seed: int = 1
-    every_s: float = 10.0
-    kinds: tuple[str, ...] = BLOWS
-    hostile: tuple[str, ...] = KINDS
-    spared: tuple[str, ...] = ()
-    within_s: float = 10.0
-    runs: Path = Path("runs")
+    seed: int
+    every_s: float
+    kinds: tuple[str, ...]
+    hostile: tuple[str, ...]
+    spared: tuple[str, ...]
+    within_s: float
+    runs: Path
 
 
-class Siege:
-    """One siege. `run` returns what it came to, and leaves no process behind, whatever happens."""
+@benchmark(fails=("broken", "interrupted"))
+def chaos(
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario.")
+    ] = "besieged",
+    seconds: Annotated[float | None, typer.Option(min=1, max=1e6, help="End after so many seconds.")] = None,
+    messages: Annotated[
+        int | None, typer.Option(min=1, help="End once so many hostile messages have been sent.")
+    ] = None,
+    blow: Annotated[
+        list[str] | None, typer.Option(help="Only this: kill, hang or messages; may be given several times.")
+    ] = None,
+    hostile: Annotated[
+        list[str] | None,
+        typer.Option(help="Only these messages: flipped, numbers, replayed or lies; may be given several times."),
+    ] = None,
+    spare: Annotated[
+        list[str] | None, typer.Option(help="Say nothing hostile under this topic; may be given several times.")
+    ] = None,
+    every: Annotated[float, typer.Option(min=1, help="Seconds from one blow to the next, at least.")] = 10.0,
+    within: Annotated[
+        float, typer.Option(min=0.1, help="Recovering later than so many seconds breaks a law.")
+    ] = 10.0,
+    seed: Seed = 1,
+    runs: Annotated[Path, typer.Option(help="Folder of the folder for logs and chaos.json.")] = Path("runs"),
+) -> dict[str, Any]:
+    """A swarm on this machine is started and struck: how soon does it recover?
 
-    def __init__(self, options: SiegeOptions, tell: Callable[[str], None]) -> None:
+    \b
+    ./launch_scripts/bench chaos --seconds 60
+    ./launch_scripts/bench chaos --blow kill --every 10 --seconds 3600
+    ./launch_scripts/bench chaos --blow messages --messages 1000000
+
+    Processes are killed (kill -9 of one or two) or stopped for a while, and messages are said with flipped bits,
+    hostile numbers, replayed, or as well-formed lies. Lasts a minute unless --seconds or --messages say more. Exit
+    code 1 if a process ended by itself, vehicles did not recover in time or met, or memory grew. Leaves chaos.json
+    in the run's folder.
+    """
+    options = Options(
+        scenario=scenario,
+        seconds=60.0 if seconds is None and messages is None else seconds,
+        messages=messages,
+        seed=seed,
+        every_s=every,
+        kinds=_known("--blow", blow, FAULTS),
+        hostile=_known("--hostile", hostile, KINDS),
+        spared=_known("--spare", spare, tuple(topic.name for topic in TOPICS)) if spare else (),
+        within_s=within,
+        runs=runs,
+    )
+    run = ChaosRun(options)
+    tell(f"logs and chaos.json in {run.run_dir}")
+    interrupted = False
+    try:
+        run.run()
+    except KeyboardInterrupt:
+        interrupted = True
+        tell("interrupted: the figures are of the part that has run")
+    report = run.results.report()
+    try:
+        (run.run_dir / "chaos.json").write_text(json.dumps(report, indent=1))
+    except OSError as error:
+        raise StoreError(f"cannot write {run.run_dir / 'chaos.json'}: {error.strerror or error}") from error
+    del report["samples"]
+    shown = {name: report[name] for name in ("rows", "seconds", "messages", "growth")}
+    notes = [f"broken: {sentence}" for sentence in report["broken"]]
+    return {**report, "interrupted": interrupted, "shown": shown, "notes": notes}
+
+
+def _known(option: str, given: list[str] | None, known: tuple[str, ...]) -> tuple[str, ...]:
+    """What an option that may be given several times names; all if it is not given. Raises ConfigError."""
+    for each in given or ():
+        if each not in known:
+            raise ConfigError(f"{option}: no {each!r}; there are {', '.join(known)}")
+    return tuple(given or known)
+
+
+class ChaosRun:
+    """One run, whose `results` say what it came to. It leaves no process behind, whatever happens."""
+
+    def __init__(self, options: Options) -> None:
         self._options = options
-        self._tell = tell
         scenario = with_port(find_scenario(options.scenario), 0)
         self._scenario: Scenario = scenario
         terrain = build_terrain(scenario)
@@ -91,11 +171,11 @@ class Siege:
         self._names = [spec.name for spec in processes_of(scenario)]
         names = (*NAMES, *scenario.target_ids, *(plan.id for plan in plan_agents(scenario)), *vehicles)
         classes = [each.name for each in scenario.classes]
-        lies = Lies(terrain.grid, options.seed, tuple(dict.fromkeys(names)), classes)
+        fuzzer = MessageFuzzer(terrain.grid, options.seed, tuple(dict.fromkeys(names)), classes)
         namespace = scenario.network.namespace
-        self._hostile = Hostile(namespace, lies, options.seed, options.hostile, options.spared)
+        self._hostile = Hostile(namespace, fuzzer, options.seed, options.hostile, options.spared)
         self.run_dir = make_run_dir(options.runs, f"chaos-{time.strftime('%Y%m%d-%H%M%S')}-{options.seed}")
-        self.tally = Tally(scenario=options.scenario, seed=options.seed, within_s=options.within_s)
+        self.results = Results(scenario=options.scenario, seed=options.seed, within_s=options.within_s)
         self._began_s = time.monotonic()
         self._pids: dict[str, int] = {}
         self._killed: set[int] = set()
@@ -104,23 +184,22 @@ class Siege:
 
     @property
     def _now_s(self) -> float:
-        """Seconds since the siege began."""
+        """Seconds since the first fault."""
         return time.monotonic() - self._began_s
 
-    def run(self) -> Tally:
-        """Besiege to the end. Raises SwarmError if the swarm does not come up."""
+    def run(self) -> None:
+        """Strikes to the end. Raises SwarmError if the swarm does not come up."""
         with self._swarm() as launcher:
-            stranger = self._join(launcher)
+            attacker = self._join(launcher)
             try:
                 self._began_s = time.monotonic()
                 self._scan_due_s = self._sample_due_s = 0.0
-                self._besiege(launcher, stranger)
+                self._strike_all(launcher, attacker)
             finally:
-                self.tally.seconds = self._now_s
+                self.results.seconds = self._now_s
                 for pid in self._stopped:
                     _send(pid, signal.SIGCONT)
-                stranger.close()
-        return self.tally
+                attacker.close()
 
     # --- the swarm ------------------------------------------------------------------------------------------
 
@@ -133,78 +212,78 @@ class Siege:
         try:
             yield launcher
         finally:
-            self.tally.left_behind += launcher.end()
+            self.results.left_behind += launcher.end()
 
-    def _join(self, launcher: UpProcess) -> Stranger:
+    def _join(self, launcher: UpProcess) -> Attacker:
         """Wait until the swarm is up and every vehicle has been heard of."""
         began_s = time.monotonic()
-        stranger: Stranger | None = None
+        attacker: Attacker | None = None
         try:
             while time.monotonic() < began_s + _UP_WITHIN_S:
                 launcher.check()
-                if stranger is None:
+                if attacker is None:
                     if listening(self._scenario.network.connect[0]):
-                        stranger = Stranger(self._scenario.network)
+                        attacker = Attacker(self._scenario.network)
                     else:
                         time.sleep(0.2)
                     continue
-                self._listen(stranger, 0.5)
+                self._listen(attacker, 0.5)
                 if self._recovery.reported and len(self._pids) >= len(self._names):
-                    self._tell(f"up after {time.monotonic() - began_s:.1f} s; settling {_SETTLE_S:g} s")
-                    self._listen(stranger, _SETTLE_S)
-                    return stranger
+                    tell(f"up after {time.monotonic() - began_s:.1f} s; settling {_SETTLE_S:g} s")
+                    self._listen(attacker, _SETTLE_S)
+                    return attacker
             raise BusError(f"the swarm did not come up within {_UP_WITHIN_S:g} s; see {self.run_dir}")
         except BaseException:
-            if stranger is not None:
-                stranger.close()
+            if attacker is not None:
+                attacker.close()
             raise
 
-    # --- blows ----------------------------------------------------------------------------------------------
+    # --- faults ----------------------------------------------------------------------------------------------
 
-    def _besiege(self, launcher: UpProcess, stranger: Stranger) -> None:
+    def _strike_all(self, launcher: UpProcess, attacker: Attacker) -> None:
         options = self._options
-        for number, blow in enumerate(blows(options.seed, self._names, options.kinds, options.every_s / 2)):
+        for number, fault in enumerate(faults(options.seed, self._names, options.kinds, options.every_s / 2)):
             if self._finished():
                 return
             if (code := launcher.process.poll()) is not None:
-                self.tally.ended.append(Ended(at_s=self._now_s, name="launcher", reason=f"exit code {code}"))
+                self.results.ended.append(Ended(at_s=self._now_s, name="launcher", reason=f"exit code {code}"))
                 return
             began_s = self._now_s
-            outcome = self._strike(stranger, blow)
-            self.tally.outcomes.append(outcome)
-            self._tell(f"{number} {_sentence(outcome)}")
-            self._listen(stranger, max(began_s + options.every_s - self._now_s, 0.5))
+            outcome = self._strike(attacker, fault)
+            self.results.outcomes.append(outcome)
+            tell(f"{number} {_sentence(outcome)}")
+            self._listen(attacker, max(began_s + options.every_s - self._now_s, 0.5))
 
     def _finished(self) -> bool:
         options = self._options
-        told = sum(self.tally.messages.values())
+        told = sum(self.results.messages.values())
         return (options.seconds is not None and self._now_s >= options.seconds) or (
             options.messages is not None and told >= options.messages
         )
 
-    def _strike(self, stranger: Stranger, blow: Blow) -> Outcome:
+    def _strike(self, attacker: Attacker, fault: Fault) -> Outcome:
         at_s = from_s = self._now_s
         many, back_s = 0, 0.0
-        match blow.kind:
+        match fault.kind:
             case "kill":
-                back_s = self._kill(stranger, blow.whom)
+                back_s = self._kill(attacker, fault.whom)
             case "hang":
-                self._hang(stranger, blow)
+                self._hang(attacker, fault)
                 from_s = self._now_s
             case "messages":
-                many = self._burst(stranger, blow.lasts_s)
+                many = self._burst(attacker, fault.lasts_s)
                 from_s = self._now_s
         recovery = self._recovery
         recovery.over(self._now_s)
         until_s = self._now_s + _WATCH_S
         while self._now_s < until_s and (recovery.routed_s() is None or recovery.moving_s() is None):
-            self._listen(stranger, 0.05)
+            self._listen(attacker, 0.05)
         routed_s, moving_s = recovery.routed_s(), recovery.moving_s()
         return Outcome(
             at_s=at_s,
-            kind=blow.kind,
-            whom=blow.whom,
-            lasts_s=blow.lasts_s,
+            kind=fault.kind,
+            whom=fault.whom,
+            lasts_s=fault.lasts_s,
             messages=many,
             back_s=back_s,
             routed_s=None if routed_s is None else routed_s - from_s,
@@ -212,7 +291,7 @@ class Siege:
             late=tuple(recovery.unrouted() or recovery.standing()),
         )
 
-    def _kill(self, stranger: Stranger, names: tuple[str, ...]) -> float:
+    def _kill(self, attacker: Attacker, names: tuple[str, ...]) -> float:
         """Kills processes; returns the seconds until others run in their place."""
         self._scan()
         began_s = self._now_s
@@ -223,24 +302,24 @@ class Siege:
         while any(self._pids.get(name) in (None, pid) for name, pid in before.items()):
             if self._now_s > began_s + _WATCH_S:
                 break
-            self._listen(stranger, 0.05)
+            self._listen(attacker, 0.05)
             self._scan()
         return self._now_s - began_s
 
-    def _hang(self, stranger: Stranger, blow: Blow) -> None:
+    def _hang(self, attacker: Attacker, fault: Fault) -> None:
         self._scan()
-        pids = [self._pids[name] for name in blow.whom if name in self._pids]
+        pids = [self._pids[name] for name in fault.whom if name in self._pids]
         self._stopped.update(pids)
         for pid in pids:
             _send(pid, signal.SIGSTOP)
-        self._listen(stranger, blow.lasts_s)
+        self._listen(attacker, fault.lasts_s)
         for pid in pids:
             _send(pid, signal.SIGCONT)
         self._stopped.clear()
 
-    def _burst(self, stranger: Stranger, lasts_s: float) -> int:
-        with stranger.listening_to_all() as last:
-            self._listen(stranger, _MATERIAL_S)
+    def _burst(self, attacker: Attacker, lasts_s: float) -> int:
+        with attacker.listening_to_all() as last:
+            self._listen(attacker, _MATERIAL_S)
         for key, sample in sorted(last.items()):
             code = None if sample.attachment is None else sample.attachment.to_bytes()
             self._hostile.heard(key, sample.payload.to_bytes(), code)
@@ -248,19 +327,19 @@ class Siege:
         while self._now_s < began_s + lasts_s and not self._finished():
             for _ in range(_AT_ONCE):
                 kind, key, payload, code = self._hostile.next()
-                stranger.say(key, payload, code)
-                self.tally.messages[kind] = self.tally.messages.get(kind, 0) + 1
+                attacker.say(key, payload, code)
+                self.results.messages[kind] = self.results.messages.get(kind, 0) + 1
                 many += 1
-            self._listen(stranger, max(began_s + many / _MESSAGES_PER_S - self._now_s, 0.0))
+            self._listen(attacker, max(began_s + many / _MESSAGES_PER_S - self._now_s, 0.0))
         return many
 
     # --- watching -------------------------------------------------------------------------------------------
 
-    def _listen(self, stranger: Stranger, seconds: float) -> None:
+    def _listen(self, attacker: Attacker, seconds: float) -> None:
         """Take in what is said for so long; look at the processes when it is time."""
         until_s = self._now_s + seconds
         while True:
-            for payload in stranger.reports(min(max(until_s - self._now_s, 0.0), 0.05)):
+            for payload in attacker.reports(min(max(until_s - self._now_s, 0.0), 0.05)):
                 self._hear(payload)
             now_s = self._now_s
             if now_s >= self._scan_due_s:
@@ -279,9 +358,9 @@ class Siege:
             for broken in self._referee.hear(fleet):  # type: ignore[arg-type]
                 if isinstance(broken, Collision):
                     text = f"{broken.first} and {broken.second} on cell {broken.cell} at {self._now_s:.1f} s"
-                    self.tally.collisions.append(text)
+                    self.results.collisions.append(text)
                 else:
-                    self.tally.lethal_entries.append(
+                    self.results.lethal_entries.append(
                         f"{broken.vehicle} on cell {broken.cell} at {self._now_s:.1f} s"
                     )
 
@@ -291,8 +370,8 @@ class Siege:
         for name, pid in gone:
             del self._pids[name]
             if pid not in self._killed:
-                self.tally.ended.append(Ended(at_s=self._now_s, name=name, reason=self._reason(name)))
-                self._tell(f"{name} ended by itself at {self._now_s:.1f} s")
+                self.results.ended.append(Ended(at_s=self._now_s, name=name, reason=self._reason(name)))
+                tell(f"{name} ended by itself at {self._now_s:.1f} s")
         # To search costs more than all else here, so only what is missing is searched for.
         if len(self._pids) < len(self._names):
             self._pids.update(processes(self.run_dir))
@@ -307,7 +386,7 @@ class Siege:
     def _sample(self) -> None:
         some = [used for name in self._names if (used := self._used(name)) is not None]
         if len(some) == len(self._names):
-            self.tally.samples.append(
+            self.results.samples.append(
                 Sample(
                     at_s=self._now_s,
                     rss_mb=sum(each.rss_bytes for each in some) / 1e6,
