@@ -15,7 +15,7 @@ from swarm.bus.endpoints import listening
 from swarm.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
-    from launch_scripts.gateways.ros2.settings import Settings
+    from launch_scripts.gateways.ros2.gateway_settings import Settings
     from swarm.config.scenario import NetworkConfig
 
 
@@ -34,14 +34,14 @@ def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
     changes  key -> value, such as {"ros.domain": 3}; None changes nothing
     """
     check_installed()
-    from launch_scripts.gateways.ros2.settings import load_settings
+    from launch_scripts.gateways.ros2.gateway_settings import load_settings
 
     return load_settings(file, changes)
 
 
 def list_topics(settings: Settings, *, as_json: bool) -> None:
     """Print what is forwarded."""
-    from launch_scripts.gateways.ros2.incoming.table import incoming_rows
+    from launch_scripts.gateways.ros2.gateway_settings import incoming_rows
 
     rows = list(settings.rows())
     rows += incoming_rows(settings.incoming, has_map=any(row.name == "map" for row in rows))

@@ -17,8 +17,8 @@ from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
-    from launch_scripts.gateways.ros2.markers import Colour
-    from launch_scripts.gateways.ros2.types import RosTypes
+    from launch_scripts.gateways.ros2.map_messages import Colour
+    from launch_scripts.gateways.ros2.ros_types import RosTypes
     from launch_scripts.report.timeline import Told
 
 _PROFILE, _SCHEMAS, _MESSAGES = "ros2", "ros2msg", "cdr"
@@ -28,9 +28,8 @@ _PROFILE, _SCHEMAS, _MESSAGES = "ros2", "ros2msg", "cdr"
 def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
     """Write the recording of a run; returns a line about it. Raises ConfigError or StoreError in one sentence."""
     _check_packages()
-    from launch_scripts.gateways.ros2.frames import RosMap
-    from launch_scripts.gateways.ros2.messages import RosMessages
-    from launch_scripts.gateways.ros2.types import Distribution, types_of
+    from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages
+    from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
     from launch_scripts.report.timeline import lines_of, told
 
     tracks = tracks_of_run(folder)

@@ -16,12 +16,25 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.gateways.ros2 import markers
-from launch_scripts.gateways.ros2.frames import headings_along
-from launch_scripts.gateways.ros2.grids import UNKNOWN, occupancy_grid, occupancy_of
-from launch_scripts.gateways.ros2.markers import Colour, Drawing, Form, MarkerBook
-from launch_scripts.gateways.ros2.messages import RosMessages, Severity
-from launch_scripts.gateways.ros2.names import ros_name
+from launch_scripts.gateways.ros2 import map_messages
+from launch_scripts.gateways.ros2.map_messages import (
+    UNKNOWN,
+    Colour,
+    Drawing,
+    Form,
+    marker_array,
+    occupancy_grid,
+    occupancy_of,
+)
+from launch_scripts.gateways.ros2.ros_messages import (
+    TERRAIN_FRAME,
+    RosMessages,
+    Severity,
+    base_frame,
+    headings_along,
+    odom_frame,
+    ros_name,
+)
 from launch_scripts.observe.alarms import Alarm
 from launch_scripts.report.export import turns_of
 from launch_scripts.report.run_arrays import GivenRoute, GroundPace, RunTracks, Track
@@ -58,7 +71,7 @@ def told(
 ) -> Iterator[Told]:
     """All messages in order of time.
 
-    colours  vehicle -> of its route; those of others are `markers.ROUTE`
+    colours  vehicle -> of its route; those of others are `map_messages.ROUTE`
     """
     moving = (*tracks.vehicles, *tracks.targets, *tracks.captures)
     ends = [int(each.time_ns[n]) for each in moving if len(each.time_ns) for n in (0, -1)]
@@ -81,9 +94,10 @@ def told(
 
 
 def _still(messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, first_ns: int) -> Iterator[Told]:
-    frames = [messages.map_transform(first_ns)]
+    map = messages.map
+    frames = [messages.transform(first_ns, (TERRAIN_FRAME, map.frame), map.origin_m)]
     names = frame_names(each.id for each in tracks.vehicles)
-    frames += [messages.vehicle_transforms(first_ns, name, 0.0, 0.0, None)[0] for name in names.values()]
+    frames += [messages.transform(first_ns, (map.frame, odom_frame(name))) for name in names.values()]
     yield Told(first_ns, "/tf_static", messages.transforms(frames))
     if ground is not None:
         occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
@@ -134,9 +148,12 @@ def frame_names(ids: Iterable[str]) -> dict[str, str]:
 def _vehicles(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
     names = frame_names(each.id for each in tracks)
     for now in _instants(tracks):
+        places = zip(now.ids, now.xy_m.tolist(), now.headings_rad, strict=True)
         bases = [
-            messages.vehicle_transforms(now.time_ns, names[id], x_m, y_m, heading_rad)[1]
-            for id, (x_m, y_m), heading_rad in zip(now.ids, now.xy_m.tolist(), now.headings_rad, strict=True)
+            messages.transform(
+                now.time_ns, (odom_frame(names[id]), base_frame(names[id])), messages.map.to_ros(*xy_m), heading_rad
+            )
+            for id, xy_m, heading_rad in places
         ]
         yield Told(now.time_ns, "/tf", messages.transforms(bases))
         poses = messages.pose_array(now.time_ns, now.xy_m, now.headings_rad)
@@ -202,30 +219,29 @@ def _drawn(
     points = sum(len(turns_of(route.cells, tracks.grid)) for route in routes)
     at_once = len({route.vehicle for route in routes}) * points // max(len(routes), 1)
     most = min(max(_MOST_POINTS // max(at_once, 1), _LEAST), _MOST)
-    book = MarkerBook(messages)
     current: dict[str, Drawing] = {}
     done = 0
     for now_ns in instants_of(changes, first_ns, last_ns, most):
         while done < len(routes) and routes[done].time_ns <= now_ns:
             route = routes[done]
-            current[route.vehicle] = _route(tracks, route, colours.get(route.vehicle, markers.ROUTE))
+            current[route.vehicle] = _route(tracks, route, colours.get(route.vehicle, map_messages.ROUTE))
             done += 1
-        seen = [
-            each
+        seen = {
+            each.id: each
             for each, at_ns in zip(tracks.captures, captures_ns, strict=True)
             if at_ns <= now_ns < at_ns + _SHOWN_NS
-        ]
-        drawings = [*current.values(), *(_capture(tracks, each) for each in seen)]
-        yield Told(now_ns, "/swarm/markers", book.array(now_ns, drawings))
+        }
+        drawings = [*current.values(), *(_capture(tracks, each) for each in seen.values())]
+        yield Told(now_ns, "/swarm/markers", marker_array(messages, now_ns, drawings))
 
 
 def _route(tracks: RunTracks, route: GivenRoute, colour: Colour) -> Drawing:
     cells = turns_of(route.cells, tracks.grid)
-    return markers.route(tracks.grid, route.vehicle, middles_of(tracks.grid, cells).T, colour)
+    return map_messages.route(tracks.grid, middles_of(tracks.grid, cells).T, colour)
 
 
 def _capture(tracks: RunTracks, capture: Track) -> Drawing:
-    return Drawing("captures", capture.id, Form.CUBES, capture.xy_m[:1], CAPTURE, 3 * tracks.grid.resolution_m)
+    return Drawing("captures", Form.CUBES, capture.xy_m[:1], CAPTURE, 3 * tracks.grid.resolution_m)
 
 
 # --- what a run said in words, as lines of a log ------------------------------------------------------------------

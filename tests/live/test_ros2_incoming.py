@@ -13,8 +13,8 @@ from support.live_swarm import SWARM, LiveSwarm, client
 from support.processes import eventually
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
-from launch_scripts.gateways.ros2.frames import RosMap
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_messages import RosMap
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.client import Observer, Swarm, connect
 from swarm.runtime.inbox import Inbox
 from swarm.wire.topics import BODY

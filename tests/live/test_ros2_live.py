@@ -17,12 +17,13 @@ from bench.wire.remote import Far
 from bench.wire.ros2 import swarm_peer
 from support.live_swarm import SWARM, LiveSwarm
 from support.processes import eventually
+from support.ros_node import PeerNode
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
-from launch_scripts.gateways.ros2.graph import Attachment, Qos
-from launch_scripts.gateways.ros2.node import Node, close_ros, open_ros
-from launch_scripts.gateways.ros2.topics import ROWS, TABLE, Direction
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.rmw import Attachment, Qos
+from launch_scripts.gateways.ros2.ros_node import close_ros, open_ros
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.topic_table import ROWS, TABLE, Direction
 from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
@@ -118,7 +119,7 @@ def test_a_foreign_stack_lists_every_topic(running: Gateway) -> None:
 def test_a_latched_map_comes_to_who_comes_late(running: Gateway) -> None:
     session = open_ros(running.endpoint)
     try:
-        node = Node(session, "late", TYPES)
+        node = PeerNode(session, "late", TYPES)
         maps, frames = [], []
         time.sleep(1.5)  # the map was put long before
         node.subscribe("/map", ROWS["map"].type_name, maps.append, Qos.LATCHED)
@@ -160,7 +161,7 @@ def test_each_message_has_33_bytes_that_name_sender_number_and_time(running: Gat
 def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(running: Gateway) -> None:
     session = open_ros(running.endpoint)
     try:
-        elsewhere = Node(session, "far", TYPES, domain=7)
+        elsewhere = PeerNode(session, "far", TYPES, domain=7)
         elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
         eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")
         elsewhere.close()
@@ -168,7 +169,7 @@ def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(running: G
         close_ros(session)
     session = open_ros(running.endpoint)
     try:
-        older = Node(session, "old", types_of(Distribution.HUMBLE))
+        older = PeerNode(session, "old", types_of(Distribution.HUMBLE))
         older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
         eventually(
             lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble"
@@ -182,7 +183,7 @@ def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway) -> 
     session = open_ros(gateway.endpoint)
     there: set[str] = set()
     try:
-        node = Node(session, "watcher", TYPES)
+        node = PeerNode(session, "watcher", TYPES)
         node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
         process = gateway.start()
         try:
@@ -217,7 +218,7 @@ def poses_heard(port: int, within_s: float) -> None:
     session = open_ros(f"tcp/127.0.0.1:{port}")
     try:
         heard: list[object] = []
-        Node(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, heard.append)
+        PeerNode(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, heard.append)
         eventually(lambda: heard, within_s, "poses of vehicles")
     finally:
         close_ros(session)

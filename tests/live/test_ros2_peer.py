@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 from support.processes import eventually
+from support.ros_node import PeerNode
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
-from launch_scripts.gateways.ros2.node import Node, open_ros
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_node import open_ros
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 
 pytestmark = pytest.mark.network
 TYPES = types_of(Distribution.JAZZY)
@@ -26,7 +27,7 @@ def port() -> Iterator[int]:
 def test_a_foreign_peer_and_the_node_hear_and_answer_each_other(port: int, tmp_path: Path) -> None:
     heard: list[Any] = []
     with open_ros(f"tcp/127.0.0.1:{port}") as session:
-        node = Node(session, "node", TYPES)
+        node = PeerNode(session, "node", TYPES)
         node.subscribe("/uav1/odom", "nav_msgs/msg/Odometry", heard.append)
         node.serve(
             "/swarm/hold",

@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from launch_scripts.gateways.ros2.types import REQUEST, RESPONSE, RosTypes
+from launch_scripts.gateways.ros2.ros_types import REQUEST, RESPONSE, RosTypes
 from launch_scripts.ports import free_ports
 
 _PROGRAM = Path(__file__).with_name("ros_peer_program.py")

@@ -4,19 +4,9 @@ from __future__ import annotations
 
 from msgspec import Struct
 
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.arming import Kind, kind_of
 from launch_scripts.gateways.mavlink.guidance import Driver, Way, Wishes, driver_of, flies
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    GLOBAL_POSITION_INT,
-    SET_MESSAGE_INTERVAL,
-    Beat,
-    Command,
-    Heartbeat,
-    Incoming,
-    Outgoing,
-    Position,
-    Warned,
-)
 from swarm.client import ConfigError, Frame
 from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
@@ -61,7 +51,7 @@ class Tell(Struct, frozen=True):
     sentence: str
 
 
-Action = Outgoing | Report | Withdraw | Follow | Unfollow | Tell
+Action = codec.Outgoing | Report | Withdraw | Follow | Unfollow | Tell
 
 
 class Adapter:
@@ -79,14 +69,14 @@ class Adapter:
         self.kind: Kind | None = None
         self._frame = frame
         self._wishes = wishes
-        self._beat: Beat | None = None
-        self._position: Position | None = None
+        self._beat: codec.Beat | None = None
+        self._position: codec.Position | None = None
         self._place: Point | None = None
         """Of the newest position, in the terrain's frame; None outside of it."""
         self._beat_ns = self._position_ns = 0
         """When they were heard."""
         self._there = False
-        self._reported: Position | None = None
+        self._reported: codec.Position | None = None
         """The newest that was told to the swarm; None while the vehicle is nowhere for it."""
         self._way: Way | None = None
         self._swarm_up = True
@@ -98,14 +88,14 @@ class Adapter:
 
     # --- what comes -----------------------------------------------------------------------------------------------
 
-    def hear(self, message: Incoming, now_ns: int) -> None:
+    def hear(self, message: codec.Incoming, now_ns: int) -> None:
         """Takes in a message of the vehicle."""
         match message:
-            case Beat():
+            case codec.Beat():
                 self._hear_beat(message, now_ns)
-            case Position():
+            case codec.Position():
                 self._hear_position(message, now_ns)
-            case Warned(text=text):
+            case codec.Warned(text=text):
                 if now_ns >= self._warn_due_ns:
                     self._warn_due_ns = now_ns + _WARN_NS
                     self._tells.append(f"the vehicle says: {text}")
@@ -124,7 +114,7 @@ class Adapter:
             )
         self._swarm_up = up
 
-    def _hear_beat(self, beat: Beat, now_ns: int) -> None:
+    def _hear_beat(self, beat: codec.Beat, now_ns: int) -> None:
         kind = kind_of(beat)
         if self.kind is None:
             self.kind = kind
@@ -140,7 +130,7 @@ class Adapter:
             return
         self._beat, self._beat_ns = beat, now_ns
 
-    def _hear_position(self, position: Position, now_ns: int) -> None:
+    def _hear_position(self, position: codec.Position, now_ns: int) -> None:
         try:
             place = self._frame.from_wgs84(position.lat_deg, position.lon_deg)
             self._frame.cell(*place)
@@ -158,11 +148,11 @@ class Adapter:
         actions: list[Action] = []
         if now_ns >= self._beat_due_ns:
             self._beat_due_ns = now_ns + BEAT_NS
-            actions.append(Heartbeat())
+            actions.append(codec.Heartbeat())
         silent = self._position is None or now_ns - self._position_ns > NS_PER_S
         if self._beat is not None and silent and now_ns >= self._ask_due_ns:
             self._ask_due_ns = now_ns + _ASK_NS
-            actions.append(Command(SET_MESSAGE_INTERVAL, (GLOBAL_POSITION_INT, _POSITIONS_US)))
+            actions.append(codec.Command(codec.SET_MESSAGE_INTERVAL, (codec.GLOBAL_POSITION_INT, _POSITIONS_US)))
         actions += self._come_or_go(now_ns)
         if self._there and self._beat is not None and self._position is not None and self._place is not None:
             actions += self._report(self._position, self._place, now_ns)
@@ -215,7 +205,7 @@ class Adapter:
             return f"no position for {self._wishes.lost_s:g} s"
         return "" if self._place is not None else "it is outside the terrain"
 
-    def _report(self, position: Position, place: Point, now_ns: int) -> list[Action]:
+    def _report(self, position: codec.Position, place: Point, now_ns: int) -> list[Action]:
         if position is self._reported or now_ns < self._report_due_ns:
             return []
         self._report_due_ns = now_ns + REPORT_NS
@@ -238,5 +228,5 @@ class Adapter:
         return told
 
 
-def _speed(position: Position) -> float:
+def _speed(position: codec.Position) -> float:
     return min(position.speed_m_per_s, _MOST_M_PER_S)

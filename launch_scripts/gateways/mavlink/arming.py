@@ -9,17 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    ACCEPTED,
-    ARM_DISARM,
-    DO_SET_MODE,
-    IN_PROGRESS,
-    MISSION_START,
-    NAV_TAKEOFF,
-    Beat,
-    Command,
-    CommandAnswered,
-)
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from swarm.clock import NS_PER_S
 
 ARDUPILOT, PX4 = 3, 12
@@ -36,7 +26,12 @@ MOST_COMMANDS = 10
 """In a row without effect. A vehicle that refuses has a reason, which it tells in its own words."""
 _MOST_STARTS = 3
 """Some autopilots begin their mission without, and never answer."""
-_OURS = {ARM_DISARM: "be armed", DO_SET_MODE: "change its mode", MISSION_START: "start", NAV_TAKEOFF: "take off"}
+_OURS = {
+    codec.ARM_DISARM: "be armed",
+    codec.DO_SET_MODE: "change its mode",
+    codec.MISSION_START: "start",
+    codec.NAV_TAKEOFF: "take off",
+}
 """Commands whose refusal a person wants to hear of."""
 
 
@@ -71,11 +66,11 @@ class Kind:
     starts: bool = True
     terrain: bool = False
 
-    def set_mode(self, mode: int) -> Command:
+    def set_mode(self, mode: int) -> codec.Command:
         """DO_SET_MODE: PX4 has main and sub-mode in parameters of their own."""
         if self.first_item:
-            return Command(DO_SET_MODE, (1, mode))
-        return Command(DO_SET_MODE, (1, mode >> 16 & 0xFF, mode >> 24 & 0xFF))
+            return codec.Command(codec.DO_SET_MODE, (1, mode))
+        return codec.Command(codec.DO_SET_MODE, (1, mode >> 16 & 0xFF, mode >> 24 & 0xFF))
 
 
 _PX4_MODES = Modes(mission=4 << 16 | 4 << 24, guided=6 << 16, hold=4 << 16 | 3 << 24)
@@ -86,7 +81,7 @@ _ARDUPILOT_MODES = (
 )
 
 
-def kind_of(beat: Beat) -> Kind:
+def kind_of(beat: codec.Beat) -> Kind:
     """The kind of vehicle which a heartbeat tells of."""
     flies = None if beat.type == _UNKNOWN_TYPE else beat.type not in _DRIVES
     if beat.autopilot == PX4:
@@ -124,7 +119,7 @@ class Arming:
         """Sent since one had an effect."""
         self._due_ns = 0
 
-    def drive(self, beat: Beat, height_m: float, now_ns: int) -> Command | None:
+    def drive(self, beat: codec.Beat, height_m: float, now_ns: int) -> codec.Command | None:
         """Returns the next command that brings it to driving; None if it drives, or none is due."""
         self._check_taken(beat, now_ns)
         if self.why or now_ns < self._due_ns:
@@ -132,7 +127,7 @@ class Arming:
         self._holding = False
         return self._send(self._wanted(beat, height_m), now_ns)
 
-    def hold(self, beat: Beat, now_ns: int, *, last: bool = False) -> Command | None:
+    def hold(self, beat: codec.Beat, now_ns: int, *, last: bool = False) -> codec.Command | None:
         """Returns the command that lets it stand, where it drives for us.
 
         last  it is said now, if it was said before or not
@@ -146,18 +141,18 @@ class Arming:
         self._holding = self._held = True
         return self._send(self._kind.set_mode(modes.hold), now_ns)
 
-    def hear(self, answer: CommandAnswered) -> list[str]:
+    def hear(self, answer: codec.CommandAnswered) -> list[str]:
         """Takes in what the vehicle says to a command. Returns sentences about it."""
-        if answer.result == ACCEPTED:
-            if answer.command == MISSION_START:
+        if answer.result == codec.ACCEPTED:
+            if answer.command == codec.MISSION_START:
                 self._starts_left = 0
-            if answer.command == NAV_TAKEOFF:
+            if answer.command == codec.NAV_TAKEOFF:
                 self.takeoff_m = None
-        elif answer.result != IN_PROGRESS and answer.command in _OURS:
+        elif answer.result != codec.IN_PROGRESS and answer.command in _OURS:
             return [f"the vehicle refuses to {_OURS[answer.command]}: MAV_RESULT {answer.result}"]
         return []
 
-    def _check_taken(self, beat: Beat, now_ns: int) -> None:
+    def _check_taken(self, beat: codec.Beat, now_ns: int) -> None:
         """Whether the vehicle still is as we left it."""
         modes = self._kind.modes
         if self.why:
@@ -176,22 +171,22 @@ class Arming:
         elif now_ns >= self._due_ns:  # before that a command of ours may still be under way
             self.why = f"its mode was changed to {beat.mode}, and not by us"
 
-    def _wanted(self, beat: Beat, height_m: float) -> Command | None:
+    def _wanted(self, beat: codec.Beat, height_m: float) -> codec.Command | None:
         modes = self._kind.modes
         if not beat.armed:
             arms = self.mode if modes is None or modes.arms is None else modes.arms
-            return Command(ARM_DISARM, (1,)) if arms in (None, beat.mode) else self._kind.set_mode(arms)
+            return codec.Command(codec.ARM_DISARM, (1,)) if arms in (None, beat.mode) else self._kind.set_mode(arms)
         if self.mode in (None, beat.mode) and self.takeoff_m is not None and height_m < 1.0:
-            return Command(NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, self.takeoff_m))
+            return codec.Command(codec.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, self.takeoff_m))
         if self.mode is not None and beat.mode != self.mode:
             return self._kind.set_mode(self.mode)
         if self._starts_left:
             self._starts_left -= 1
             self._commands = 0
-            return Command(MISSION_START)
+            return codec.Command(codec.MISSION_START)
         return None
 
-    def _send(self, command: Command | None, now_ns: int) -> Command | None:
+    def _send(self, command: codec.Command | None, now_ns: int) -> codec.Command | None:
         if command is None:
             self._commands = 0
             return None

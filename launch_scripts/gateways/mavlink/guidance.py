@@ -10,27 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.arming import Arming, Kind
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    ABOVE_HOME,
-    ABOVE_TERRAIN,
-    ACCEPTED,
-    NAV_LOITER_UNLIM,
-    NAV_TAKEOFF,
-    NAV_WAYPOINT,
-    Beat,
-    CommandAnswered,
-    Incoming,
-    ItemAsked,
-    MissionAnswered,
-    MissionCancelled,
-    MissionCount,
-    MissionCurrent,
-    MissionItem,
-    Outgoing,
-    Position,
-    Setpoint,
-)
 from swarm.client import Frame
 from swarm.client.frame import Point
 from swarm.client.route import along, between
@@ -112,7 +93,7 @@ def driver_of(kind: Kind, frame: Frame, wishes: Wishes) -> Driver | str:
         # PX4 climbs to the height of its setpoints.
         takeoff_m = height_m if guided and not kind.streams else None
         arming = Arming(kind, mode, starts=kind.starts and not guided, takeoff_m=takeoff_m)
-    above = ABOVE_TERRAIN if height_m is not None and wishes.above == "terrain" else ABOVE_HOME
+    above = codec.ABOVE_TERRAIN if height_m is not None and wishes.above == "terrain" else codec.ABOVE_HOME
     return (Setpoints if guided else Missions)(kind, frame, above, height_m, arming)
 
 
@@ -132,19 +113,19 @@ class Driver:
         self._gave_up = False
         """It was told that the wheel commands nothing any more."""
 
-    def hear(self, message: Incoming) -> list[str]:
+    def hear(self, message: codec.Incoming) -> list[str]:
         """Takes in an answer of the vehicle. Returns sentences about it."""
-        return self._arming.hear(message) if self._arming and isinstance(message, CommandAnswered) else []
+        return self._arming.hear(message) if self._arming and isinstance(message, codec.CommandAnswered) else []
 
     def forget(self) -> None:
         """The link is lost: nobody knows what the vehicle has."""
         raise NotImplementedError
 
-    def lead(self, way: Way, position: Position, place: Point, now_ns: int) -> Sequence[Outgoing | str]:
+    def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
         """Returns what is to be said now so that the vehicle follows a way, with sentences for people."""
         raise NotImplementedError
 
-    def stay(self, position: Position, now_ns: int) -> Sequence[Outgoing]:
+    def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
         """Returns what is to be said now as there is no way any more."""
         raise NotImplementedError
 
@@ -153,8 +134,8 @@ class Driver:
         raise NotImplementedError
 
     def tick(
-        self, way: Way | None, beat: Beat, position: Position, place: Point, now_ns: int
-    ) -> list[Outgoing | str]:
+        self, way: Way | None, beat: codec.Beat, position: codec.Position, place: Point, now_ns: int
+    ) -> list[codec.Outgoing | str]:
         """Returns what is to be said now, with sentences for people.
 
         way    the newest; None: the swarm is not heard, or there was none yet
@@ -172,7 +153,9 @@ class Driver:
             said.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
         return said
 
-    def hold(self, beat: Beat, position: Position, now_ns: int, *, last: bool = False) -> list[Outgoing | str]:
+    def hold(
+        self, beat: codec.Beat, position: codec.Position, now_ns: int, *, last: bool = False
+    ) -> list[codec.Outgoing | str]:
         """Returns what is to be said now so that it stays where it is, as far as that is ours.
 
         last  nothing is said after it
@@ -192,35 +175,35 @@ class Upload:
     why       it has failed: half a sentence; empty while it has not
     """
 
-    def __init__(self, items: Sequence[MissionItem]) -> None:
+    def __init__(self, items: Sequence[codec.MissionItem]) -> None:
         self.items = items
         self.accepted = False
         self.why = ""
-        self._said: MissionCount | MissionItem = MissionCount(len(items))
+        self._said: codec.MissionCount | codec.MissionItem = codec.MissionCount(len(items))
         """What is said next, or was last."""
         self._due_ns: int | None = None
         """When it is said (again); None: at once."""
         self._tries = self._asked = 0
 
-    def hear(self, message: Incoming) -> None:
+    def hear(self, message: codec.Incoming) -> None:
         """Takes in that the vehicle asks for an item, or answers to all."""
         if self.accepted or self.why:
             return
         match message:
-            case ItemAsked(seq=seq):
+            case codec.ItemAsked(seq=seq):
                 self._asked += 1
                 if not 0 <= seq < len(self.items):
                     return  # of a mission before; it asks again
                 if self._asked > _MOST_ASKED * len(self.items):
                     self.why = f"asked {self._asked} times for {len(self.items)} items"
                 self._said, self._due_ns, self._tries = self.items[seq], None, 0
-            case MissionAnswered(result=result) if result != ACCEPTED:
+            case codec.MissionAnswered(result=result) if result != codec.ACCEPTED:
                 self.why = f"refused it with MAV_MISSION_RESULT {result}"
-            case MissionAnswered():
+            case codec.MissionAnswered():
                 # One of a mission before, while the last item of this one was not asked for, says nothing of it.
-                self.accepted = isinstance(self._said, MissionItem) and self._said.seq == len(self.items) - 1
+                self.accepted = isinstance(self._said, codec.MissionItem) and self._said.seq == len(self.items) - 1
 
-    def tick(self, now_ns: int) -> MissionCount | MissionItem | None:
+    def tick(self, now_ns: int) -> codec.MissionCount | codec.MissionItem | None:
         """Returns what is to be said now."""
         if self.accepted or self.why or (self._due_ns is not None and now_ns < self._due_ns):
             return None
@@ -246,7 +229,7 @@ class Missions(Driver):
     """The vehicle has a mission that leads along a way."""
     _due_ns = 0
 
-    def hear(self, message: Incoming) -> list[str]:
+    def hear(self, message: codec.Incoming) -> list[str]:
         if self._upload is not None:
             self._upload.hear(message)
         return super().hear(message)
@@ -257,12 +240,12 @@ class Missions(Driver):
     def ready(self, now_ns: int) -> bool:
         return self._accepted
 
-    def stay(self, position: Position, now_ns: int) -> Sequence[Outgoing]:
+    def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
         under_way = self._upload is not None
         self.forget()
-        return [MissionCancelled()] if under_way else []
+        return [codec.MissionCancelled()] if under_way else []
 
-    def lead(self, way: Way, position: Position, place: Point, now_ns: int) -> Sequence[Outgoing | str]:
+    def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
         if self._upload is None and now_ns >= self._due_ns and self._is_news(way, place):
             left = rest(way.points_m, place, self._frame.grid.resolution_m)
             known = self._seen is not way and self._accepted and not self._cut and is_end_of(left, self._sent)
@@ -280,7 +263,7 @@ class Missions(Driver):
         self._upload = None
         if upload.accepted:
             self._accepted = True
-            return [MissionCurrent(self._kind.first_item)]
+            return [codec.MissionCurrent(self._kind.first_item)]
         self._seen = None
         self._due_ns = now_ns + _AFTER_FAILURE_NS
         return [f"a mission of {len(upload.items)} items has failed: the vehicle {upload.why}"]
@@ -290,17 +273,17 @@ class Missions(Driver):
             return True
         return self._cut and math.dist(place, self._sent[-1]) < math.dist(place, self._sent[0])
 
-    def _items(self, position: Position) -> list[MissionItem]:
+    def _items(self, position: codec.Position) -> list[codec.MissionItem]:
         here, first = (position.lat_deg, position.lon_deg), self._kind.first_item
-        items = [(NAV_WAYPOINT, here)] * first
-        items += [(NAV_WAYPOINT, self._frame.to_wgs84(*point)) for point in self._sent]
+        items = [(codec.NAV_WAYPOINT, here)] * first
+        items += [(codec.NAV_WAYPOINT, self._frame.to_wgs84(*point)) for point in self._sent]
         if self._height_m is not None:
             # A plane flies home at the end of a mission, if nothing tells it to stay.
-            items[-1] = NAV_LOITER_UNLIM, items[-1][1]
+            items[-1] = codec.NAV_LOITER_UNLIM, items[-1][1]
             if position.height_m < _ON_GROUND_M:
-                items.insert(first, (NAV_TAKEOFF, here))
+                items.insert(first, (codec.NAV_TAKEOFF, here))
         return [
-            MissionItem(seq, command, self._above, *degrees, self._height_m or 0.0, current=seq == first)
+            codec.MissionItem(seq, command, self._above, *degrees, self._height_m or 0.0, current=seq == first)
             for seq, (command, degrees) in enumerate(items)
         ]
 
@@ -327,7 +310,7 @@ class Setpoints(Driver):
         streamed = self._began_ns is not None and now_ns - self._began_ns >= _STREAMED_FIRST_NS
         return not self._kind.streams or streamed
 
-    def lead(self, way: Way, position: Position, place: Point, now_ns: int) -> Sequence[Outgoing | str]:
+    def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
         near_m = self._frame.grid.resolution_m / 2
         left = rest(way.points_m, place, near_m)
         # The first lies half a cell ahead on the line; the vehicle drives straight to the turn behind it.
@@ -338,9 +321,9 @@ class Setpoints(Driver):
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
         self._due_ns = now_ns + (_STREAM_NS if self._kind.streams else _REPEAT_NS)
         self._holds_left = 0 if self._kind.streams else _HOLDS
-        return [Setpoint(self._above, *self._frame.to_wgs84(*goal), self._height_m)]
+        return [codec.Setpoint(self._above, *self._frame.to_wgs84(*goal), self._height_m)]
 
-    def stay(self, position: Position, now_ns: int) -> Sequence[Outgoing]:
+    def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
         if self._goal is not None:
             self._goal, self._began_ns, self._due_ns = None, None, 0
             self._hold_at = (position.lat_deg, position.lon_deg)
@@ -348,7 +331,7 @@ class Setpoints(Driver):
             return []
         self._holds_left -= 1
         self._due_ns = now_ns + _REPEAT_NS
-        return [Setpoint(self._above, *self._hold_at, self._height_m)]
+        return [codec.Setpoint(self._above, *self._hold_at, self._height_m)]
 
 
 # --- the few points of a route that an autopilot gets -------------------------------------------------------------

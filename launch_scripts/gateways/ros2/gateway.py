@@ -1,32 +1,82 @@
 """What ROS is told of a swarm: its state and the time in, messages to put out. Core: no bus, no clock.
 
-Each topic of the table has its rate; what comes late is left out, never made up for.
+Each row of the table of topics has a function here which yields its messages. It is called at the row's rate; what
+comes late is left out, never made up for. Topics of vehicles and targets come and go with them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple, Protocol
 
-from launch_scripts.gateways.ros2.actions import Action, Channel, Declare, Put
-from launch_scripts.gateways.ros2.diagnostics import Health, diagnostics_of
-from launch_scripts.gateways.ros2.frames import RosMap
-from launch_scripts.gateways.ros2.grids import occupancy_grid
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.gateways.ros2 import map_messages, ros_messages
+from launch_scripts.gateways.ros2.gateway_settings import Settings
 from launch_scripts.gateways.ros2.map_feed import MapFeed
-from launch_scripts.gateways.ros2.map_topics import MapTopics
-from launch_scripts.gateways.ros2.messages import RosMessages
-from launch_scripts.gateways.ros2.settings import Settings
-from launch_scripts.gateways.ros2.target_topics import TargetTopics
-from launch_scripts.gateways.ros2.topics import Direction, TopicRow
-from launch_scripts.gateways.ros2.types import RosTypes
-from launch_scripts.gateways.ros2.vehicle_topics import BARE, ToWgs84, VehicleTopics
+from launch_scripts.gateways.ros2.ros_messages import Level, PackedPlaces, Place, RosMap, RosMessages, ros_name
+from launch_scripts.gateways.ros2.ros_types import RosTypes
+from launch_scripts.gateways.ros2.topic_table import TARGET, VEHICLE, TopicRow
+from shared_map.cost_map import merged
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.clock import NS_PER_S
+from swarm.grid import Window
 from swarm.wire.messages.map_data import MarkSet
 
-_STEP_HZ = 10.0
-"""What has no rate of its own is looked at so often."""
-_MAP_HZ = 1.0
+MOST_VEHICLES = 1000
+"""More are not told: each has topics of its own, and each topic a token."""
+MOST_CUBES = 5000
+"""The marked cells of each kind that are drawn; all of them are in the map."""
+_STEP_HZ, _MAP_HZ = 10.0, 1.0
+"""What has no rate of its own is looked at so often; the map less often, as it is large."""
+_BARE = ("tf", "tf_static")
+"""Topics that each vehicle has for itself where its frames are bare."""
+_STANDS_NS = NS_PER_S // 2
+"""A vehicle of which no other place was told for so long stands."""
+_LEAP_M_PER_S = 100.0
+"""What moves faster was put elsewhere: it has no speed that anybody could use."""
+_PLAN_NS = NS_PER_S
+"""A vehicle's route is told at most so often."""
+_BAD_STATES = ("stranded", "lost")
+ToWgs84 = Callable[[float, float], tuple[float, float]]
+
+
+class Channel(NamedTuple):
+    """One topic in ROS.
+
+    row    name of its row in the table
+    topic  with its leading slash
+    """
+
+    row: str
+    topic: str
+
+
+class Declare(NamedTuple):
+    """Put topics up: a publisher with its token each."""
+
+    channels: tuple[Channel, ...]
+
+
+class Remove(NamedTuple):
+    """Take topics down."""
+
+    channels: tuple[Channel, ...]
+
+
+class Put(NamedTuple):
+    """Put a message; bytes are CDR already."""
+
+    channel: Channel
+    message: Any
+
+
+Action = Declare | Remove | Put
 
 
 class View(Protocol):
@@ -38,6 +88,91 @@ class View(Protocol):
     def targets(self) -> Mapping[str, SeenTarget]: ...
     def take_routes(self) -> Mapping[str, list[tuple[float, float]]]: ...
     def take_mark_sets(self) -> list[MarkSet]: ...
+
+
+@dataclass(frozen=True)
+class Health:
+    """What the shell knows of its two sides.
+
+    run         id of the run
+    swarm_up, ros_up  whether the links to the routers are up
+    counts      what was put, dropped and refused since the start
+    """
+
+    run: str = ""
+    swarm_up: bool = True
+    ros_up: bool = True
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+class _Now(NamedTuple):
+    """The moment of a tick, and what is seen then."""
+
+    now_ns: int
+    stamp_ns: int
+    swarm_now_ns: int
+    vehicles: Mapping[str, SeenVehicle]
+    targets: Mapping[str, SeenTarget]
+    health: Health
+
+
+_Told = Iterator[tuple[str | None, Any]]
+"""Messages of a row, each with the name in ROS of its vehicle or target; None if there is one for all."""
+
+
+class Moving:
+    """One vehicle as ROS is told of it. Its speed is the difference of the last two places that were told, by a
+    clock that never leaps: so are all times here.
+
+    id, name        in the swarm, and in ROS
+    frames          the one that does not move, and its own
+    place           a heading of None is told as the last known
+    speed_m_per_s   forward; negative backwards
+    turn_rad_per_s  clockwise
+    route           float64 (n, 2): x, y; what it follows
+    route_is_new    it was not told yet
+    """
+
+    def __init__(self, id: str, frames: tuple[str, str], seen: SeenVehicle, now_ns: int, made: RosMessages) -> None:
+        self.id, self.name, self.frames = id, ros_name(id), frames
+        self.place: Place = (seen.x_m, seen.y_m, seen.heading_rad)
+        self.speed_m_per_s = self.turn_rad_per_s = 0.0
+        self.route: NDArray[np.float64] = np.empty((0, 2), np.float64)
+        self.route_is_new = False
+        self.odometry = ros_messages.packed_odometry(made, frames)
+        self.transform = ros_messages.packed_transforms(made, [frames])
+        self._route_told_ns = now_ns - _PLAN_NS
+        self._moved_ns = now_ns
+
+    def take(self, seen: SeenVehicle, now_ns: int) -> None:
+        """Takes in where it is now."""
+        x_m, y_m, before_rad = self.place
+        heading_rad = before_rad if seen.heading_rad is None else seen.heading_rad
+        if self.place == (seen.x_m, seen.y_m, heading_rad):
+            if now_ns - self._moved_ns > _STANDS_NS:
+                self.speed_m_per_s = self.turn_rad_per_s = 0.0
+            return
+        # Of two places that were told long apart the first was left at an unknown time: no less than a report ago.
+        since_s = (now_ns - self._moved_ns) / NS_PER_S
+        if since_s > 0:
+            east_m, north_m = seen.x_m - x_m, seen.y_m - y_m
+            forward_m = math.hypot(east_m, north_m)
+            turned_rad = 0.0
+            leaps = forward_m > _LEAP_M_PER_S * since_s
+            if heading_rad is not None:
+                forward_m = east_m * math.sin(heading_rad) + north_m * math.cos(heading_rad)
+                if before_rad is not None:
+                    turned_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
+            self.speed_m_per_s = 0.0 if leaps else forward_m / since_s
+            self.turn_rad_per_s = 0.0 if leaps else turned_rad / since_s
+        self.place, self._moved_ns = (seen.x_m, seen.y_m, heading_rad), now_ns
+
+    def take_route(self, now_ns: int) -> bool:
+        """Whether its route is to be told now; then it is told."""
+        if not self.route_is_new or now_ns - self._route_told_ns < _PLAN_NS:
+            return False
+        self.route_is_new, self._route_told_ns = False, now_ns
+        return True
 
 
 class Gateway:
@@ -52,20 +187,39 @@ class Gateway:
     def __init__(
         self, settings: Settings, types: RosTypes, map: RosMap, feed: MapFeed, to_wgs84: ToWgs84 | None = None
     ) -> None:
-        self._problems: list[str] = []
-        rows = {row.name: row for row in settings.rows() if row.direction is Direction.OUT}
-        if to_wgs84 is None:
-            rows.pop("fix", None)
-        self._rows = rows
-        self._bare = settings.frames.bare
-        self._feed = feed
+        self._rows = {row.name: row for row in settings.rows() if to_wgs84 is not None or row.name != "fix"}
+        self._bare, self._patterns = settings.frames.bare, settings.vehicles
+        self._feed, self._to_wgs84 = feed, to_wgs84
         self._messages = RosMessages(types, map)
-        problem = self._problems.append
-        self._vehicles = VehicleTopics(rows, self._messages, settings.vehicles, self._bare, to_wgs84, problem)
-        self._targets = TargetTopics(rows, self._messages, problem)
-        self._map = MapTopics(rows, self._messages, feed)
-        self._due_ns = dict.fromkeys(rows, 0)
+        self._vehicles: dict[str, Moving] = {}
+        """By name in ROS."""
+        self._targets: dict[str, str] = {}
+        """Name in ROS -> id."""
+        self._refused: set[str] = set()
+        """Vehicles and targets that are not told; said once each."""
+        self._problems: list[str] = []
+        self._crew_changed = False
+        """Vehicles have come or gone since /tf_static was put."""
+        self._came: list[str] = []
+        """Names of those that have come since then."""
+        self._pose = ros_messages.packed_pose(self._messages)
+        self._transforms: PackedPlaces | None = None
+        """Of all vehicles in their order; None if others have come since it was made."""
+        self._fresh: list[Window] = []
+        """Windows that have changed since markers were put last."""
+        self._changed: list[Window] = []
+        """Windows that have changed since the map or its updates were put last."""
+        self._whole = False
+        """The whole map is to be put."""
+        self._due_ns = dict.fromkeys(self._rows, 0)
         self._begun = False
+        self._tellers: dict[str, Callable[[_Now], _Told]] = {
+            "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
+            "tf": self._tell_transforms, "odom": self._tell_odometry, "pose": self._tell_poses,
+            "plan": self._tell_plans, "fix": self._tell_fixes, "poses": self._tell_all_poses,
+            "targets": self._tell_targets, "target_pose": self._tell_target_poses,
+            "markers": self._tell_markers, "diagnostics": self._tell_diagnostics,
+        }  # fmt: skip
 
     @property
     def due_ns(self) -> int:
@@ -74,16 +228,15 @@ class Gateway:
 
     def whole_map(self, stamp_ns: int) -> Any:
         """nav_msgs/OccupancyGrid of the map as it is known now."""
-        return occupancy_grid(self._messages, stamp_ns, self._feed.occupancy(self._feed.grid.window))
+        return map_messages.occupancy_grid(self._messages, stamp_ns, self._feed.occupancy(self._feed.grid.window))
 
     def take_problems(self) -> list[str]:
         """Sentences for people since the last call."""
-        taken = list(self._problems)
-        self._problems.clear()
+        taken, self._problems = self._problems, []
         return taken
 
     def tick(self, now_ns: int, stamp_ns: int, swarm_now_ns: int, view: View, health: Health) -> list[Action]:
-        """What is to be done now, in order.
+        """Returns what is to be done now, in order.
 
         now_ns        by a clock that never leaps, by which all rates are kept
         stamp_ns      by the clock of this machine, since 1970, which stamps what ROS hears
@@ -92,41 +245,225 @@ class Gateway:
         due = {name for name, at_ns in self._due_ns.items() if now_ns >= at_ns}
         if not due:
             return []
-        for name in due:
-            self._due_ns[name] = _next_ns(self._rows[name], now_ns)
-        vehicles, targets = view.vehicles, view.targets
-        actions = [
-            *self._begin(),
-            *self._vehicles.follow(vehicles, now_ns, stamp_ns),
-            *self._targets.follow(targets),
-        ]
+        now = _Now(now_ns, stamp_ns, swarm_now_ns, view.vehicles, view.targets, health)
+        actions = [*self._begin(), *self._follow(now)]
         for id, points_m in view.take_routes().items():
-            self._vehicles.route(id, points_m)
-        actions += self._vehicles.tell(due, now_ns, stamp_ns)
-        actions += self._targets.tell(due, targets, stamp_ns)
+            if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:
+                moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
         if due & {"map", "map_updates", "markers"}:
             self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
-            actions += self._map.tell(due, self._vehicles.told, now_ns, stamp_ns, swarm_now_ns)
-        if "diagnostics" in due:
-            told = diagnostics_of(self._messages, vehicles, targets, health, self._feed.knows_ground)
-            channel = Channel("diagnostics", self._rows["diagnostics"].topic)
-            actions.append(Put(channel, self._messages.diagnostics(stamp_ns, told)))
+            self._take_changes(now_ns, whole="map" in due)
+        for name, tell in self._tellers.items():
+            if name in due:
+                self._due_ns[name] = _next_ns(self._rows[name], now_ns)
+                actions += [Put(self._channel(name, of), message) for of, message in tell(now)]
         return actions
+
+    # --- who is there ---------------------------------------------------------------------------------------------
 
     def _begin(self) -> list[Action]:
         """Topics that are there from the first tick on."""
         if self._begun:
             return []
         self._begun = True
-        return [
-            Declare(
-                tuple(
-                    Channel(name, row.topic)
-                    for name, row in self._rows.items()
-                    if row.per is None and not (self._bare and name in BARE)
-                )
+        rows = self._rows.values()
+        return [Declare(tuple(self._channel(row.name) for row in rows if self._per(row) is None))]
+
+    def _follow(self, now: _Now) -> list[Action]:
+        """Takes in who is where. Topics of vehicles that are new are declared, of those that have left taken down.
+        A target of a scenario stays."""
+        gone = [name for name, moving in self._vehicles.items() if moving.id not in now.vehicles]
+        actions: list[Action] = [Remove(self._channels(VEHICLE, name)) for name in gone]
+        for name in gone:
+            del self._vehicles[name]
+        if gone:
+            self._refused = {each for each in self._refused if each.startswith("target")}  # their names are free
+        taken = [self._take(id, seen, now.now_ns) for id, seen in now.vehicles.items()]
+        came = [name for name in taken if name is not None]
+        if came or gone:
+            self._transforms, self._crew_changed = None, True
+            self._came += came
+        actions += [Declare(self._channels(VEHICLE, name)) for name in came]
+        for id in now.targets:
+            name = ros_name(id)
+            if name not in self._targets:
+                self._targets[name] = id
+                actions.append(Declare(self._channels(TARGET, name)))
+            elif self._targets[name] != id:
+                self._refuse(f"target {id}", f"{self._targets[name]} is called {name}, too")
+        return actions
+
+    def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> str | None:
+        """Returns the name of a vehicle that is told from now on; None of one that is known, or not told."""
+        name = ros_name(id)
+        moving = self._vehicles.get(name)
+        if moving is not None and moving.id == id:
+            moving.take(seen, now_ns)
+        elif not any(fnmatchcase(id, each) for each in self._patterns):
+            pass
+        elif moving is not None:
+            self._refuse(f"vehicle {id}", f"{moving.id} is called {name}, too")
+        elif len(self._vehicles) >= MOST_VEHICLES:
+            self._refuse(f"vehicle {id}", f"there are {MOST_VEHICLES} already")
+        else:
+            frames = (
+                ("odom", "base_link")
+                if self._bare
+                else (ros_messages.odom_frame(name), ros_messages.base_frame(name))
             )
+            self._vehicles[name] = Moving(id, frames, seen, now_ns, self._messages)
+            return name
+        return None
+
+    def _refuse(self, who: str, why: str) -> None:
+        if who not in self._refused:
+            self._refused.add(who)
+            self._problems.append(f"{who} is not told to ROS: {why}")
+
+    def _per(self, row: TopicRow) -> str | None:
+        """What there is a topic of the row for each of: VEHICLE, TARGET, or None."""
+        return VEHICLE if self._bare and row.name in _BARE else row.per
+
+    def _channels(self, per: str, name: str) -> tuple[Channel, ...]:
+        return tuple(self._channel(row.name, name) for row in self._rows.values() if self._per(row) == per)
+
+    def _channel(self, row: str, name: str | None = None) -> Channel:
+        topic = self._rows[row].topic
+        if name is not None and self._rows[row].per is None:
+            return Channel(row, f"/{name}{topic}")
+        return Channel(row, topic.replace(VEHICLE, name or "").replace(TARGET, name or ""))
+
+    # --- vehicles -------------------------------------------------------------------------------------------------
+
+    def _tell_odometry(self, now: _Now) -> _Told:
+        for name, each in self._vehicles.items():
+            twist = each.speed_m_per_s, each.turn_rad_per_s
+            yield name, each.odometry.at(now.stamp_ns, [each.place], twist)
+
+    def _tell_poses(self, now: _Now) -> _Told:
+        for name, each in self._vehicles.items():
+            yield name, self._pose.at(now.stamp_ns, [each.place])
+
+    def _tell_plans(self, now: _Now) -> _Told:
+        for name, each in self._vehicles.items():
+            if each.take_route(now.now_ns):
+                yield name, ros_messages.packed_path(self._messages.map, now.stamp_ns, each.route)
+
+    def _tell_fixes(self, now: _Now) -> _Told:
+        for name, each in self._vehicles.items():
+            if self._to_wgs84 is not None:
+                place = self._to_wgs84(*each.place[:2])
+                yield name, self._messages.fix(now.stamp_ns, each.frames[1], *place)
+
+    def _tell_transforms(self, now: _Now) -> _Told:
+        if self._bare:
+            for name, each in self._vehicles.items():
+                yield name, each.transform.at(now.stamp_ns, [each.place])
+        elif self._vehicles:
+            if self._transforms is None:
+                frames = [each.frames for each in self._vehicles.values()]
+                self._transforms = ros_messages.packed_transforms(self._messages, frames)
+            yield None, self._transforms.at(now.stamp_ns, [each.place for each in self._vehicles.values()])
+
+    def _tell_static(self, now: _Now) -> _Told:
+        """The frames that do not move lie in the map's origin."""
+
+        def of(vehicles: Iterable[Moving]) -> Any:
+            pairs = [(self._messages.map.frame, each.frames[0]) for each in vehicles]
+            return self._messages.transforms(self._messages.transform(now.stamp_ns, pair) for pair in pairs)
+
+        came, self._came = self._came, []
+        if self._bare:
+            for name in dict.fromkeys(came):
+                if name in self._vehicles:
+                    yield name, of([self._vehicles[name]])
+        elif self._vehicles and self._crew_changed:
+            yield None, of(self._vehicles.values())
+        self._crew_changed = False
+
+    def _tell_all_poses(self, now: _Now) -> _Told:
+        told = sorted(self._vehicles.values(), key=lambda each: each.id)
+        points_m = np.array([each.place[:2] for each in told], np.float64).reshape(-1, 2)
+        yield None, self._messages.pose_array(now.stamp_ns, points_m, [each.place[2] for each in told])
+
+    # --- targets. What nobody tracks may be anywhere: it is told again when somebody does -------------------------
+
+    def _tracked(self, now: _Now) -> dict[str, SeenTarget]:
+        """By name in ROS."""
+        seen = now.targets
+        return {name: seen[id] for name, id in self._targets.items() if id in seen and not seen[id].lost}
+
+    def _tell_target_poses(self, now: _Now) -> _Told:
+        for name, each in self._tracked(now).items():
+            yield name, self._messages.pose_stamped(now.stamp_ns, each.x_m, each.y_m)
+
+    def _tell_targets(self, now: _Now) -> _Told:
+        tracked = sorted(self._tracked(now).values(), key=lambda each: each.id)
+        places = np.array([(each.x_m, each.y_m) for each in tracked], np.float64).reshape(-1, 2)
+        yield None, self._messages.pose_array(now.stamp_ns, places)
+
+    # --- the map --------------------------------------------------------------------------------------------------
+
+    def _take_changes(self, now_ns: int, *, whole: bool) -> None:
+        changed = self._feed.change(now_ns, whole=whole)
+        self._whole = changed is None
+        self._fresh += changed or []
+        if "map_updates" in self._rows:
+            self._changed = [] if changed is None else merged(changed, self._changed)
+
+    def _tell_map(self, now: _Now) -> _Told:
+        if self._whole:
+            yield None, self.whole_map(now.stamp_ns)
+
+    def _tell_updates(self, now: _Now) -> _Told:
+        changed, self._changed = self._changed, []
+        for window in changed:
+            cells = self._feed.occupancy(window)
+            yield None, map_messages.occupancy_update(self._messages, now.stamp_ns, cells, window)
+
+    def _tell_markers(self, now: _Now) -> _Told:
+        grid, fresh = self._feed.grid, self._fresh
+        self._fresh = []
+        lethal, paced = (cells[:MOST_CUBES].tolist() for cells in self._feed.marked)
+        drawn: list[map_messages.Drawing] = [
+            *(map_messages.route(grid, map_messages.corners(each.route)) for each in self._vehicles.values()),
+            *map_messages.marked_cells(grid, lethal, paced),
+            *(
+                map_messages.zone(grid, closed, cells)
+                for closed, cells in self._feed.zones(now.swarm_now_ns).values()
+            ),
+            map_messages.windows(grid, fresh),
         ]
+        yield None, map_messages.marker_array(self._messages, now.stamp_ns, drawn)
+
+    # --- how all are ----------------------------------------------------------------------------------------------
+
+    def _tell_diagnostics(self, now: _Now) -> _Told:
+        """Of vehicles, targets, map and gateway: whether each is well, a sentence, and values."""
+        states = Counter(each.state for each in now.vehicles.values())
+        bad = ", ".join(f"{states[state]} {state}" for state in _BAD_STATES if states[state])
+        lost = sorted(each.id for each in now.targets.values() if each.lost)
+        captures = sum(each.captures for each in now.targets.values())
+        grid, health, knows = self._feed.grid, now.health, self._feed.knows_ground
+        west_m, south_m = self._messages.map.origin_m
+        up = health.swarm_up and health.ros_up
+        vehicles = bad or f"{len(now.vehicles)} vehicles"
+        nothing = "marks alone: the terrain of the run is not on this machine"
+        rows: tuple[tuple[str, Level, str, Mapping[str, object]], ...] = (
+            ("vehicles", Level.WARN if bad or not now.vehicles else Level.OK, vehicles,
+             {"vehicles": len(now.vehicles), **dict(sorted(states.items()))}),
+            ("targets", Level.WARN if lost else Level.OK,
+             f"nobody tracks {', '.join(lost[:10])}" if lost else f"{len(now.targets)} targets",
+             {"targets": len(now.targets), "lost": len(lost), "captures": captures}),
+            ("map", Level.OK if knows else Level.WARN, "ground and marks" if knows else nothing,
+             {"crs": grid.crs, "origin_x_m": west_m, "origin_y_m": south_m, "rows": grid.rows, "cols": grid.cols,
+              "resolution_m": grid.resolution_m}),
+            ("gateway", Level.OK if up else Level.ERROR, "both links are up" if up else "a link is down",
+             {"run": health.run, **dict(sorted(health.counts.items()))}),
+        )  # fmt: skip
+        told = [self._messages.diagnostic(f"swarm: {row[0]}", *row[1:]) for row in rows]
+        header = self._messages.header(now.stamp_ns, "")
+        yield None, self._messages.types.make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=told)
 
 
 def _next_ns(row: TopicRow, now_ns: int) -> int:

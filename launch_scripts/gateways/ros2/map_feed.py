@@ -6,94 +6,38 @@ else is unknown.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.gateways.ros2.grids import Occupancy, occupancy_of
-from shared_map.arrays import Floats
-from shared_map.cost_map import CostMap, merged
+from launch_scripts.gateways.ros2.map_messages import Occupancy, occupancy_of
+from shared_map.cost_map import CostMap
 from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
+from shared_map.terrain.prepared import load_prepared, read_meta
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
-from swarm.grid import TILE_CELLS, GridSpec, Window
+from swarm.errors import SwarmError, TerrainError
+from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 QUICK_S_PER_M = 0.1
-"""What the quickest ground is taken for where the terrain is not known: 10 m/s."""
-_WHOLE_SHARE = 0.02
-"""The whole map is due when windows of more than this share of it have changed since it was put last."""
+"""The pace of the quickest ground where the terrain is not known: 10 m/s."""
+_WHOLE_SHARE, _MUCH_CELLS = 0.02, 1000
+"""Much has changed if windows of more than this share of the map have, and of more cells than these."""
 _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
-"""It is due so long after it was put last if anything has changed; as many times longer as it has more cells."""
+"""The whole map is due so long after it was put last if much has changed. If anything has, it is due after as many
+times longer as it has more cells than a million."""
 _REDRAW_NS = 10 * NS_PER_S
 """All marks are looked at again so often, as those that expire are in no set that comes."""
+_META = "terrain.json"
+_NEWEST = 50
+"""The folders of runs that are looked at."""
 _Cells = NDArray[np.uint32]
 _NO_CELLS: _Cells = np.empty(0, np.uint32)
-
-
-class Sink(Protocol):
-    """What a replica keeps at the winning statements: `CostMap`, or `MarksAlone`."""
-
-    pace_s_per_m: Floats
-
-    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> object: ...
-    def learn(self, words: Sequence[MarkSet]) -> bool: ...
-    def take_dirty(self) -> list[Window]: ...
-
-
-class MarksAlone:
-    """A cost map that knows no ground: NaN where nothing is marked.
-
-    pace_s_per_m  float32 (rows, cols)
-    """
-
-    def __init__(self, grid: GridSpec) -> None:
-        self.pace_s_per_m: Floats = np.full((grid.rows, grid.cols), np.nan, np.float32)
-        self._cols = grid.cols
-        self._dirty: list[Window] = []
-
-    def apply(
-        self,
-        cells: NDArray[np.uint32],
-        kinds: NDArray[np.uint8],
-        paces: NDArray[np.float32],
-        class_number: int = 0,
-    ) -> None:
-        if class_number:
-            return  # for one class of vehicles alone
-        values = np.where(kinds == MarkKind.PACE, paces, np.where(kinds == MarkKind.LETHAL, np.inf, np.nan))
-        self.pace_s_per_m.reshape(-1)[cells] = values
-        rows, cols = np.divmod(np.asarray(cells, np.int64), self._cols)
-        boxes: dict[tuple[int, int], Window] = {}
-        for row, col in zip(rows.tolist(), cols.tolist(), strict=True):
-            tile, box = (row // TILE_CELLS, col // TILE_CELLS), Window(row, col, row + 1, col + 1)
-            boxes[tile] = boxes[tile].union(box) if tile in boxes else box
-        self._dirty = merged(boxes.values(), self._dirty)
-
-    def learn(self, words: Sequence[MarkSet]) -> bool:
-        """What was learned is about kinds of ground, of which nothing is known here."""
-        return False
-
-    def take_dirty(self) -> list[Window]:
-        windows, self._dirty = self._dirty, []
-        return windows
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """What is to be told of the map.
-
-    whole    all of it
-    windows  those that have changed since they were told last; empty with `whole`
-    """
-
-    whole: bool
-    windows: tuple[Window, ...]
 
 
 class MapFeed:
@@ -106,9 +50,10 @@ class MapFeed:
     def __init__(self, grid: GridSpec, terrain: Terrain | None) -> None:
         self.grid = grid
         self.knows_ground = terrain is not None
-        self._sink: Sink = MarksAlone(grid) if terrain is None else CostMap(terrain, learning=True)
-        self._replica = MapReplica(grid, self._sink)
-        self._best_s_per_m = QUICK_S_PER_M if terrain is None else _quickest(terrain.pace_s_per_m)
+        self._map = CostMap(_unknown(grid)) if terrain is None else CostMap(terrain, learning=True)
+        self._replica = MapReplica(grid, self._map)
+        passable = self._map.pace_s_per_m[np.isfinite(self._map.pace_s_per_m)]
+        self._best_s_per_m = float(passable.min()) if len(passable) else QUICK_S_PER_M
         self._told_ns: int | None = None
         self._changed_cells = 0
         """Since the whole map was told last, at `_told_ns`."""
@@ -118,7 +63,7 @@ class MapFeed:
         self._redraw_due_ns = 0
 
     def merge(self, sets: Sequence[MarkSet], now_ns: int, swarm_now_ns: int) -> None:
-        """Take in sets of marks, and let expire what has expired.
+        """Takes in sets of marks, and lets expire what has expired.
 
         now_ns        by a clock that never leaps
         swarm_now_ns  by the swarm's clocks
@@ -131,40 +76,41 @@ class MapFeed:
             tiles |= self._marked.keys()
         for tile in tiles:
             if tile < self.grid.tiles:
-                self._mark(tile)
+                won = self._replica.winners(tile)
+                cells = self._cells_of(tile, won.cells)
+                self._marked[tile] = cells[won.kinds == MarkKind.LETHAL], cells[won.kinds == MarkKind.PACE]
 
-    def change(self, now_ns: int, *, whole: bool = True) -> Change:
-        """What is to be told since the last call. At first the whole map, if that is wanted.
+    def change(self, now_ns: int, *, whole: bool) -> list[Window] | None:
+        """Returns the windows that have changed since the last call, or None if the whole map is to be told: at
+        first, and when that is due.
 
         now_ns  by a clock that never leaps
+        whole   the whole map may be told now
         """
-        windows = self._sink.take_dirty()
+        windows = self._map.take_dirty()
         self._changed_cells += sum(each.cells for each in windows)
-        much = self._changed_cells > _WHOLE_SHARE * self.grid.cells and self._changed_cells > 1000
-        since_ns = None if self._told_ns is None else now_ns - self._told_ns
-        if whole and (
-            since_ns is None or (self._changed_cells and since_ns >= (_WHOLE_NS if much else self._whole_ns))
-        ):
-            self._told_ns, self._changed_cells = now_ns, 0
-            return Change(True, ())
-        return Change(False, tuple(windows))
+        much = self._changed_cells > max(_WHOLE_SHARE * self.grid.cells, _MUCH_CELLS)
+        wait_ns = _WHOLE_NS if much else self._whole_ns
+        due = self._told_ns is None or (self._changed_cells and now_ns - self._told_ns >= wait_ns)
+        if not (whole and due):
+            return windows
+        self._told_ns, self._changed_cells = now_ns, 0
+        return None
 
     def occupancy(self, window: Window) -> Occupancy:
         """int8 (rows, cols) of a window, row 0 in the north, as `occupancy_of` has it."""
-        pace = self._sink.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
+        pace = self._map.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
         return occupancy_of(pace, self._best_s_per_m)
 
     @property
     def marked(self) -> tuple[_Cells, _Cells]:
         """Cells that are marked as lethal, and those that are marked with a pace; zones among them."""
-        if not self._marked:
-            return _NO_CELLS, _NO_CELLS
-        lethal, paced = zip(*self._marked.values(), strict=True)
+        lethal, paced = zip((_NO_CELLS, _NO_CELLS), *self._marked.values(), strict=True)
         return np.concatenate(lethal), np.concatenate(paced)
 
     def zones(self, now_ns: int) -> Mapping[str, tuple[bool, _Cells]]:
         """The zones that stand: whether they are closed, and their cells, by name."""
-        found: dict[str, tuple[bool, list[_Cells]]] = {}
+        found: dict[str, tuple[bool, _Cells]] = {}
         for tile in self._replica.held.tiles:
             if tile >= self.grid.tiles:
                 continue
@@ -173,22 +119,53 @@ class MapFeed:
                     said = standing(each, now_ns)
                     stated = said.kinds != MarkKind.CLEAR
                     if stated.any():
-                        closed = bool((said.kinds[stated] == MarkKind.LETHAL).any())
-                        name = each.author.partition(".")[2]
-                        _, cells = found.setdefault(name, (closed, []))
-                        cells.append(grid_cells(self.grid, tile_corners(self.grid, [tile])[0], said.cells[stated]))
-        return {name: (closed, np.concatenate(cells)) for name, (closed, cells) in found.items()}
+                        closed, before = found.get(each.author, (False, _NO_CELLS))
+                        cells = np.concatenate([before, self._cells_of(tile, said.cells[stated])])
+                        closed |= bool((said.kinds[stated] == MarkKind.LETHAL).any())
+                        found[each.author] = closed, cells
+        return found
 
-    def _mark(self, tile: int) -> None:
-        won = self._replica.winners(tile)
-        cells = grid_cells(self.grid, tile_corners(self.grid, [tile])[0], won.cells)
-        lethal, paced = cells[won.kinds == MarkKind.LETHAL], cells[won.kinds == MarkKind.PACE]
-        if len(lethal) or len(paced):
-            self._marked[tile] = lethal, paced
-        else:
-            self._marked.pop(tile, None)
+    def _cells_of(self, tile: int, cells: NDArray[np.uint16]) -> _Cells:
+        return grid_cells(self.grid, tile_corners(self.grid, [tile])[0], cells)
 
 
-def _quickest(pace_s_per_m: Floats) -> float:
-    passable = pace_s_per_m[np.isfinite(pace_s_per_m)]
-    return float(passable.min()) if len(passable) else QUICK_S_PER_M
+def _unknown(grid: GridSpec) -> Terrain:
+    """The terrain of which nothing is known: each pace is NaN, until a mark says one."""
+    pace, none = np.full((grid.rows, grid.cols), np.nan, np.float32), np.empty((0, 0), np.uint8)
+    return Terrain(grid, none.astype(np.float32), none, pace, none, "", pace)
+
+
+def find_terrain(digest: str, folder: Path | None, runs: Path) -> Terrain | None:
+    """The terrain with this digest: in a folder, or in that of any run of this machine, for terrains of one digest
+    are equal. None if none is here.
+
+    folder  None: the newest folders in `runs` are looked at
+
+    Raises TerrainError if the folder that was named has none, or another.
+    """
+    if folder is None:
+        return next((found for each in _newest_first(runs) if (found := _of_digest(each, digest))), None)
+    terrain = load_prepared(folder)
+    if terrain is None:
+        raise TerrainError(f"no prepared terrain in {folder}: expected the folder of a run, which holds {_META}")
+    if terrain.digest != digest:
+        raise TerrainError(f"{folder} holds terrain {terrain.digest}, and the run has {digest}")
+    return terrain
+
+
+def _of_digest(folder: Path, digest: str) -> Terrain | None:
+    """The terrain of a folder if it has this digest, and is whole."""
+    try:
+        meta = read_meta(folder / _META, "")
+        return load_prepared(folder) if meta is not None and meta.get("digest") == digest else None
+    except SwarmError:
+        return None  # another run's damage is no business of ours
+
+
+def _newest_first(runs: Path) -> Iterator[Path]:
+    try:
+        folders = [each for each in runs.iterdir() if not each.is_symlink() and (each / _META).is_file()]
+        folders.sort(key=lambda each: each.stat().st_mtime_ns, reverse=True)
+    except OSError:
+        return
+    yield from folders[:_NEWEST]

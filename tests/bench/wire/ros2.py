@@ -128,7 +128,7 @@ def ros2(
 
     As a share of one core, and what a hearer of all topics gets meanwhile.
     """
-    from launch_scripts.gateways.ros2.node import close_ros, open_ros
+    from launch_scripts.gateways.ros2.ros_node import close_ros, open_ros
 
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     ros_side = NetworkConfig(namespace="ros", listen=(endpoint,), connect=(endpoint,))

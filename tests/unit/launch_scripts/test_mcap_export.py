@@ -22,9 +22,7 @@ from rosbags.highlevel import AnyReader
 from support.fake_run import fake_run
 
 from launch_scripts.cli import main
-from launch_scripts.gateways.ros2.frames import RosMap
-from launch_scripts.gateways.ros2.grids import rows_from_north
-from launch_scripts.gateways.ros2.names import ros_name
+from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
 from launch_scripts.report.timeline import frame_names, instants_of
@@ -165,7 +163,7 @@ def test_the_map_says_what_is_lost_of_the_best_speed(heard: dict[str, list[tuple
     ((_, told),) = heard["/map"]
     assert (told.info.resolution, told.info.width, told.info.height) == (25.0, 64, 48)
     assert (told.info.origin.position.x, told.info.origin.position.y) == (0, 0)
-    shown = rows_from_north(np.array(told.data, np.int8), told.info.height, told.info.width)
+    shown = np.array(told.data, np.int8).reshape(told.info.height, told.info.width)[::-1]
     expected = np.zeros((48, 64), np.int8)
     expected[:10, :10], expected[30:, 20:40], expected[40:, 60:] = 50, 75, 100
     assert (shown == expected).all()
@@ -179,7 +177,7 @@ def test_marks_are_in_the_last_grid_as_they_were_at_the_end(
     for before, after in itertools.pairwise(grids):
         assert (after[before >= 0] == before[before >= 0]).all()
         assert (after >= 0).sum() > (before >= 0).sum()
-    last = rows_from_north(grids[-1], 48, 64).reshape(-1)
+    last = grids[-1].reshape(48, 64)[::-1].reshape(-1)
     marked = tracks.marks.kinds != MarkKind.CLEAR
     assert set(np.flatnonzero(last >= 0).tolist()) == set(tracks.marks.cells[marked].tolist())
     lethal = tracks.marks.cells[tracks.marks.kinds == MarkKind.LETHAL]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import random
+import threading
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import pairwise
 from types import SimpleNamespace
@@ -14,22 +16,29 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.effort import few
+from support.ros_messages import path
+from support.ros_node import FakeNode
 
-from launch_scripts.gateways.ros2.frames import RosMap, quaternion_of
-from launch_scripts.gateways.ros2.incoming.areas import MOST_CELLS, closed_cells, corners_of
-from launch_scripts.gateways.ros2.incoming.goals import GoalTargets
-from launch_scripts.gateways.ros2.incoming.places import FrameReader, Place, robot_place
-from launch_scripts.gateways.ros2.incoming.settings import (
+from launch_scripts.gateways.ros2.gateway_settings import (
     GridSettings,
     IncomingSettings,
     Robots,
     ZoneSettings,
     check_incoming,
 )
-from launch_scripts.gateways.ros2.incoming.tracks import Track
-from launch_scripts.gateways.ros2.messages import RosMessages
-from launch_scripts.gateways.ros2.packed_path import packed_path
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.incoming.place_routes import GoalTargets
+from launch_scripts.gateways.ros2.incoming.readings import (
+    MOST_CELLS,
+    FrameReader,
+    Place,
+    Track,
+    closed_cells,
+    corners_of,
+    robot_place,
+)
+from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, packed_path, quaternion_of
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
@@ -74,6 +83,14 @@ messages = st.builds(
 )  # fmt: skip
 
 
+def tried(read: Callable[..., Any], *given: Any) -> Any:
+    """What is read, or the sentence that says why it is not."""
+    try:
+        return read(*given)
+    except ConfigError as error:
+        return str(error)
+
+
 def assert_valid(place: Place) -> None:
     assert GRID.cell_at(place.x_m, place.y_m) >= 0
     assert 0 <= place.speed_m_per_s <= MOST_M_PER_S
@@ -82,7 +99,7 @@ def assert_valid(place: Place) -> None:
 
 @given(messages, NUMBERS.filter(lambda x: abs(x) < 1e12), NUMBERS.filter(lambda x: abs(x) < 10))
 def test_any_message_of_a_robot_is_a_valid_place_or_a_sentence(message: Any, offset: float, turn: float) -> None:
-    found = robot_place(FrameReader(MAP, "uav/odom", (offset, -offset), turn), message)
+    found = tried(robot_place, FrameReader(MAP, "uav/odom", (offset, -offset), turn), message)
     if isinstance(found, str):
         assert "expected" in found
         assert len(found) < 400
@@ -92,23 +109,28 @@ def test_any_message_of_a_robot_is_a_valid_place_or_a_sentence(message: Any, off
 
 @given(st.lists(st.tuples(messages, st.integers(0, 3 * NS_PER_S)), max_size=30), st.floats(0.1, 50))
 def test_the_swarm_is_told_valid_places_at_a_bounded_rate_whatever_comes(words: Any, hz: float) -> None:
-    said: list[str] = []
-    track = Track(FrameReader(MAP, "uav/odom"), 2.0, hz, said.append)
-    now_ns, told_ns, heard_ns = 0, [], None
+    track = Track(FrameReader(MAP, "uav/odom"), 2.0)
+    told_ns: list[int] = []
+
+    def take(message: Any, now_ns: int) -> None:
+        assert_valid(track.hear(message, now_ns))
+        told_ns.append(now_ns)
+
+    node: Any = FakeNode(TYPES)
+    poses = Input(node, "/uav/odom", KINDS[0], hz, take)
+    now_ns, heard = 0, False
     for message, step_ns in words:
         now_ns += step_ns
-        if track.due(now_ns):
-            place = track.hear(message, now_ns)
-            if place is not None:
-                assert_valid(place)
-                told_ns.append(now_ns)
-                heard_ns = now_ns
+        node.topics["/uav/odom"].waiting.append(message)
+        before = len(told_ns)
+        poses.tick(now_ns)
+        heard = heard or len(told_ns) > before
         gone = track.gone(now_ns)
-        assert gone == (heard_ns is not None and now_ns - heard_ns > 2 * NS_PER_S)
-        heard_ns = None if gone else heard_ns
-        assert (track.place is None) == (heard_ns is None)
-    assert all(later - sooner >= NS_PER_S / hz for sooner, later in pairwise(told_ns))
-    assert len(said) <= track.refused
+        assert gone == (heard and now_ns - told_ns[-1] > 2 * NS_PER_S)
+        heard = heard and not gone
+        assert (track.place is None) == (not heard)
+    assert all(later - sooner >= int(NS_PER_S / hz) for sooner, later in pairwise(told_ns))
+    assert len(told_ns) + poses.refused <= len(words)
 
 
 @given(st.integers(0, 11), st.integers(0, 15), st.floats(0, math.tau, exclude_max=True), st.floats(-3, 3))
@@ -133,22 +155,45 @@ def test_a_robot_that_drives_backwards_is_told_to_go_where_it_goes() -> None:
 
 
 def test_poses_tell_a_speed_that_the_messages_do_not() -> None:
-    track = Track(FrameReader(MAP), 2.0, 10.0, pytest.fail)
+    track = Track(FrameReader(MAP), 2.0)
     track.hear(n(header=header(), pose=pose(50, 50)), 0)
     found = track.hear(n(header=header(), pose=pose(50, 53)), NS_PER_S)
-    assert found is not None
     assert (found.heading_rad, found.speed_m_per_s) == (pytest.approx(0.0), pytest.approx(3.0))
 
 
-def test_a_reason_is_said_once_until_a_good_message_comes() -> None:
-    said: list[str] = []
-    track = Track(FrameReader(MAP), 2.0, 10.0, said.append)
-    for number in range(20):
-        track.hear(odometry(50, 50, frame="odom"), number * NS_PER_S)
-    assert said == ["frame is 'odom', expected 'map' or 'terrain'"]
-    track.hear(odometry(50, 50), 30 * NS_PER_S)
-    track.hear(odometry(50, 50, frame="odom"), 31 * NS_PER_S)
-    assert len(said) == 2
+def test_a_reason_is_said_once_until_a_good_message_comes(caplog: pytest.LogCaptureFixture) -> None:
+    node: Any = FakeNode(TYPES)
+    track = Track(FrameReader(MAP), 2.0)
+    poses = Input(node, "/uav/odom", KINDS[0], 10.0, track.hear)  # type: ignore[arg-type]
+    for number, frame in enumerate(["odom"] * 20 + ["map", "odom"]):
+        node.topics["/uav/odom"].waiting.append(odometry(50, 50, frame=frame))
+        poses.tick(number * NS_PER_S)
+    assert [record.getMessage() for record in caplog.records] == [
+        "topic /uav/odom: frame is 'odom', expected 'map' or 'terrain'"
+    ] * 2
+
+
+def test_a_queue_is_bounded_and_all_that_it_takes_is_answered() -> None:
+    queue, begun, go = WorkQueue("test", 1, 3), threading.Event(), threading.Event()
+    failed: list[str] = []
+
+    def wait() -> None:
+        begun.set()
+        go.wait(10)
+
+    def refuse() -> None:
+        raise ConfigError("it is refused")
+
+    assert queue.give("waiting", wait, failed.append)
+    assert begun.wait(10)
+    assert queue.give("refused", refuse, failed.append)
+    assert queue.give("refused", refuse, failed.append)
+    assert not queue.give("too much", refuse, failed.append)
+    queue.close()
+    assert failed == ["the gateway ends"] * 2
+    go.set()
+    queue.give("late", refuse, failed.append)
+    assert failed[2:] == ["the gateway ends"]
 
 
 # --- goals -----------------------------------------------------------------------------------------------------
@@ -191,7 +236,7 @@ def test_any_grid_closes_cells_of_the_terrain_or_is_a_sentence(
     more: int, turn: float,
 ) -> None:  # fmt: skip
     message = grid_message([value] * (width * height + more), width, height, resolution, x, y, frame, z=turn)
-    found = closed_cells(MAP, message, occupied)
+    found = tried(closed_cells, MAP, message, occupied)
     if not isinstance(found, str):
         assert found == sorted(set(found))
         assert all(0 <= cell < GRID.cells for cell in found)
@@ -205,7 +250,8 @@ def test_cells_are_closed_by_the_area_under_them(
     width: int, height: int, resolution: float, x: float, y: float, chance: Any
 ) -> None:
     data = [chance.choice([-1, 0, 50, 100]) for _ in range(width * height)]
-    found = closed_cells(MAP, grid_message(data, width, height, resolution, float(x), float(y)), 50)
+    message = grid_message(data, width, height, resolution, float(x), float(y))
+    found = tried(closed_cells, MAP, message, 50)
 
     def overlap(a: float, b: float, c: float, d: float) -> float:
         return max(0.0, min(b, d) - max(a, c))
@@ -230,14 +276,14 @@ def test_cells_are_closed_by_the_area_under_them(
 def test_a_grid_that_would_close_too_much_is_refused() -> None:
     large = RosMap(GridSpec(400, 400, 10.0))
     message = grid_message([100], 1, 1, 4000.0, 0.0, 0.0)
-    found = closed_cells(large, message, 100)
+    found = tried(closed_cells, large, message, 100)
     assert found == f"grid closes 160000 cells of the terrain, expected at most {MOST_CELLS}"
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), max_size=300), FRAMES)
 def test_any_polygon_is_corners_on_the_terrain_or_a_sentence(points: Any, frame: str) -> None:
     message = n(header=header(frame), polygon=n(points=[n(x=x, y=y, z=0.0) for x, y in points]))
-    found = corners_of(FrameReader(MAP), message)
+    found = tried(corners_of, FrameReader(MAP), message)
     if isinstance(found, str):
         assert "expected" in found
     else:
@@ -249,7 +295,7 @@ def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
     """Of real types, as they come from the wire: messages of which any bytes are others."""
     chance, read = random.Random(1), 0
     messages = RosMessages(TYPES, MAP)
-    good = messages.odometry(0, "uav", *GRID.centre_m(40), 1.0, 2.0)
+    good = messages.odometry(0, ("map", "uav"), (*GRID.centre_m(40), 1.0), 2.0, 0.0)
     pose = messages.pose_stamped(0, *GRID.centre_m(40), 1.0)
     for number in range(few(3000)):
         kind, made = (KINDS[0], good) if number % 2 else (KINDS[1], pose)
@@ -257,7 +303,7 @@ def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
         for _ in range(chance.randrange(12)):
             content[chance.randrange(4, len(content))] = chance.choice([0, 127, 128, 255, chance.randrange(256)])
         with suppress(ProtocolError):
-            found = robot_place(FrameReader(MAP, "uav/odom"), TYPES.unpack(bytes(content), kind))
+            found = tried(robot_place, FrameReader(MAP, "uav/odom"), TYPES.unpack(bytes(content), kind))
             assert isinstance(found, (str, Place))
             read += 1
     assert read > few(3000) / 3
@@ -315,6 +361,6 @@ def test_a_robot_is_found_by_its_topic(topic: str, robot: str | None) -> None:
 
 def test_a_response_of_getplan_has_the_bytes_of_its_path() -> None:
     points = [GRID.centre_m(cell) for cell in (3, 4, 21, 22)]
-    path = RosMessages(TYPES, MAP).path(7, points)
-    response = TYPES.make("nav_msgs/srv/GetPlan_Response", plan=path)
+    plan = path(RosMessages(TYPES, MAP), 7, points)
+    response = TYPES.make("nav_msgs/srv/GetPlan_Response", plan=plan)
     assert TYPES.pack(response, "nav_msgs/srv/GetPlan_Response") == packed_path(MAP, 7, points)

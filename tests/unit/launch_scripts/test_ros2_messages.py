@@ -10,19 +10,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from support.ros_messages import path
 
-from launch_scripts.gateways.ros2 import grids, markers
-from launch_scripts.gateways.ros2.frames import (
+from launch_scripts.gateways.ros2 import map_messages
+from launch_scripts.gateways.ros2.map_messages import Drawing, Form
+from launch_scripts.gateways.ros2.ros_messages import (
+    Level,
     RosMap,
+    RosMessages,
+    Severity,
+    base_frame,
     heading_of,
     heading_of_quaternion,
     headings_along,
+    odom_frame,
     quaternion_of,
     yaw_of,
 )
-from launch_scripts.gateways.ros2.markers import Drawing, Form, MarkerBook
-from launch_scripts.gateways.ros2.messages import Level, RosMessages, Severity
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.grid import GridSpec, Window
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -32,6 +37,7 @@ GRIDS = st.builds(
     st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 1.0, 10.0, 25.0]),
     st.floats(-1e6, 1e6), st.floats(-1e7, 1e7), st.just("EPSG:32632"),
 )  # fmt: skip
+FRAMES = odom_frame("a1"), base_frame("a1")
 GRID = GridSpec(4, 6, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 
 
@@ -119,17 +125,16 @@ def test_the_cell_under_a_point_of_ros_is_the_cell_under_ours(grid: GridSpec, da
     messages = maker(grid)
     numbers = np.arange(grid.cells).reshape(grid.rows, grid.cols)
     occupancy = (numbers % 97).astype(np.int8)
-    sent = as_sent(messages, grids.occupancy_grid(messages, STAMP_NS, occupancy))
+    sent = as_sent(messages, map_messages.occupancy_grid(messages, STAMP_NS, occupancy))
     cell = data.draw(st.integers(0, grid.cells - 1))
     x_m, y_m = messages.map.to_ros(*grid.centre_m(cell))
-    assert grids.cell_at(messages.map, x_m, y_m) == cell
+    assert grid.cell_at(*messages.map.to_terrain(x_m, y_m)) == cell
     # As Nav2's costmap_2d finds it: worldToMap.
     col = int((x_m - sent.info.origin.position.x) / sent.info.resolution)
     row = int((y_m - sent.info.origin.position.y) / sent.info.resolution)
     assert sent.data[row * sent.info.width + col] == cell % 97
     assert messages.map.to_terrain(x_m, y_m) == pytest.approx(grid.centre_m(cell))
-    read = grids.rows_from_north(sent.data, sent.info.height, sent.info.width)
-    assert (read == occupancy).all()
+    assert (sent.data.reshape(grid.rows, grid.cols)[::-1] == occupancy).all()
 
 
 @given(GRIDS, st.data())
@@ -145,13 +150,13 @@ def test_an_update_changes_the_cells_of_its_window_and_no_others(grid: GridSpec,
         np.arange(window.cells).reshape(window.row1 - window.row0, -1) % 97 + 1
     )
     part = changed[window.row0 : window.row1, window.col0 : window.col1]
-    update = as_sent(messages, grids.occupancy_update(messages, STAMP_NS, part, window))
-    shown = np.array(grids.occupancy_grid(messages, STAMP_NS, whole).data).reshape(grid.rows, grid.cols)
+    update = as_sent(messages, map_messages.occupancy_update(messages, STAMP_NS, part, window))
+    shown = np.array(map_messages.occupancy_grid(messages, STAMP_NS, whole).data).reshape(grid.rows, grid.cols)
     # As RViz pastes it.
     pasted = shown[update.y : update.y + update.height, update.x : update.x + update.width]
     pasted[:] = update.data.reshape(update.height, update.width)
-    assert (shown.reshape(-1) == grids.occupancy_grid(messages, STAMP_NS, changed).data).all()
-    assert grids.flipped(grids.flipped(window, grid.rows), grid.rows) == window
+    assert (shown.reshape(-1) == map_messages.occupancy_grid(messages, STAMP_NS, changed).data).all()
+    assert map_messages.flipped(map_messages.flipped(window, grid.rows), grid.rows) == window
 
 
 @given(GRIDS, st.integers(2, 7), st.data())
@@ -159,7 +164,7 @@ def test_a_grid_of_blocks_lies_over_the_same_places(grid: GridSpec, side: int, d
     messages = maker(grid)
     shape = -(-grid.rows // side), -(-grid.cols // side)
     blocks = (np.arange(shape[0] * shape[1]).reshape(shape) % 97).astype(np.int8)
-    made = grids.occupancy_grid(messages, STAMP_NS, blocks, side)
+    made = map_messages.occupancy_grid(messages, STAMP_NS, blocks, side)
     cell = data.draw(st.integers(0, grid.cells - 1))
     x_m, y_m = messages.map.to_ros(*grid.centre_m(cell))
     col = int((x_m - made.info.origin.position.x) / made.info.resolution)
@@ -174,9 +179,9 @@ PACES = npst.arrays(
 
 @given(PACES, st.floats(0.01, 1.0))
 def test_occupancy_is_what_is_lost_of_the_best_speed(pace: np.ndarray[Any, Any], best: float) -> None:
-    occupancy = grids.occupancy_of(pace, best)
-    assert ((occupancy == grids.LETHAL) == np.isinf(pace)).all()
-    assert ((occupancy == grids.UNKNOWN) == np.isnan(pace)).all()
+    occupancy = map_messages.occupancy_of(pace, best)
+    assert ((occupancy == map_messages.LETHAL) == np.isinf(pace)).all()
+    assert ((occupancy == map_messages.UNKNOWN) == np.isnan(pace)).all()
     finite = np.isfinite(pace)
     lost = 100 * (1 - best / np.maximum(pace[finite].astype(float), best))
     assert np.abs(occupancy[finite] - np.minimum(lost, 98)).max(initial=0) <= 0.51
@@ -186,59 +191,49 @@ def test_occupancy_is_what_is_lost_of_the_best_speed(pace: np.ndarray[Any, Any],
 
 def test_occupancy_is_refused_for_another_grid() -> None:
     with pytest.raises(ValueError, match="not those of 4 x 6 cells"):
-        grids.occupancy_grid(maker(), STAMP_NS, np.zeros((6, 4), np.int8))
+        map_messages.occupancy_grid(maker(), STAMP_NS, np.zeros((6, 4), np.int8))
     with pytest.raises(ValueError, match="do not fill"):
-        grids.occupancy_update(maker(), STAMP_NS, np.zeros((1, 1), np.int8), Window(0, 0, 1, 2))
+        map_messages.occupancy_update(maker(), STAMP_NS, np.zeros((1, 1), np.int8), Window(0, 0, 1, 2))
 
 
 # --- markers ------------------------------------------------------------------------------------------------------
 
 LINE_M = np.array([[500_000.0, 5_200_000.0], [500_025.0, 5_199_975.0]])
-DRAWN = st.dictionaries(st.tuples(st.sampled_from("ab"), st.sampled_from("uvwxyz")), st.booleans(), max_size=8)
+DRAWN = st.lists(st.tuples(st.sampled_from("ab"), st.booleans()), max_size=8)
 
 
 @given(st.lists(DRAWN, max_size=8))
-def test_what_is_drawn_on_screen_is_what_was_drawn_last(histories: list[dict[tuple[str, str], bool]]) -> None:
+def test_what_is_drawn_on_screen_is_what_was_drawn_last(histories: list[list[tuple[str, bool]]]) -> None:
     """A viewer that follows actions by layer and number, as RViz does, shows each thing once, and nothing else."""
-    book = MarkerBook(maker())
-    screen: dict[tuple[str, int], str] = {}
-    numbers: dict[tuple[str, str], int] = {}
+    messages = maker()
+    screen: dict[tuple[str, int], Any] = {}
     for drawn in histories:
         drawings = [
-            Drawing(layer, name, Form.LINE, LINE_M if visible else LINE_M[:1], (0, 0, 0, 1.0), 2.0)
-            for (layer, name), visible in drawn.items()
+            Drawing(layer, Form.LINE, LINE_M if visible else LINE_M[:1], (0, 0, 0, 1.0), 2.0)
+            for layer, visible in drawn
         ]
-        array = book.array(STAMP_NS, drawings, 2.0)
-        shown = {key for key, visible in drawn.items() if visible}
-        assert set(book.numbers) == shown
-        for key in shown & set(numbers):
-            assert book.numbers[key] == numbers[key], "a number changed while it was drawn"
-        numbers = dict(book.numbers)
-        names = {(layer, number): name for (layer, name), number in numbers.items()}
-        for marker in array.markers:
-            if marker.action == 2:
-                screen.pop((marker.ns, marker.id), None)
+        for marker in map_messages.marker_array(messages, STAMP_NS, drawings).markers:
+            if marker.action == 3:
+                screen.clear()
             else:
-                screen[marker.ns, marker.id] = names[marker.ns, marker.id]
-        assert {(layer, name) for (layer, _), name in screen.items()} == shown
-    assert max(numbers.values(), default=0) < 12
+                screen[marker.ns, marker.id] = marker
+        assert sorted(layer for layer, _ in screen) == sorted(layer for layer, visible in drawn if visible)
 
 
 def test_drawings_lie_where_they_are_in_the_map_frame() -> None:
-    cubes, none = markers.marked_cells(GRID, [0, 23], [])
+    cubes, none = map_messages.marked_cells(GRID, [0, 23], [])
     assert len(none.points_m) == 0
-    outline = markers.windows(GRID, "t1", [Window(0, 0, 1, 2)])
-    ring = markers.zone(GRID, "forbidden", "lake", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
-    assert ring.points_m.tolist() == [[0, 0], [1, 0], [1, 1], [0, 0]]
+    outline = map_messages.windows(GRID, [Window(0, 0, 1, 2)])
+    zone = map_messages.zone(GRID, True, np.array([7], np.uint32))
     messages = maker()
-    array = as_sent(messages, MarkerBook(messages).array(STAMP_NS, [cubes, none, outline, ring], 1.5))
-    lethal, window, zone = array.markers
+    array = as_sent(messages, map_messages.marker_array(messages, STAMP_NS, [cubes, none, outline, zone]))
+    _, lethal, window, zone = array.markers
     assert [(p.x, p.y) for p in lethal.points] == [(12.5, 87.5), (137.5, 12.5)]
     assert (lethal.type, lethal.scale.x, lethal.ns, lethal.id) == (6, 25.0, "marks", 0)
     assert {(p.x, p.y) for p in window.points} == {(0, 100), (50, 100), (50, 75), (0, 75)}
     assert len(window.points) == 8
-    assert (zone.ns, zone.type) == ("zones/forbidden", 4)
-    assert (zone.lifetime.sec, zone.lifetime.nanosec) == (1, 500_000_000)
+    assert (zone.ns, zone.type) == ("zones/closed", 5)
+    assert {(p.x, p.y) for p in zone.points} == {(25, 75), (50, 75), (25, 50), (50, 50)}
     assert zone.pose.orientation.w == 1
 
 
@@ -248,26 +243,24 @@ def test_drawings_lie_where_they_are_in_the_map_frame() -> None:
 def every_message(messages: RosMessages) -> list[Any]:
     x_m, y_m = 500_010.0, 5_199_990.0
     places = np.array([[x_m, y_m], [x_m + 5, y_m - 5]])
-    book = MarkerBook(messages)
-    book.array(STAMP_NS, [markers.route(GRID, "a1-0", LINE_M)])
     return [
         messages.pose_stamped(STAMP_NS, x_m, y_m, 1.0),
         messages.pose_array(STAMP_NS, places, [0.5, None]),
         messages.pose_array(STAMP_NS, places[:0]),
-        messages.odometry(STAMP_NS, "a1-0", x_m, y_m, 0.0, 2.5, 0.25),
-        messages.path(STAMP_NS, places),
-        messages.path(STAMP_NS, []),
+        messages.odometry(STAMP_NS, FRAMES, (x_m, y_m, 0.0), 2.5, 0.25),
+        path(messages, STAMP_NS, places),
+        path(messages, STAMP_NS, []),
         messages.transforms(
-            [messages.map_transform(STAMP_NS), *messages.vehicle_transforms(STAMP_NS, "a1-0", x_m, y_m, 0.0)]
+            [messages.transform(STAMP_NS, ("map", FRAMES[0])), messages.transform(STAMP_NS, FRAMES, (10, 20), 0.0)]
         ),
         messages.fix(STAMP_NS, "a1-0/base_link", 46.9, 9.0),
-        messages.diagnostics(
-            STAMP_NS, [messages.diagnostic("planner t1", Level.WARN, "slow", {"routes": 5, "gap": 1.25})]
-        ),
+        messages.diagnostic("planner t1", Level.WARN, "slow", {"routes": 5, "gap": 1.25}),
         messages.log(STAMP_NS, Severity.INFO, "targets", "t1 was captured"),
-        grids.occupancy_grid(messages, STAMP_NS, np.full((4, 6), -1, np.int8)),
-        grids.occupancy_update(messages, STAMP_NS, np.full((2, 3), 100, np.int8), Window(1, 1, 3, 4)),
-        book.array(STAMP_NS, [markers.route(GRID, "a1-1", LINE_M), *markers.marked_cells(GRID, [3], [4])]),
+        map_messages.occupancy_grid(messages, STAMP_NS, np.full((4, 6), -1, np.int8)),
+        map_messages.occupancy_update(messages, STAMP_NS, np.full((2, 3), 100, np.int8), Window(1, 1, 3, 4)),
+        map_messages.marker_array(
+            messages, STAMP_NS, [map_messages.route(GRID, LINE_M), *map_messages.marked_cells(GRID, [3], [4])]
+        ),
     ]
 
 
@@ -294,29 +287,28 @@ def plain(value: Any) -> Any:
 def test_frames_twists_and_places_are_those_of_rep_103_and_105() -> None:
     messages = maker()
     x_m, y_m = messages.map.origin_m
-    odometry = messages.odometry(STAMP_NS, "a1-0", x_m + 10, y_m + 20, math.pi / 2, 2.5, 0.25)
-    assert (odometry.header.frame_id, odometry.child_frame_id) == ("a1-0/odom", "a1-0/base_link")
+    odometry = messages.odometry(STAMP_NS, FRAMES, (x_m + 10, y_m + 20, math.pi / 2), 2.5, 0.25)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == FRAMES == ("a1/odom", "a1/base_link")
     place, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
     assert (place.x, place.y, place.z) == (10, 20, 0)
     assert (orientation.z, orientation.w) == pytest.approx((0, 1))
     assert (odometry.twist.twist.linear.x, odometry.twist.twist.angular.z) == (2.5, -0.25)
     assert (odometry.header.stamp.sec, odometry.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
-    still = messages.map_transform(STAMP_NS)
-    assert (still.header.frame_id, still.child_frame_id) == ("terrain", "map")
-    assert (still.transform.translation.x, still.transform.translation.y) == (500_000, 5_199_900)
-    identity, base = messages.vehicle_transforms(STAMP_NS, "a1-0", x_m + 10, y_m + 20, 0.0)
-    assert (identity.header.frame_id, identity.child_frame_id) == ("map", "a1-0/odom")
-    assert (base.header.frame_id, base.child_frame_id) == ("a1-0/odom", "a1-0/base_link")
+    still = messages.types.make(
+        "tf2_msgs/msg/TFMessage", transforms=[messages.transform(STAMP_NS, FRAMES, (10, 20), 0.0)]
+    )
+    (base,) = still.transforms
+    assert (base.header.frame_id, base.child_frame_id) == FRAMES
     assert (base.transform.translation.x, base.transform.translation.y) == (10, 20)
     assert base.transform.rotation.z == pytest.approx(math.sqrt(0.5))
-    path = messages.path(STAMP_NS, [(x_m, y_m), (x_m, y_m + 5), (x_m + 5, y_m + 5)])
-    yaws = [2 * math.atan2(each.pose.orientation.z, each.pose.orientation.w) for each in path.poses]
+    way = path(messages, STAMP_NS, [(x_m, y_m), (x_m, y_m + 5), (x_m + 5, y_m + 5)])
+    yaws = [2 * math.atan2(each.pose.orientation.z, each.pose.orientation.w) for each in way.poses]
     assert yaws == pytest.approx([math.pi / 2, 0, 0], abs=1e-12)
 
 
 @given(st.integers(-(2**63), 2**63 - 1))
 def test_no_stamp_is_too_late_to_be_told(stamp_ns: int) -> None:
     messages = maker()
-    time = as_sent(messages, messages.header(stamp_ns)).stamp
+    time = as_sent(messages, messages.pose_stamped(stamp_ns, 0.0, 0.0)).header.stamp
     if 0 <= stamp_ns < 2**31 * 10**9:
         assert time.sec * 10**9 + time.nanosec == stamp_ns

@@ -2,65 +2,34 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from support.client_rig import Program
+from support.ros_node import FakeNode
 from support.swarm_model import SwarmModel
 
-from launch_scripts.gateways.ros2.frames import RosMap
+from launch_scripts.gateways.ros2.gateway_settings import Robots
 from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
-from launch_scripts.gateways.ros2.incoming.places import Place
+from launch_scripts.gateways.ros2.incoming.readings import Place
 from launch_scripts.gateways.ros2.incoming.robot import Robot
-from launch_scripts.gateways.ros2.incoming.settings import Robots
-from launch_scripts.gateways.ros2.messages import Level, RosMessages
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.incoming.work_queue import WorkQueue
+from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.clock import NS_PER_S
 
 TYPES = types_of(Distribution.JAZZY)
 
 
-class FakeNewest:
-    """What came last on a topic, put there by a test."""
-
-    def __init__(self, topic: str) -> None:
-        self.endpoint = SimpleNamespace(topic=topic)
-        self.wake: Callable[[], None] | None = None
-        self.waiting: deque[Any] = deque(maxlen=1)
-
-    def take(self) -> Any | None:
-        return self.waiting.pop() if self.waiting else None
-
-    def close(self) -> None:
-        pass
-
-
-class FakeNode:
-    """A node whose topics a test hears and says.
-
-    heard  topic -> messages that were put
-    """
+class NoQueue(WorkQueue):
+    """Answers no question: a test looks at what is followed."""
 
     def __init__(self) -> None:
-        self.types = TYPES
-        self.topics: dict[str, FakeNewest] = {}
-        self.heard: dict[str, list[Any]] = {}
+        super().__init__("none", 1, 0)
 
-    def newest(self, topic: str, *_: Any, **__: Any) -> FakeNewest:
-        return self.topics.setdefault(topic, FakeNewest(topic))
-
-    def publisher(self, topic: str, *_: Any) -> Any:
-        told = self.heard.setdefault(topic, [])
-        return SimpleNamespace(endpoint=topic, put=told.append, put_packed=told.append)
-
-    def serve(self, name: str, *_: Any) -> str:
-        return name
-
-    def remove(self, endpoint: Any) -> None:
-        pass
+    def give(self, what: str, work: Callable[[], None], failed: Callable[[str], None]) -> bool:
+        return True
 
 
 class World:
@@ -69,10 +38,10 @@ class World:
     def __init__(self, taken: Collection[str] = (), **settings: Any) -> None:
         self.model = SwarmModel()
         self.swarm = Program(self.model).swarm
-        self.node: Any = FakeNode()
+        self.node: Any = FakeNode(TYPES)
         map = RosMap(self.swarm.frame.grid)
         self.messages = RosMessages(TYPES, map)
-        self.routes = PlaceRoutes(self.swarm, ["goal0"])
+        self.routes = PlaceRoutes(self.swarm, ["goal0"], NoQueue())
         robots = Robots(lease_s=10.0, **settings)
         self.robots = {
             id: Robot(id, robots, self.node, self.swarm, self.routes, self.messages, taken.__contains__)
@@ -85,11 +54,10 @@ class World:
     def say(self, id: str, topic: str, row: int, col: int, frame: str | None = None) -> None:
         grid = self.swarm.frame.grid
         x_m, y_m = grid.centre_m(grid.cell(row, col))
-        make = self.messages.odometry if topic == "odom" else self.messages.pose_stamped
-        message: Any = make(1, id, x_m, y_m, 0.0, 0.0, 0.0) if topic == "odom" else make(1, x_m, y_m)
+        odometry = self.messages.odometry(1, ("map", id), (x_m, y_m, 0.0), 0.0, 0.0)
+        message: Any = odometry if topic == "odom" else self.messages.pose_stamped(1, x_m, y_m)
         message.header.frame_id = frame or "map"
         self.node.topics[f"/{id}/{topic}"].waiting.append(message)
-        self.robots[id]._goal_ns = -NS_PER_S
         self.now_ns += NS_PER_S // 4
         self.robots[id].tick(self.now_ns)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.gateways.ros2.graph import (
+from launch_scripts.gateways.ros2.rmw import (
     NO_HASH,
     Attachment,
     Endpoint,
@@ -18,7 +18,7 @@ from launch_scripts.gateways.ros2.graph import (
     SeenEndpoint,
     read_token,
 )
-from launch_scripts.gateways.ros2.types import Distribution, types_of
+from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.errors import ProtocolError
 
 # As ROS nodes print them (`ros2 topic info -v`) and other stacks publish them.

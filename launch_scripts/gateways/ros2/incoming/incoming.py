@@ -5,24 +5,21 @@ from __future__ import annotations
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
-from launch_scripts.gateways.ros2.frames import RosMap
-from launch_scripts.gateways.ros2.graph import Endpoint, Kind, SeenEndpoint
-from launch_scripts.gateways.ros2.incoming.drawn_areas import DrawnMarks, DrawnZone
-from launch_scripts.gateways.ros2.incoming.moved_targets import MovedTarget
-from launch_scripts.gateways.ros2.incoming.order_desk import OrderDesk
-from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
-from launch_scripts.gateways.ros2.incoming.places import FrameReader
+from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
+from launch_scripts.gateways.ros2.incoming.place_routes import TRACKER, PlaceRoutes
+from launch_scripts.gateways.ros2.incoming.readings import FrameReader, closed_cells, corners_of
 from launch_scripts.gateways.ros2.incoming.robot import Robot
-from launch_scripts.gateways.ros2.incoming.settings import POSE_TYPES, IncomingSettings, Robots
-from launch_scripts.gateways.ros2.messages import RosMessages
-from launch_scripts.gateways.ros2.names import ros_name
-from launch_scripts.gateways.ros2.node import Node
-from swarm.client import Swarm
+from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
+from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, SeenEndpoint
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name
+from launch_scripts.gateways.ros2.ros_node import Node
+from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
+from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, ZONE
+from swarm.client import Swarm, Target, Vehicle
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.runtime.operator import Acknowledged
 
 log = logging.getLogger(__name__)
 
@@ -32,17 +29,9 @@ MOST_ROBOTS = 256
 _LOOK_NS = NS_PER_S // 2
 """The swarm's own vehicles are looked at so often."""
 _MOST_ASKED = 16
-_MAP = "nav_msgs/srv/GetMap"
 _MOST_NEWS = 1 << 14
+_MOST_ORDERS = 8
 _TRIGGER = "std_srvs/srv/Trigger"
-Paused = Callable[[], Acknowledged]
-
-
-class Part(Protocol):
-    """A robot, target or area: it takes what has come for it at ticks."""
-
-    def tick(self, now_ns: int) -> None: ...
-    def close(self) -> None: ...
 
 
 class Incoming:
@@ -68,37 +57,36 @@ class Incoming:
         self._node, self._swarm, self._settings = node, swarm, settings
         self._map = map or RosMap(swarm.frame.grid)
         self._messages = RosMessages(node.types, self._map)
+        self._reader = FrameReader(self._map)
         self._routes = PlaceRoutes(swarm, settings.goal_targets)
-        self._desk = OrderDesk()
+        self._orders = WorkQueue("ros2-orders", 1, _MOST_ORDERS)
+        """An order waits until it is obeyed, and the next one for it."""
         self._robots: dict[str, Robot] = {}
         self._publishers: Counter[str] = Counter()
         """Topic of a robot -> how many publish it, as their tokens say."""
         self._news: deque[tuple[SeenEndpoint, bool]] = deque(maxlen=_MOST_NEWS)
-        self._full_said = False
-        self._strange: set[str] = set()
-        """Robots whose type is of another distribution; said once each."""
-        reader = FrameReader(self._map)
-        self._targets = [MovedTarget(id, settings.set_pose, node, swarm, reader) for id in settings.targets]
-        self._areas = [
-            *(DrawnZone(each, node, swarm, self._desk, self._map) for each in settings.zones),
-            *(DrawnMarks(each, node, swarm, self._desk, self._map) for each in settings.grids),
-        ]
-        self._services: list[Endpoint] = []
-        self._map_now = map_now
-        self._vehicles = vehicles
+        self._said: set[str] = set()
+        """Robots that were said not to be taken in."""
+        self._guests: list[Vehicle | Target] = []
+        """Targets that ROS moves, and authors of its marks."""
+        self._map_now, self._vehicles = map_now, vehicles
         self._taken: frozenset[str] = frozenset()
         """Names in ROS of vehicles that agents of the swarm have. What another gateway tells of one looks like a
         robot, and would be a body where the vehicle itself is."""
         self._taken_due_ns = 0
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
+        self._inputs = [
+            *(self._target_input(each) for each in settings.targets),
+            *(self._zone_input(each) for each in settings.zones),
+            *(self._grid_input(each) for each in settings.grids),
+        ]
+        self._services: list[Endpoint] = []
         if map_now is not None:
-            self._services.append(node.serve("/map_server/map", _MAP, lambda _, reply: self._asked.append(reply)))
+            self._serve(MAP_SERVER.topic, MAP_SERVER.type_name, lambda _, reply: self._asked.append(reply))
         if settings.orders:
-            orders = swarm.orders()
-            self._serve_order("/swarm/pause", orders.pause)
-            self._serve_order("/swarm/hold", orders.pause)
-            self._serve_order("/swarm/resume", orders.resume)
+            for name in ("pause", "hold", "resume"):
+                self._serve_order(f"/swarm/{name}", resumes=name == "resume")
         for robots in settings.robots:
             if robots.id is not None:
                 self._add(robots.id, robots)
@@ -119,11 +107,11 @@ class Incoming:
         return found
 
     @property
-    def _parts(self) -> tuple[Part, ...]:
-        return (*self._robots.values(), *self._targets, *self._areas)
+    def _parts(self) -> list[Robot | Input]:
+        return [*self._robots.values(), *self._inputs]
 
     def tick(self, now_ns: int) -> None:
-        """Take in what has come.
+        """Takes in what has come.
 
         now_ns  by time.monotonic_ns
         """
@@ -134,26 +122,25 @@ class Incoming:
             self._hear(*self._news.popleft())
         for part in self._parts:
             part.tick(now_ns)
-        self._answer_map()
-        self._routes.tick()
+        if self._asked and self._map_now is not None:
+            # All who ask get one map. Of more than _MOST_ASKED the oldest get none: their question ends so.
+            response = self._node.types.make(f"{MAP_SERVER.type_name}_Response", map=self._map_now())
+            while self._asked:
+                self._asked.popleft()(response)
 
     def close(self) -> None:
-        """Take away all that was declared. The connection and the node stay open."""
+        """Takes away all that was declared. The connection and the node stay open."""
         for service in self._services:
             self._node.remove(service)
         for part in self._parts:
             part.close()
         self._robots.clear()
         self._routes.close()
-        self._desk.close()
+        self._orders.close()
+        for guest in self._guests:
+            guest.leave()
 
-    def _answer_map(self) -> None:
-        """All who ask get one map. Of more than `_MOST_ASKED` the oldest get none: their question ends so."""
-        if not self._asked or self._map_now is None:
-            return
-        response = self._node.types.make(f"{_MAP}_Response", map=self._map_now())
-        while self._asked:
-            self._asked.popleft()(response)
+    # --- robots ---------------------------------------------------------------------------------------------------
 
     def _hear(self, seen: SeenEndpoint, there: bool) -> None:
         """An endpoint of somebody has come or gone."""
@@ -165,12 +152,9 @@ class Incoming:
                 continue
             ours = self._node.types.hash_of(seen.type_name)
             if ours != seen.type_hash:
-                if there and id not in self._strange and len(self._strange) < MOST_ROBOTS:
-                    self._strange.add(id)
-                    log.warning(
-                        "robot %s is not taken in: it publishes %s as %s, expected %s (--distribution)",
-                        id, seen.topic, seen.type_hash[:20], ours[:20],
-                    )  # fmt: skip
+                if there:
+                    hash = seen.type_hash[:20]
+                    self._warn(id, f"it publishes {seen.topic} as {hash}, expected {ours[:20]} (--distribution)")
                 continue
             self._publishers[seen.topic] += 1 if there else -1
             known = self._robots.get(id)
@@ -184,27 +168,92 @@ class Incoming:
 
     def _add(self, id: str, robots: Robots) -> None:
         if len(self._robots) >= MOST_ROBOTS:
-            if not self._full_said:
-                log.warning("robot %s is not taken in: there are %d already", id, MOST_ROBOTS)
-            self._full_said = True
+            self._warn(id, f"there are {MOST_ROBOTS} already")
             return
         self._robots[id] = Robot(
             id, robots, self._node, self._swarm, self._routes, self._messages, lambda name: name in self._taken
         )
 
-    def _serve_order(self, name: str, order: Paused) -> None:
-        """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""
-        make = self._node.types.make
+    def _warn(self, robot: str, why: str) -> None:
+        if robot not in self._said and len(self._said) < MOST_ROBOTS:
+            self._said.add(robot)
+            log.warning("robot %s is not taken in: %s", robot, why)
 
-        def told(acknowledged: Acknowledged) -> str:
-            silent = f", not heard of: {', '.join(acknowledged.silent)}" if acknowledged.silent else ""
-            return f"{len(acknowledged.obeyed)} processes obey{silent}"
+    # --- targets and areas ----------------------------------------------------------------------------------------
+
+    def _target_input(self, id: str) -> Input:
+        """A person who clicks once in RViz puts a target somewhere: it stays there while the gateway lives."""
+        target: Target | None = None
+
+        def take(message: Any, _: int) -> None:
+            nonlocal target
+            place = self._reader.pose(message.header, message.pose)
+            if target is None:
+                target = self._swarm.target(id, tracker=TRACKER)
+                self._guests.append(target)
+            target.at(place.x_m, place.y_m)
+
+        return Input(self._node, self._settings.set_pose_of(id), SET_POSE.type_name, 10.0, take)
+
+    def _zone_input(self, zone: ZoneSettings) -> Input:
+        """A polygon whose corners are those of the last is not ordered again, unless the zone ends by itself."""
+        orders = self._swarm.orders()
+        before: list[tuple[float, float]] | None = None
+
+        def take(message: Any, _: int) -> None:
+            nonlocal before
+            corners = corners_of(self._reader, message)
+            if corners == before and zone.for_s is None:
+                return
+            if corners:
+                orders.add_zone(corners, name=zone.name, pace_s_per_m=zone.pace_s_per_m, for_s=zone.for_s)
+            else:
+                orders.remove_zone(zone.name)
+            before = corners
+
+        return Input(self._node, zone.topic, ZONE.type_name, 1.0, take, qos=ZONE.qos, queue=self._orders)
+
+    def _grid_input(self, grid: GridSettings) -> Input:
+        """Cells which the next grid does not close are again as the map had them."""
+        author: Vehicle | None = None
+        closed: set[int] = set()
+
+        def take(message: Any, _: int) -> None:
+            nonlocal author, closed
+            cells = set(closed_cells(self._map, message, grid.occupied))
+            if author is None:  # it has no place: it only marks
+                author = self._swarm.vehicle(grid.name)
+                self._guests.append(author)
+            if opened := closed - cells:
+                author.mark(sorted(opened), clear=True)
+            if new := cells if grid.for_s is not None else cells - closed:
+                author.mark(sorted(new), lethal=True, for_s=grid.for_s)
+            closed = cells
+
+        return Input(
+            self._node, grid.topic, GRID.type_name, 1.0, take,
+            qos=GRID.qos, most_bytes=LARGEST_MESSAGE_BYTES, queue=self._orders,
+        )  # fmt: skip
+
+    # --- services -------------------------------------------------------------------------------------------------
+
+    def _serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> None:
+        self._services.append(self._node.serve(name, type_name, answer))
+
+    def _serve_order(self, name: str, *, resumes: bool) -> None:
+        """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""
+        orders = self._swarm.orders()
 
         def answer(request: Any, reply: Callable[[Any], None]) -> None:
             def respond(done: bool, sentence: str) -> None:
-                reply(make(f"{_TRIGGER}_Response", success=done, message=sentence))
+                reply(self._node.types.make(f"{_TRIGGER}_Response", success=done, message=sentence))
 
-            if not self._desk.give(name, lambda: told(order()), respond):
+            def give() -> None:
+                told = orders.resume() if resumes else orders.pause()
+                silent = f", not heard of: {', '.join(told.silent)}" if told.silent else ""
+                respond(True, f"{len(told.obeyed)} processes obey{silent}")
+
+            if not self._orders.give(name, give, lambda why: respond(False, why)):
                 respond(False, "too many orders wait already")
 
-        self._services.append(self._node.serve(name, _TRIGGER, answer))
+        self._serve(name, _TRIGGER, answer)

@@ -5,33 +5,64 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 
-from launch_scripts.gateways.ros2.incoming.goals import GoalTargets
-from launch_scripts.gateways.ros2.incoming.places import Place
-from swarm.client import Route, Swarm, SwarmError, Target
-from swarm.clock import NS_PER_S
+from launch_scripts.gateways.ros2.incoming.readings import Place
+from launch_scripts.gateways.ros2.incoming.work_queue import WorkQueue
+from swarm.client import BusError, Route, Swarm, SwarmError, Target
 
 TRACKER = "ros2"
 """Name of the tracker that the gateway is: its next start takes its targets over at once."""
 PATIENCE_S = 5.0
 _AT_ONCE = 6
 """Questions that follow each other without waiting; later ones wait for a tick, as planners go by ticks, too."""
+_TICK_S = 0.02
 MOST_WAITING = 64
+_THREADS = 16
+"""A route takes milliseconds; only one to a place where nobody may stand takes as long as `PATIENCE_S`."""
 Answer = Callable[[Route | str], None]
-"""Takes a route, or the reason why there is none. Called on a thread of the swarm's connection, or at once."""
+"""Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
 
 
 @dataclass
-class _Question:
-    target: str
-    cell: int | None
-    start: Place
-    vehicle_class: str
-    until_ns: int
-    answer: Answer
-    asked: int = 0
+class _Stand:
+    cell: int | None = None
+    users: int = 0
+    used: int = 0
+
+
+class GoalTargets:
+    """A few external targets, lent to those who need a route to a place. One serves all who go to the same cell.
+
+    A target that nobody needs stays where it is, so that its tree is good for the next one who goes there; the one
+    that has been idle for the longest is taken first. Pure.
+    """
+
+    def __init__(self, ids: Sequence[str]) -> None:
+        self._stands = {id: _Stand() for id in ids}
+        self._turn = 0
+
+    def lend(self, cell: int) -> tuple[str, bool] | None:
+        """(target, whether it stands there already) for a goal in a cell; None if all are in use elsewhere."""
+        there = next((id for id, stand in self._stands.items() if stand.cell == cell), None)
+        idle = [id for id, stand in self._stands.items() if not stand.users]
+        id = there or min(idle, key=lambda each: self._stands[each].used, default=None)
+        if id is None:
+            return None
+        stand = self._stands[id]
+        self._turn += 1
+        stand.cell, stand.users, stand.used = cell, stand.users + 1, self._turn
+        return id, there is not None
+
+    def give_back(self, id: str) -> None:
+        """One who was lent it needs it no more."""
+        if self._stands[id].users <= 0:
+            raise ValueError(f"{id} is lent to nobody")
+        self._stands[id].users -= 1
+
+    def cell_of(self, id: str) -> int | None:
+        """Where it stands; None before it was lent first."""
+        return self._stands[id].cell
 
 
 class PlaceRoutes:
@@ -40,22 +71,25 @@ class PlaceRoutes:
     goal_targets  external targets of the scenario that stand for goals
     """
 
-    def __init__(self, swarm: Swarm, goal_targets: Sequence[str]) -> None:
-        self._swarm = swarm
+    def __init__(self, swarm: Swarm, goal_targets: Sequence[str], queue: WorkQueue | None = None) -> None:
+        self._swarm, self._ids = swarm, goal_targets
         self._pool = GoalTargets(goal_targets)
         self._targets: dict[str, Target] = {}
         self._lock = threading.Lock()
-        self._later: list[_Question] = []
-        self._waiting = 0
+        self._queue = queue or WorkQueue("ros2-routes", _THREADS, MOST_WAITING)
 
-    def lend(self, goal: Place) -> str | None:
-        """A target that stands at a goal from now on, until it is given back; None if none is free. Raises
-        SwarmError if it cannot be put there."""
+    def lend(self, goal: Place) -> str:
+        """Returns a target that stands at a goal from now on, until it is given back. Raises SwarmError if none is
+        free, or it cannot be put there."""
         cell = self._swarm.frame.cell(goal.x_m, goal.y_m)
         with self._lock:
             lent = self._pool.lend(cell)
             if lent is None:
-                return None
+                ids = ", ".join(self._ids)
+                raise SwarmError(
+                    f"all goal targets are in use: {ids}" if ids
+                    else "no goal_targets are set, so no place can be a goal"
+                )  # fmt: skip
             id, there = lent
             try:
                 if id not in self._targets:
@@ -72,97 +106,59 @@ class PlaceRoutes:
         with self._lock:
             self._pool.give_back(target)
 
-    @property
-    def none_free(self) -> str:
-        """Why nothing was lent, in a sentence."""
-        ids = ", ".join(self._pool.ids)
-        return (
-            f"all goal targets are in use: {ids}" if ids else "no goal_targets are set, so no place can be a goal"
-        )
-
-    def to_target(self, target: str, start: Place, vehicle_class: str, answer: Answer) -> None:
-        """The route to a target, wherever it is."""
-        self._begin(target, None, start, vehicle_class, answer)
-
-    def to_lent(self, target: str, start: Place, vehicle_class: str, answer: Answer) -> None:
-        """The route to where a target was put that is lent."""
+    def to_target(
+        self, target: str, start: Place, vehicle_class: str, answer: Answer, *, lent: bool = False
+    ) -> None:
+        """Finds the route to a target: wherever it is, or to where it was put that is lent."""
         with self._lock:
-            cell = self._pool.cell_of(target)
-        self._begin(target, cell, start, vehicle_class, answer)
+            cell = self._pool.cell_of(target) if lent else None
+
+        def find() -> None:
+            answer(self._find(target, cell, start, vehicle_class))
+
+        if not self._queue.give(f"a route to {target}", find, answer):
+            answer(f"{MOST_WAITING} questions wait already")
 
     def to_place(self, goal: Place, start: Place, vehicle_class: str, answer: Answer) -> None:
-        """The route to a place; the target that stands for it is given back with the answer."""
+        """Finds the route to a place; the target that stands for it is given back with the answer."""
         try:
             lent = self.lend(goal)
         except SwarmError as error:
             answer(str(error))
-            return
-        if lent is None:
-            answer(self.none_free)
             return
 
         def give_back(found: Route | str) -> None:
             self.give_back(lent)
             answer(found)
 
-        self.to_lent(lent, start, vehicle_class, give_back)
-
-    def tick(self) -> None:
-        """Ask again what planners had not come to."""
-        with self._lock:
-            later, self._later = self._later, []
-        for question in later:
-            self._ask(question)
+        self.to_target(lent, start, vehicle_class, give_back, lent=True)
 
     def close(self) -> None:
-        """Answer what waits, and let all targets go."""
+        """Answers what waits, and lets all targets go."""
+        self._queue.close()
         with self._lock:
-            later, self._later = self._later, []
             targets, self._targets = list(self._targets.values()), {}
-        for question in later:
-            self._end(question, "the gateway ends")
         for target in targets:
             target.leave()
 
-    def _begin(self, target: str, cell: int | None, start: Place, vehicle_class: str, answer: Answer) -> None:
-        with self._lock:
-            full = self._waiting >= MOST_WAITING
-            self._waiting += not full
-        if full:
-            answer(f"{MOST_WAITING} questions wait already")
-            return
-        until_ns = time.monotonic_ns() + int(PATIENCE_S * NS_PER_S)
-        self._ask(_Question(target, cell, start, vehicle_class, until_ns, answer))
-
-    def _ask(self, question: _Question) -> None:
-        left_s = (question.until_ns - time.monotonic_ns()) / NS_PER_S
-        start = question.start
-        question.asked += 1
-        try:
-            asked = self._swarm.route_soon(
-                question.target, start.x_m, start.y_m, vehicle_class=question.vehicle_class,
-                timeout_s=max(left_s, 0.1),
-            )  # fmt: skip
-        except SwarmError as error:
-            self._end(question, str(error))
-            return
-        asked.add_done_callback(lambda done: self._hear(question, done))
-
-    def _hear(self, question: _Question, done: Future[Route]) -> None:
-        error = done.exception()
-        route = None if error is not None else done.result()
-        if route is not None and question.cell in (None, route.target_cell):
-            self._end(question, route)
-        elif time.monotonic_ns() >= question.until_ns:
-            no_way = f"the planner of {question.target} finds no way to the goal: nobody may stand there"
-            self._end(question, no_way if error is None else f"{error}: is it a target of the scenario?")
-        elif error is None and question.asked < _AT_ONCE:
-            self._ask(question)
-        else:
-            with self._lock:
-                self._later.append(question)
-
-    def _end(self, question: _Question, found: Route | str) -> None:
-        with self._lock:
-            self._waiting -= 1
-        question.answer(found)
+    def _find(self, target: str, cell: int | None, start: Place, vehicle_class: str) -> Route | str:
+        """Waits for its planner. Raises SwarmError."""
+        until_s, asked = time.monotonic() + PATIENCE_S, 0
+        while True:
+            left_s = max(until_s - time.monotonic(), 0.1)
+            question = self._swarm.route_soon(
+                target, start.x_m, start.y_m, vehicle_class=vehicle_class, timeout_s=left_s
+            )
+            try:
+                route = question.result()
+            except BusError as error:
+                why = f"{error}: is it a target of the scenario?"
+            else:
+                if cell in (None, route.target_cell):
+                    return route
+                why = f"the planner of {target} finds no way to the goal: nobody may stand there"
+            if time.monotonic() >= until_s:
+                return why
+            asked += 1
+            if asked >= _AT_ONCE:
+                time.sleep(_TICK_S)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from launch_scripts.gateways.ros2.graph import Qos
+from launch_scripts.gateways.ros2.rmw import Qos
 
 
 class Direction(StrEnum):
@@ -19,8 +19,8 @@ class Direction(StrEnum):
     SERVICE = "service"
 
 
-VEHICLE, TARGET = "{vehicle}", "{target}"
-"""Stand in names for that of each vehicle or target."""
+VEHICLE, TARGET, ROBOT = "{vehicle}", "{target}", "{robot}"
+"""Stand in names for that of each vehicle, target or robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class TopicRow:
         return next((each for each in (VEHICLE, TARGET) if each in self.topic), None)
 
 
-_OUT = Direction.OUT
+_OUT, _IN, _SERVICE = Direction.OUT, Direction.IN, Direction.SERVICE
 TABLE: tuple[TopicRow, ...] = (
     TopicRow("map", "/map", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _OUT, None,
              "How fast each cell may be driven; put again when much of it has changed."),
@@ -78,3 +78,38 @@ TABLE: tuple[TopicRow, ...] = (
              "How many vehicles are in which state, targets, links, what was dropped."),
 )  # fmt: skip
 ROWS = {row.name: row for row in TABLE}
+
+_POSE, _TRIGGER = "geometry_msgs/msg/PoseStamped", "std_srvs/srv/Trigger"
+ROBOT_TABLE: tuple[TopicRow, ...] = (
+    TopicRow("robot", "/{robot}/odom", "nav_msgs/msg/Odometry", Qos.SENSOR, _IN, 10.0,
+             "A robot is a vehicle there."),
+    TopicRow("goal", "/{robot}/goal_pose", _POSE, Qos.DEFAULT, _IN, 10.0, "Gives a robot a goal."),
+    TopicRow("robot_plan", "/{robot}/plan", "nav_msgs/msg/Path", Qos.LATCHED, _OUT, None,
+             "The robot's route, on change."),
+    TopicRow("robot_goal", "/{robot}/goal_pose", _POSE, Qos.DEFAULT, _OUT, None,
+             "Where the target is that a robot without a goal follows, when its cell changes."),
+    TopicRow("certificate", "/{robot}/plan_certificate", "diagnostic_msgs/msg/DiagnosticStatus", Qos.LATCHED, _OUT,
+             None, "What each plan takes and what no route is below; or why there is none."),
+    TopicRow("get_plan", "/{robot}/get_plan", "nav_msgs/srv/GetPlan", Qos.DEFAULT, _SERVICE, None,
+             "A route to a place or a target."),
+)  # fmt: skip
+"""For each robot, where the settings let it in."""
+ORDER_TABLE: tuple[TopicRow, ...] = (
+    TopicRow("pause", "/swarm/pause", _TRIGGER, Qos.DEFAULT, _SERVICE, None,
+             "Stops all vehicles of the swarm; answers when they obey."),
+    TopicRow("hold", "/swarm/hold", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "The same."),
+    TopicRow("resume", "/swarm/resume", _TRIGGER, Qos.DEFAULT, _SERVICE, None, "Lets them go on."),
+)  # fmt: skip
+SET_POSE = TopicRow("set_pose", "/targets/{target}/set_pose", _POSE, Qos.DEFAULT, _IN, 10.0,
+                    "Moves an external target.")  # fmt: skip
+ZONE = TopicRow("zone", "", "geometry_msgs/msg/PolygonStamped", Qos.LATCHED, _IN, 1.0,
+                "Draws a zone; without corners it is taken away.")  # fmt: skip
+GRID = TopicRow("grid", "", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _IN, 1.0, "Closes cells by marks.")
+MAP_SERVER = TopicRow("map_server", "/map_server/map", "nav_msgs/srv/GetMap", Qos.DEFAULT, _SERVICE, None,
+                      "The map as it is now.")  # fmt: skip
+POSE_TYPES = {
+    "odometry": "nav_msgs/msg/Odometry",
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "pose_with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+}
+"""Word in the settings -> type of the topic on which a robot says where it is."""

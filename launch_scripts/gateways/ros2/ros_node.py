@@ -18,8 +18,8 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from launch_scripts.gateways.ros2.graph import Attachment, Endpoint, Kind, NodeName, Qos, SeenEndpoint, read_token
-from launch_scripts.gateways.ros2.types import LARGEST_MESSAGE_BYTES, REQUEST, RESPONSE, RosTypes
+from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, NodeName, Qos, SeenEndpoint, read_token
+from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, REQUEST, RESPONSE, RosTypes
 from swarm.errors import BusError, ProtocolError
 
 log = logging.getLogger(__name__)
@@ -38,10 +38,9 @@ class Publisher:
         self._gid = endpoint.gid
 
     def put(self, message: Any) -> None:
-        self.put_packed(self._types.pack(message, self.endpoint.type_name))
-
-    def put_packed(self, content: bytes) -> None:
-        """CDR that was made before. Raises BusError if Zenoh refuses it."""
+        """Puts a message, or CDR that was made before. Raises BusError if Zenoh refuses it."""
+        packed = isinstance(message, bytes)
+        content = message if packed else self._types.pack(message, self.endpoint.type_name)
         attachment = Attachment(next(self._sequence), time.time_ns(), self._gid)
         try:
             self._put(content, attachment=attachment.packed())
@@ -134,20 +133,6 @@ class Node:
         self._declare(endpoint, made)
         return Publisher(self.types, endpoint, made.put)
 
-    def subscribe(
-        self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT
-    ) -> Endpoint:
-        endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
-
-        def take(sample: zenoh.Sample) -> None:
-            try:
-                hear(self.types.unpack(sample.payload.to_bytes(), type_name))
-            except ProtocolError as error:
-                self.dropped(topic, error)
-
-        self._listen(endpoint, qos, take)
-        return endpoint
-
     def newest(
         self,
         topic: str,
@@ -208,34 +193,6 @@ class Node:
         made = self._session.declare_queryable(endpoint.key, Callback(take), complete=True)
         self._declare(endpoint, made)
         return endpoint
-
-    def client(self, name: str, type_name: str) -> Callable[[Any, float], Any]:
-        """What asks a service: ask(request, timeout_s) returns the response. Raises BusError without one, and
-        ProtocolError on one that is none."""
-        packed = self.packed_client(name, type_name)
-        return lambda request, timeout_s: self.types.unpack(packed(request, timeout_s), type_name + RESPONSE)
-
-    def packed_client(self, name: str, type_name: str) -> Callable[[Any, float], bytes]:
-        """As `client`, with the CDR of the response."""
-        endpoint = self._endpoint(Kind.CLIENT, name, type_name, Qos.DEFAULT)
-        self._declare(endpoint, None)
-        sequence = itertools.count(1)
-
-        def ask(request: Any, timeout_s: float) -> bytes:
-            replies = self._session.get(
-                endpoint.key,
-                payload=self.types.pack(request, type_name + REQUEST),
-                attachment=Attachment(next(sequence), time.time_ns(), endpoint.gid).packed(),
-                target=zenoh.QueryTarget.ALL_COMPLETE,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=timeout_s,
-            )
-            for reply in replies:
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-            raise BusError(f"service {name} does not answer within {timeout_s:g} s")
-
-        return ask
 
     def watch(self, domain: str, seen: Callable[[SeenEndpoint, bool], None]) -> None:
         """Tell of every endpoint of others that is there, comes (True) or goes (False): of a domain, or of "*"."""

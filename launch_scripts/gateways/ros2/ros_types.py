@@ -1,26 +1,28 @@
-"""ROS types by distribution: their classes, CDR and hashes. rosbags knows them; two things are repaired here.
+"""ROS types by distribution: their messages, CDR and hashes. rosbags knows them; two things are repaired here.
 
 rosbags hashes `char` as a type of its own, ROS 2 as uint8, which changes every service's hash (ServiceEventInfo has
-a char[16]); and it knows no services, so those in use are stated below, with the messages that it lacks.
+a char[16]). And it knows no services, so those in use are stated below, with the message that it lacks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from launch_scripts.gateways.ros2.graph import NO_HASH
+from launch_scripts.gateways.ros2.rmw import NO_HASH
 from swarm.errors import ProtocolError
 
 LARGEST_MESSAGE_BYTES = 1 << 24
 """What a peer sends is not even looked at beyond it. A grid of 4096 x 4096 cells has as many."""
+_DTYPES = {"byte": "uint8", "char": "uint8", "string": "object"}
+REQUEST, RESPONSE, _EVENT = "_Request", "_Response", "_Event"
 
 
 class Distribution(StrEnum):
@@ -33,29 +35,22 @@ class Distribution(StrEnum):
     ROLLING = "rolling"
 
 
-_STORES = {
-    Distribution.HUMBLE: Stores.ROS2_HUMBLE,
-    Distribution.JAZZY: Stores.ROS2_JAZZY,
-    Distribution.KILTED: Stores.ROS2_KILTED,
-    Distribution.LYRICAL: Stores.ROS2_LYRICAL,
-    Distribution.ROLLING: Stores.LATEST,
-}
-
-_MESSAGES: Mapping[str, str] = {
+_ADDED = {
     "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header\nint32 x\nint32 y\n"
     "uint32 width\nuint32 height\nint8[] data",
+    "std_srvs/srv/Trigger_Request": "",
+    "std_srvs/srv/Trigger_Response": "bool success\nstring message",
+    "std_srvs/srv/SetBool_Request": "bool data",
+    "std_srvs/srv/SetBool_Response": "bool success\nstring message",
+    "std_srvs/srv/Empty_Request": "",
+    "std_srvs/srv/Empty_Response": "",
+    "nav_msgs/srv/GetMap_Request": "",
+    "nav_msgs/srv/GetMap_Response": "nav_msgs/OccupancyGrid map",
+    "nav_msgs/srv/GetPlan_Request": "geometry_msgs/PoseStamped start\ngeometry_msgs/PoseStamped goal\n"
+    "float32 tolerance",
+    "nav_msgs/srv/GetPlan_Response": "nav_msgs/Path plan",
 }
-_SERVICES: Mapping[str, tuple[str, str]] = {
-    "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
-    "std_srvs/srv/SetBool": ("bool data", "bool success\nstring message"),
-    "std_srvs/srv/Empty": ("", ""),
-    "nav_msgs/srv/GetMap": ("", "nav_msgs/OccupancyGrid map"),
-    "nav_msgs/srv/GetPlan": (
-        "geometry_msgs/PoseStamped start\ngeometry_msgs/PoseStamped goal\nfloat32 tolerance",
-        "nav_msgs/Path plan",
-    ),
-}  # fmt: skip
-REQUEST, RESPONSE = "_Request", "_Response"
+"""Name -> definition, as .msg files have it."""
 
 
 class RosTypes:
@@ -66,43 +61,30 @@ class RosTypes:
 
     def __init__(self, distribution: Distribution) -> None:
         self.distribution = distribution
-        self._store = get_typestore(_STORES[distribution])
+        rolling = distribution is Distribution.ROLLING
+        self._store = get_typestore(Stores.LATEST if rolling else Stores[f"ROS2_{distribution.upper()}"])
         _hash_char_as_uint8(self._store)
-        for name, text in _MESSAGES.items():
-            self.add_message(name, text)
-        for name, (request, response) in _SERVICES.items():
-            self.add_service(name, request, response)
+        for name, text in _ADDED.items():
+            if name not in self._store.fielddefs:
+                package, _, base = name.split("/")
+                as_message = f"{package}/msg/{base}"  # what rosbags makes of every name
+                self._store.register({name: get_types_from_msg(text, as_message)[as_message]})
+        if "service_msgs/msg/ServiceEventInfo" in self._store.fielddefs:  # but in Humble, which hashes nothing
+            for name in _ADDED:
+                if name.endswith(RESPONSE):
+                    self._link_service(name.removesuffix(RESPONSE))
 
-    def add_message(self, name: str, text: str) -> None:
-        """Add what rosbags lacks. `name` is "pkg/msg/X", "pkg/srv/X_Request" or "pkg/action/X_Goal"; `text` as .msg
-        files have it."""
-        if name in self._store.fielddefs:
-            return
-        package, _, base = name.split("/")
-        as_message = f"{package}/msg/{base}"  # what rosbags makes of every name
-        self._store.register({name: get_types_from_msg(text, as_message)[as_message]})
-
-    def add_service(self, name: str, request: str, response: str) -> None:
-        """Add a service with its parts: "pkg/srv/X"."""
-        self.add_message(name + REQUEST, request)
-        self.add_message(name + RESPONSE, response)
-        self.link_service(name)
-
-    def link_service(self, name: str) -> None:
+    def _link_service(self, name: str) -> None:
         """Add the type of a service whose request and response are known: what its hash is computed from."""
-        if "service_msgs/msg/ServiceEventInfo" not in self._store.fielddefs:
-            return  # Humble, which hashes nothing
 
         def at_most_one(part: str) -> Any:
             return Nodetype.SEQUENCE, ((Nodetype.NAME, name + part), 1)
 
         info = (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")
         event = [("info", info), ("request", at_most_one(REQUEST)), ("response", at_most_one(RESPONSE))]
-        parts = ("Request", "Response", "Event")
-        self._store.register({f"{name}_Event": ([], event)})
-        self._store.register(
-            {name: ([], [(f"{part.lower()}_message", (Nodetype.NAME, f"{name}_{part}")) for part in parts])}
-        )
+        self._store.register({name + _EVENT: ([], event)})
+        parts = (("request_message", REQUEST), ("response_message", RESPONSE), ("event_message", _EVENT))
+        self._store.register({name: ([], [(field, (Nodetype.NAME, name + part)) for field, part in parts])})
 
     @property
     def names(self) -> list[str]:
@@ -118,8 +100,32 @@ class RosTypes:
         return str(self._store.generate_msgdef(name, ros_version=2)[0])
 
     def make(self, name: str, /, **fields: Any) -> Any:
-        """A message of a type, such as make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=0.0)."""
-        return self._store.types[name](**fields)
+        """Returns a message of a type, such as make("geometry_msgs/msg/Point", x=1.0).
+
+        What is not given is 0, false or empty. A dict stands for a message which is within.
+        """
+        made = {
+            field: self._value(node, inner, fields.pop(field, None))
+            for field, (node, inner) in self._store.fielddefs[name][1]
+        }
+        if fields:
+            raise TypeError(f"{name} has no field {next(iter(fields))!r}")
+        return self._store.types[name](**made)
+
+    def _value(self, node: Nodetype, inner: Any, given: Any) -> Any:
+        """Returns the value of a field, of which nothing may be given."""
+        if node is Nodetype.NAME:
+            return self.make(inner, **given or {}) if given is None or isinstance(given, dict) else given
+        if node is Nodetype.BASE:
+            kind = inner[0]
+            none: object = "" if kind == "string" else False if kind == "bool" else 0.0 if "float" in kind else 0
+            return none if given is None else given
+        (element, of), many = inner
+        if element is Nodetype.NAME:
+            return [self._value(element, of, each) for each in given or ()]
+        return (
+            np.zeros(many if node is Nodetype.ARRAY else 0, _DTYPES.get(of[0], of[0])) if given is None else given
+        )
 
     def pack(self, message: Any, name: str) -> bytes:
         """CDR, little-endian, with its header of four bytes."""

@@ -1,0 +1,378 @@
+"""Settings of the gateway to ROS 2: a TOML file, checked as scenarios are."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from launch_scripts.gateways.ros2 import topic_table
+from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
+from swarm.config.explain import choice, explain
+from swarm.config.input_files import FileKind, parse_toml, read_text
+from swarm.config.load import is_loopback
+from swarm.config.values import Metres, Name, Positive, Section
+from swarm.errors import ConfigError
+from swarm.wire.messages.planning import GROUND
+from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_RADIUS_M
+
+ROS_ENDPOINT = "tcp/127.0.0.1:7447"
+"""Where rmw_zenohd listens unless it is told otherwise: the same as a swarm's router."""
+MOST_HZ, MOST_ROBOT_HZ = 100.0, 50.0
+
+DistributionName = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
+NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}\Z")]
+FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,79}(?<!/)\Z")]
+RosName = Annotated[str, Meta(pattern=r"^[a-zA-Z][a-zA-Z0-9_]{0,60}\Z")]
+Topic = Annotated[str, Meta(min_length=1, max_length=200)]
+Frame = Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/{}-]{0,200}\Z")]
+PoseType = Literal["odometry", "pose", "pose_with_covariance"]
+_TOPIC = re.compile(r"(?:/[a-zA-Z_][a-zA-Z0-9_]*)+")
+Rate = Annotated[float, Meta(ge=0, le=MOST_HZ)]
+
+
+class RosSide(Section, frozen=True, kw_only=True):
+    """The ROS side.
+
+    endpoint      of its Zenoh router, rmw_zenohd; a swarm's router has the same port unless told otherwise
+    in_the_clear  the endpoint may be on another machine: ROS nodes hear and say all unencrypted there
+    domain        ROS_DOMAIN_ID of the nodes
+    distribution  of the nodes; messages of one are not heard by another whose types differ
+    node          name of the gateway's node
+    """
+
+    endpoint: str = ROS_ENDPOINT
+    in_the_clear: bool = False
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+    distribution: DistributionName = "jazzy"
+    node: NodeName = "swarm_gateway"
+
+
+class Frames(Section, frozen=True, kw_only=True):
+    """Coordinate frames. The map frame begins in the terrain's south-west corner; those of a vehicle are
+    VEHICLE/odom, at the same place, and VEHICLE/base_link.
+
+    map   name of the map frame
+    bare  transforms of a vehicle go under /VEHICLE/tf, with the names odom and base_link, as Nav2 in a namespace
+          expects them; otherwise all go under /tf
+    """
+
+    map: FrameName = "map"
+    bare: bool = False
+
+
+class SwarmSide(Section, frozen=True, kw_only=True):
+    """The swarm's side. What options of the command say counts more.
+
+    connect      endpoint of a router of the swarm; if not given, the newest run of this machine that runs
+    namespace    first chunk of the swarm's keys; if not given, that of the run, or `swarm`
+    ca           certificate of the swarm's authority, beyond this machine; all three or none
+    certificate  the gateway's certificate
+    key          its private key
+    terrain      folder of the run, or any with its prepared terrain, for /map; if not given, that of the run if it
+                 is on this machine. Without one the map holds marks alone
+    """
+
+    connect: str | None = None
+    namespace: Name | None = None
+    ca: str | None = None
+    certificate: str | None = None
+    key: str | None = None
+    terrain: str | None = None
+
+
+class TopicSettings(Section, frozen=True, kw_only=True):
+    """What is changed of a topic of the table.
+
+    topic  its name in ROS, with {vehicle} or {target} where the table has them; empty: as in the table
+    hz     how often, at most; 0: as in the table
+    """
+
+    topic: str = ""
+    hz: Rate = 0.0
+
+
+class Robots(Section, frozen=True, kw_only=True):
+    """Robots of ROS that are vehicles of the swarm, from the first message on which says where they are.
+
+    id         of the one robot; not given where the topic has {robot}: then every robot that has such a topic
+    topic      where each says where it is
+    type       of this topic: odometry, pose, pose_with_covariance
+    frame      in which it says so, beside the map frame
+    offset_m   where the origin of that frame lies in the map frame: x, y
+    turn_rad   how far that frame is turned against the map frame, counter-clockwise
+    radius_m   others keep clear of it
+    lease_s    it is no vehicle any more so long after its last message
+    hz         the swarm hears of it at most so often
+    group      whose it is
+    vehicle_class  whose routes it gets: one of the scenario's classes
+    target     whom it follows; not given: nobody, until it is given a goal
+    plan       topic of its route
+    goal       topic of the place to go: put when it follows a target, heard when somebody gives it a goal
+    """
+
+    id: RosName | None = None
+    topic: Topic = "/{robot}/odom"
+    type: PoseType = "odometry"
+    frame: Frame = "{robot}/odom"
+    offset_m: tuple[Metres, Metres] = (0.0, 0.0)
+    turn_rad: Annotated[float, Meta(ge=-10, le=10)] = 0.0
+    radius_m: Annotated[float, Meta(ge=0, le=MOST_RADIUS_M)] = 1.0
+    lease_s: Annotated[float, Meta(gt=0, le=LONGEST_BODY_LEASE_S)] = 2.0
+    hz: Annotated[float, Meta(gt=0, le=MOST_ROBOT_HZ)] = 10.0
+    group: Name = "all"
+    vehicle_class: Name = GROUND
+    target: Name | None = None
+    plan: Topic = "/{robot}/plan"
+    goal: Topic = "/{robot}/goal_pose"
+
+    def robot_of(self, topic: str) -> str | None:
+        """The robot that has a topic; None if it is none of these robots."""
+        if self.id is not None:
+            return self.id if topic == self.topic else None
+        before, _, after = self.topic.partition(topic_table.ROBOT)
+        found = re.fullmatch(rf"{re.escape(before)}([a-zA-Z][a-zA-Z0-9_]{{0,60}}){re.escape(after)}", topic)
+        return found[1] if found else None
+
+
+class ZoneSettings(Section, frozen=True, kw_only=True):
+    """A zone that ROS draws by a polygon, as operators order one. A polygon without corners takes it away.
+
+    name          of the zone
+    topic         of the polygon, geometry_msgs/PolygonStamped
+    pace_s_per_m  how long a metre takes there; not given: nobody enters
+    for_s         it ends by itself so long after it was drawn last; not given: it stands until it is taken away
+    """
+
+    name: RosName
+    topic: Topic
+    pace_s_per_m: Positive | None = None
+    for_s: Positive | None = None
+
+
+class GridSettings(Section, frozen=True, kw_only=True):
+    """Cells that ROS closes by a grid. The next grid opens those that it does not close.
+
+    name      of the author of the marks
+    topic     of the grid, nav_msgs/OccupancyGrid
+    occupied  from this value on, up to 100, its cells are closed
+    for_s     they open by themselves so long after the last grid; not given: they stay closed
+    """
+
+    name: RosName
+    topic: Topic
+    occupied: Annotated[int, Meta(ge=1, le=100)] = 100
+    for_s: Positive | None = None
+
+
+class IncomingSettings(Section, frozen=True, kw_only=True):
+    """What may come in.
+
+    robots        vehicles of the swarm which ROS moves
+    targets       external targets of the scenario that ROS moves
+    set_pose      topic of a target's place, geometry_msgs/PoseStamped
+    goal_targets  external targets of the scenario that stand for places to which robots are sent: one for each goal
+                  at a time. Groups must name their `targets`, or their vehicles chase goals
+    zones         polygons that become zones
+    grids         grids that become marks
+    orders        whether ROS may pause the swarm and let it go on
+    """
+
+    robots: tuple[Robots, ...] = ()
+    targets: tuple[Name, ...] = ()
+    set_pose: Topic = "/targets/{target}/set_pose"
+    goal_targets: tuple[Name, ...] = ()
+    zones: tuple[ZoneSettings, ...] = ()
+    grids: tuple[GridSettings, ...] = ()
+    orders: bool = False
+
+    def set_pose_of(self, target: str) -> str:
+        return self.set_pose.replace(topic_table.TARGET, ros_name(target))
+
+
+EXAMPLE = IncomingSettings(
+    robots=(Robots(),),
+    targets=("ID",),
+    zones=(ZoneSettings(name="works", topic="/works"),),
+    grids=(GridSettings(name="seen", topic="/seen"),),
+    orders=True,
+)
+"""One of each, with the names that they have unless settings say otherwise."""
+
+
+class Settings(Section, frozen=True, kw_only=True):
+    """Settings of `swarm ros2`. Each key has a default, so that an empty file is one.
+
+    vehicles  ids of vehicles that ROS hears of, with * and ?
+    forward   names of topics of the table that are forwarded; empty: all
+    topics    what is changed of topics of the table, by name
+    incoming  what may come in from ROS; nothing unless it is named
+    """
+
+    vehicles: tuple[str, ...] = ("*",)
+    forward: tuple[str, ...] = ()
+    ros: RosSide = RosSide()
+    frames: Frames = Frames()
+    swarm: SwarmSide = SwarmSide()
+    topics: dict[str, TopicSettings] = msgspec.field(default_factory=dict)
+    incoming: IncomingSettings = IncomingSettings()
+
+    def rows(self) -> tuple[topic_table.TopicRow, ...]:
+        """The topics that are forwarded, as these settings have them."""
+        wanted = self.forward or tuple(topic_table.ROWS)
+        return tuple(self._changed(row) for name, row in topic_table.ROWS.items() if name in wanted)
+
+    def _changed(self, row: topic_table.TopicRow) -> topic_table.TopicRow:
+        changes = self.topics.get(row.name, TopicSettings())
+        return replace(row, topic=changes.topic or row.topic, hz=changes.hz or row.hz)
+
+
+def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_table.TopicRow]:
+    """Returns all that these settings let in, and what robots get.
+
+    has_map  whether there is a map to be asked for
+    """
+    rows: list[topic_table.TopicRow] = []
+    for robots in settings.robots:
+        names = {"robot": robots.topic, "goal": robots.goal, "robot_goal": robots.goal, "robot_plan": robots.plan}
+        for row in topic_table.ROBOT_TABLE:
+            own = replace(
+                row, topic=names.get(row.name, row.topic).replace(topic_table.ROBOT, robots.id or topic_table.ROBOT)
+            )
+            is_pose = row.name == "robot"
+            rows.append(
+                replace(own, type_name=topic_table.POSE_TYPES[robots.type], hz=robots.hz) if is_pose else own
+            )
+    rows += [replace(topic_table.SET_POSE, topic=settings.set_pose_of(each)) for each in settings.targets]
+    rows += [replace(topic_table.ZONE, topic=each.topic) for each in settings.zones]
+    rows += [replace(topic_table.GRID, topic=each.topic) for each in settings.grids]
+    rows += topic_table.ORDER_TABLE if settings.orders else ()
+    return [*rows, topic_table.MAP_SERVER] if has_map and rows else rows
+
+
+def load_settings(path: Path | None, options: Mapping[str, object] | None = None) -> Settings:
+    """Read and check a file of settings, or none, and what options say over them. Raises ConfigError that names the
+    file, or options, and the key.
+
+    options  key -> value, such as {"ros.domain": 3}; None changes nothing
+    """
+    text, source = ("", "settings") if path is None else (read_text(path, FileKind.SCENARIO), str(path))
+    return parse_settings(text, source, options)
+
+
+def parse_settings(text: str, source: str = "settings", options: Mapping[str, object] | None = None) -> Settings:
+    """As `load_settings`, of a text."""
+    raw = parse_toml(text, source, ConfigError)
+    settings = _checked(raw, source)
+    said = {key: value for key, value in (options or {}).items() if value is not None}
+    if not said:
+        return settings
+    # Into what was read, not into what became of it: defaults need not be values that a file may have.
+    for key, value in said.items():
+        section, _, name = key.rpartition(".")
+        (raw.setdefault(section, {}) if section else raw)[name] = value
+    return _checked(raw, "options")
+
+
+def _checked(raw: dict[str, Any], source: str) -> Settings:
+    try:
+        settings = msgspec.convert(raw, Settings)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {explain(str(error), raw, Settings)}") from error
+    check(settings, source)
+    return settings
+
+
+def check(settings: Settings, source: str = "settings") -> None:
+    """Raises ConfigError on what no single key shows."""
+    for key, given in (("forward", settings.forward), ("topics", tuple(settings.topics))):
+        for name in given:
+            if name not in topic_table.ROWS:
+                raise ConfigError(
+                    f"{source}: {key}: no topic {name!r} in the table{choice(name, tuple(topic_table.ROWS))}"
+                )
+    for name, changes in settings.topics.items():
+        where, row = f"{source}: topics.{name}", topic_table.ROWS[name]
+        if changes.topic:
+            _check_topic(changes.topic, row.per or topic_table.VEHICLE, 1 if row.per else 0, f"{where}.topic")
+        if changes.hz and row.hz is None:
+            raise ConfigError(f"{where}.hz: {name} is put when something changes, and has no rate")
+    topics = Counter(row.topic for row in settings.rows())
+    if doubled := [topic for topic, many in topics.items() if many > 1]:
+        raise ConfigError(f"{source}: topics: two topics are called {doubled[0]}; rename one")
+    if settings.frames.map == TERRAIN_FRAME:
+        raise ConfigError(
+            f"{source}: frames.map is {TERRAIN_FRAME!r}, which is the frame of the terrain's coordinates"
+        )
+    check_incoming(settings.incoming, f"{source}: incoming")
+    _check_ros_endpoint(settings.ros, f"{source}: ros.endpoint")
+
+
+def check_incoming(settings: IncomingSettings, source: str = "settings") -> None:
+    """Raises ConfigError on what no single key shows."""
+    for n, robots in enumerate(settings.robots):
+        where = f"{source}: robots[{n}]"
+        if (topic_table.ROBOT in robots.topic) != (robots.id is None):
+            raise ConfigError(
+                f"{where}: topic is {robots.topic!r}, expected {topic_table.ROBOT} in it, or an id and none in it"
+            )
+        own = {"topic": robots.topic, "plan": robots.plan, "goal": robots.goal}
+        if len({each.replace(topic_table.ROBOT, robots.id or topic_table.ROBOT) for each in own.values()}) < len(
+            own
+        ):
+            told = ", ".join(own.values())
+            raise ConfigError(f"{where}: topic, plan and goal are {told}, expected three topics")
+        for key, topic in own.items():
+            _check_topic(
+                topic,
+                topic_table.ROBOT,
+                1 if robots.id is None or topic_table.ROBOT in topic else 0,
+                f"{where}.{key}",
+            )
+        _check_braces(robots.frame, topic_table.ROBOT, robots.frame.count(topic_table.ROBOT), f"{where}.frame")
+    drawn = [*((f"zones[{n}]", each.topic) for n, each in enumerate(settings.zones)),
+             *((f"grids[{n}]", each.topic) for n, each in enumerate(settings.grids))]  # fmt: skip
+    for area, topic in drawn:
+        _check_topic(topic, topic_table.ROBOT, 0, f"{source}: {area}.topic")
+    _check_topic(settings.set_pose, topic_table.TARGET, 1, f"{source}: set_pose")
+    robot_ids = [each.id for each in settings.robots if each.id]
+    robot_topics = [each.topic for each in settings.robots]
+    for key, names in {
+        "robots and grids": [*robot_ids, *(each.name for each in settings.grids)],
+        "targets and goal_targets": [*settings.targets, *settings.goal_targets],
+        "zones": [each.name for each in settings.zones],
+        "topics": [*robot_topics, *map(settings.set_pose_of, settings.targets), *(topic for _, topic in drawn)],
+    }.items():
+        if doubled := [name for name, many in Counter(names).items() if many > 1]:
+            raise ConfigError(f"{source}: {key}: {doubled[0]!r} is there twice, expected once")
+
+
+def _check_topic(topic: str, part: str, many: int, where: str) -> None:
+    """Zenoh refuses what is none: empty parts between slashes, a slash at the end."""
+    _check_braces(topic, part, many, where)
+    if len(topic) > 200 or not _TOPIC.fullmatch(topic.replace(part, "x")):
+        raise ConfigError(f"{where} is {topic[:60]!r}, expected a topic such as /a/b, of letters, digits and _")
+
+
+def _check_braces(text: str, part: str, many: int, where: str) -> None:
+    rest = text.replace(part, "")
+    if text.count(part) != many or "{" in rest or "}" in rest:
+        raise ConfigError(f"{where} is {text[:60]!r}, expected {part + ' once' if many else 'no braces'}")
+
+
+def _check_ros_endpoint(ros: RosSide, where: str) -> None:
+    """Raises ConfigError on what is no endpoint, and on another machine unless that is allowed."""
+    match = re.fullmatch(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", ros.endpoint)
+    if match is None or not 0 < int(match[2]) <= 65535:
+        raise ConfigError(f"{where}: {ros.endpoint!r} is not an endpoint such as {ROS_ENDPOINT}")
+    if not ros.in_the_clear and not is_loopback(match[1].strip("[]")):
+        raise ConfigError(
+            f"{where}: {ros.endpoint} leaves this machine in the clear, as ROS nodes do not encrypt: run "
+            "rmw_zenohd beside the gateway, or set ros.in_the_clear = true"
+        )

@@ -1,0 +1,98 @@
+"""Nodes for tests: one which hears each message and asks services, as no gateway does; one without a network."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import zenoh
+
+from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, Qos
+from launch_scripts.gateways.ros2.ros_node import Node
+from launch_scripts.gateways.ros2.ros_types import REQUEST, RosTypes
+from swarm.errors import BusError, ProtocolError
+
+
+class PeerNode(Node):
+    """A node of ours as a peer."""
+
+    def subscribe(
+        self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT
+    ) -> Endpoint:
+        endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
+
+        def take(sample: zenoh.Sample) -> None:
+            try:
+                hear(self.types.unpack(sample.payload.to_bytes(), type_name))
+            except ProtocolError as error:
+                self.dropped(topic, error)
+
+        self._listen(endpoint, qos, take)
+        return endpoint
+
+    def client(self, name: str, type_name: str) -> Callable[[Any, float], bytes]:
+        """Returns what asks a service: ask(request, timeout_s) returns the CDR of the response. Raises BusError
+        without one."""
+        endpoint = self._endpoint(Kind.CLIENT, name, type_name, Qos.DEFAULT)
+        self._declare(endpoint, None)
+        sequence = itertools.count(1)
+
+        def ask(request: Any, timeout_s: float) -> bytes:
+            replies = self._session.get(
+                endpoint.key,
+                payload=self.types.pack(request, type_name + REQUEST),
+                attachment=Attachment(next(sequence), time.time_ns(), endpoint.gid).packed(),
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    return reply.ok.payload.to_bytes()
+            raise BusError(f"service {name} does not answer within {timeout_s:g} s")
+
+        return ask
+
+
+class FakeNewest:
+    """What came last on a topic, put there by a test."""
+
+    def __init__(self, topic: str) -> None:
+        self.endpoint = SimpleNamespace(topic=topic)
+        self.wake: Callable[[], None] | None = None
+        self.waiting: deque[Any] = deque(maxlen=1)
+
+    def take(self) -> Any | None:
+        return self.waiting.pop() if self.waiting else None
+
+    def close(self) -> None:
+        pass
+
+
+class FakeNode:
+    """A node whose topics a test hears and says.
+
+    heard  topic -> messages that were put
+    """
+
+    def __init__(self, types: RosTypes) -> None:
+        self.types = types
+        self.topics: dict[str, FakeNewest] = {}
+        self.heard: dict[str, list[Any]] = {}
+
+    def newest(self, topic: str, *_: Any, **__: Any) -> FakeNewest:
+        return self.topics.setdefault(topic, FakeNewest(topic))
+
+    def publisher(self, topic: str, *_: Any) -> Any:
+        told = self.heard.setdefault(topic, [])
+        return SimpleNamespace(endpoint=topic, put=told.append)
+
+    def serve(self, name: str, *_: Any) -> str:
+        return name
+
+    def remove(self, endpoint: Any) -> None:
+        pass
