@@ -1,9 +1,7 @@
-"""Nodes for tests: one which hears each message and asks services, as no gateway does; one without a network."""
+"""Nodes for tests: one which hears each message, as no gateway does, and one without a network."""
 
 from __future__ import annotations
 
-import itertools
-import time
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -11,10 +9,10 @@ from typing import Any
 
 import zenoh
 
-from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, Qos
+from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, Qos
 from launch_scripts.gateways.ros2.ros_node import Node
-from launch_scripts.gateways.ros2.ros_types import REQUEST, RosTypes
-from swarm.errors import BusError, ProtocolError
+from launch_scripts.gateways.ros2.ros_types import RosTypes
+from swarm.errors import ProtocolError
 
 
 class PeerNode(Node):
@@ -33,29 +31,6 @@ class PeerNode(Node):
 
         self._listen(endpoint, qos, take)
         return endpoint
-
-    def client(self, name: str, type_name: str) -> Callable[[Any, float], bytes]:
-        """Returns what asks a service: ask(request, timeout_s) returns the CDR of the response. Raises BusError
-        without one."""
-        endpoint = self._endpoint(Kind.CLIENT, name, type_name, Qos.DEFAULT)
-        self._declare(endpoint, None)
-        sequence = itertools.count(1)
-
-        def ask(request: Any, timeout_s: float) -> bytes:
-            replies = self._session.get(
-                endpoint.key,
-                payload=self.types.pack(request, type_name + REQUEST),
-                attachment=Attachment(next(sequence), time.time_ns(), endpoint.gid).packed(),
-                target=zenoh.QueryTarget.ALL_COMPLETE,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=timeout_s,
-            )
-            for reply in replies:
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-            raise BusError(f"service {name} does not answer within {timeout_s:g} s")
-
-        return ask
 
 
 class FakeNewest:
