@@ -8,7 +8,7 @@ from typing import Any
 
 from docs.generate.wire_page import number
 from launch_scripts import cli
-from launch_scripts.command_line.families import Family
+from launch_scripts.command_line.declaring import Family
 
 PATH = Path(__file__).parents[2] / "docs" / "reference" / "cli.md"
 _INTRO = """# The command `swarm`

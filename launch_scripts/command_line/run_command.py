@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from typer.exceptions import TyperException
 
-from launch_scripts.command_line import usage
+from swarm.config.input_files import quoted
 from swarm.errors import ConfigError, StoreError, SwarmError
 
 
@@ -34,7 +34,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         finally:
             sys.stdout.flush()
     except TyperException as error:
-        if said := usage.sentence(error):
+        if said := _sentence(error):
             print(f"swarm: {said}", file=sys.stderr)
         return ConfigError.exit_code
     except typer.Abort:
@@ -57,6 +57,24 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
         print("swarm: stopped", file=sys.stderr)
     return code if isinstance(code, int) else 0
+
+
+def _sentence(error: TyperException) -> str:
+    """What Typer found wrong, in its own words, with what they lack: the value found, what an argument is, which
+    commands there are. Empty where Typer has printed help already."""
+    if type(error).__name__ == "NoArgsIsHelpError":  # private to Typer, as all of its classes of errors
+        return ""
+    ctx: Any = getattr(error, "ctx", None)
+    param: Any = getattr(error, "param", None)
+    wrong: list[Any] = getattr(error.__cause__, "errors", list)()
+    said: str = error.format_message()
+    if wrong:
+        said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
+    elif param is not None and said.startswith("Missing") and param.help:
+        said = f"{said.removesuffix('.')}: {param.help}"
+    elif "command" in said and "Did you mean" not in said and hasattr(ctx.command, "commands"):
+        said = f"{said} There are {', '.join(ctx.command.commands)}"
+    return said if ctx is None else f"{said.removesuffix('.')}; `{ctx.command_path} -h` explains"
 
 
 def _fill_streams() -> None:

@@ -1,23 +1,32 @@
-"""Options which several commands share: fields of dataclasses that a command takes whole."""
+"""Options which several commands share."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
-from launch_scripts.command_line import complete, panels
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import CERTIFICATES, NETWORK, PART
 from swarm.liveness import HIGHEST_RANK
 
 if TYPE_CHECKING:
     from swarm.config.scenario import TlsConfig
 
 MOST_SECONDS = 1e12
-"""As the scenario has it."""
+"""Bound of a duration, as in a scenario."""
+MOST_SEED = 2**53
+"""Bound of a seed, as in a scenario."""
+HIGHEST_PORT = 65535
+
+Seconds = Annotated[float | None, typer.Option(min=0.1, max=MOST_SECONDS)]
+Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
+TargetId = Annotated[str | None, typer.Option(autocompletion=complete.target_ids)]
+GroupName = Annotated[str, typer.Option(autocompletion=complete.group_names)]
+VehicleClass = Annotated[str, typer.Option("--class")]
+Walk = Annotated[str | None, typer.Option(autocompletion=complete.words("swarm.config.values", "Walk"))]
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
@@ -26,20 +35,20 @@ ScenarioArgument = Annotated[
         autocompletion=complete.scenarios,
     ),
 ]
-Namespace = Annotated[
-    str | None,
-    typer.Option(help="Prefix of all keys: runs in different ones do not meet.", rich_help_panel=panels.NETWORK),
-]
+Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")]
 Runs = Annotated[Path, typer.Option(help="Folder in which each run gets a folder of its own.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,
-    typer.Option(min=0, max=65533, help="Router on this port, live view on the next two; 0 picks free ones."),
+    typer.Option(
+        min=0,
+        max=HIGHEST_PORT - 2,
+        help="Router on this port, live view on the next two; 0 picks free ones.",
+    ),
 ]
 PresetOption = Annotated[
     str | None,
     typer.Option(
-        "--preset",
         help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
         autocompletion=complete.words("swarm.config.values", "Preset"),
     ),
@@ -55,56 +64,22 @@ LogFormatOption = Annotated[
     Literal["text", "json"],
     typer.Option(metavar="FORMAT", help="Logs as text, or as json: one object a line, for programs."),
 ]
-Rank = Annotated[
-    int,
-    typer.Option(
-        min=0,
-        max=HIGHEST_RANK,
-        help="0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).",
-    ),
-]
-
-
-def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """Replaces each parameter of a dataclass type by the fields of that class, which typer reads as options."""
-    groups: dict[str, Any] = {}
-    parameters: list[inspect.Parameter] = []
-    for parameter in inspect.signature(command, eval_str=True).parameters.values():
-        group = parameter.annotation
-        if not is_dataclass(group):
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-            continue
-        groups[parameter.name] = group
-        hints = get_type_hints(group, include_extras=True)
-        parameters += [
-            inspect.Parameter(
-                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
-            )
-            for field in fields(group)
-        ]
-
-    def run(**values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-        command(**values)
-
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    return run
-
-
-def _certificate(help: str) -> Any:
-    return typer.Option(help=help, rich_help_panel=panels.CERTIFICATES)
+Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 
 
 @dataclass(frozen=True)
 class Tls:
-    """The three files of mutual TLS: all, or none."""
+    """The three files of mutual TLS: all, or none.
 
-    tls_ca: Annotated[str | None, _certificate("Certificate of the authority, PEM.")] = None
-    tls_cert: Annotated[str | None, _certificate("Our certificate, PEM.")] = None
-    tls_key: Annotated[str | None, _certificate("Our private key, PEM.")] = None
+    tls_ca    Certificate of the authority, PEM.
+    tls_cert  Our certificate, PEM.
+    tls_key   Our private key, PEM.
+    """
+
+    panel: ClassVar = CERTIFICATES
+    tls_ca: str | None = None
+    tls_cert: str | None = None
+    tls_key: str | None = None
 
     def config(self) -> TlsConfig | None:
         from launch_scripts.launcher.options import tls_of
@@ -114,35 +89,62 @@ class Tls:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is started and shown: `swarm demo` and `swarm up`."""
+    """How a run is started and shown: `swarm demo` and `swarm up`.
 
-    seconds: Annotated[
-        float | None,
-        typer.Option(min=0.1, max=MOST_SECONDS, help="How long the run lasts once the swarm is up."),
-    ] = None
-    seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None
+    seconds        How long the run lasts once the swarm is up.
+    seed           Seed of everything random.
+    no_live        Serve no live view. The run is recorded all the same.
+    record_inputs  Record what every process hears, so that `swarm replay` can repeat it.
+    metrics_port   Serve figures to Prometheus, and health to probes, on this port; 0 picks one.
+    follow         The camera follows this vehicle or target, as a0-07.
+    plain          Plain lines instead of the live table.
+    """
+
+    panel: ClassVar = None
+    seconds: Seconds = None
+    seed: Seed = None
     runs: Runs = Path("runs")
     port: PortOption = None
-    no_live: Annotated[
-        bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")
-    ] = False
-    record_inputs: Annotated[
-        bool,
-        typer.Option(
-            "--record-inputs", help="Record what every process hears, so that `swarm replay` can repeat it."
-        ),
-    ] = False
-    metrics_port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, help="Serve figures to Prometheus, and health to probes, on this port; 0 picks one."
-        ),
-    ] = None
+    no_live: bool = False
+    record_inputs: bool = False
+    metrics_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
     signals_address: SignalsAddress = "127.0.0.1"
     log_format: LogFormatOption = "text"
-    follow: Annotated[
-        str | None,
-        typer.Option(metavar="ID", help="The camera follows this vehicle or target, as a0-07."),
-    ] = None
-    plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")] = False
+    follow: Annotated[str | None, typer.Option(metavar="ID")] = None
+    plain: bool = False
     as_json: AsJson = False
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Where the processes of a launcher meet others.
+
+    connect  Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.
+    listen   Where the router listens too, for other machines, such as tls/0.0.0.0:7448.
+    """
+
+    panel: ClassVar = NETWORK
+    connect: str | None = None
+    listen: str | None = None
+    namespace: Namespace = None
+
+
+@dataclass(frozen=True)
+class SomeProcesses:
+    """Which part of a swarm a launcher starts, and of which run.
+
+    only       Start only this role, or one process of it: planner, planner.t0.r1; may be given several times.
+    rank       Of planners and the targets process, start those of this rank: 0 lead, 1 stand by, and so on.
+    run_id     Take part in this run; by default a new one, or the one in the namespace.
+    take_over  Take over from the launcher that runs this part of the run here, as for an upgrade: it is ended once
+               successors are ready.
+    """
+
+    panel: ClassVar = PART
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROLE[.ID]", autocompletion=complete.words("launch_scripts.process_table", "ROLES")),
+    ] = None
+    rank: Annotated[int | None, typer.Option(min=0, max=HIGHEST_RANK)] = None
+    run_id: str | None = None
+    take_over: bool = False

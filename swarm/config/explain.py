@@ -26,7 +26,7 @@ UNBOUNDED = 1e12
 """Limits beyond this keep numbers finite; they say nothing to a reader."""
 
 
-def meanings(section: type[msgspec.Struct]) -> dict[str, str]:
+def meanings(section: object) -> dict[str, str]:
     """Setting -> meaning, in the order of the rows of a section's docstring.
 
     A row is `key` or several, two or more spaces and the meaning; lines that begin with spaces continue it.

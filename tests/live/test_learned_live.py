@@ -13,7 +13,7 @@ import pytest
 from support.processes import eventually
 from typer.testing import CliRunner
 
-from launch_scripts.commands.map import app
+from launch_scripts.commands.map_commands import app
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.learning.words import ONE, Said

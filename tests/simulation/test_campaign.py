@@ -8,7 +8,7 @@ import json
 import msgspec
 import pytest
 
-from launch_scripts.commands.simulate import simulate_seeds
+from launch_scripts.commands.simulation_commands import simulate_seeds
 from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds, world_of
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.simulate import Simulation

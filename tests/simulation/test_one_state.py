@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from launch_scripts.commands.running.status import print_status, status_fields, status_of
+from launch_scripts.commands.status_view import print_status, status_fields, status_of
 from launch_scripts.launcher.tables import live_table
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.details import _DOES

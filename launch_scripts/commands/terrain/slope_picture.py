@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from launch_scripts.commands.terrain.slope_rules import Curve, Shown
+from launch_scripts.commands.slope_tables import Curve, Shown
 from swarm.errors import TerrainError
 
 _STEEPEST_PERCENT = 60
@@ -22,10 +22,10 @@ _STYLES = ("-", "--")
 
 def draw_rules(shown: Shown, path: Path) -> None:
     """Pace or speed over slope. Raises TerrainError where the file cannot be written."""
-    figure = Figure(figsize=(7.5 * len(shown.groups), 5.6), layout="constrained")
+    figure = Figure(figsize=(7.5 * len(shown), 5.6), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(shown.groups), squeeze=False)[0]
-    for panel, (title, curves) in zip(panels, shown.groups.items(), strict=True):
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    for panel, (title, curves) in zip(panels, shown.items(), strict=True):
         _panel(panel, title, curves)
     try:
         figure.savefig(path, dpi=120)

@@ -12,14 +12,15 @@ import pytest
 import yaml
 from support.exported_metrics import exported
 
-from launch_scripts.commands.metrics import alerts
+from launch_scripts import web
 from swarm.wire.messages.vehicles import VehicleState
 
+_ALERTS = Path(web.__file__).with_name("alerts.yml")
 _PAGE = Path(__file__).parents[3] / "docs" / "operate" / "alerts.md"
 
 
 def rules() -> list[dict[str, Any]]:
-    [group] = yaml.safe_load(alerts())["groups"]
+    [group] = yaml.safe_load(_ALERTS.read_text(encoding="utf-8"))["groups"]
     assert set(group) == {"name", "rules"}
     found: list[dict[str, Any]] = group["rules"]
     return found
@@ -105,7 +106,7 @@ def test_there_is_a_history_for_every_alert() -> None:
 
 @pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not installed")
 def test_promtool_says_that_each_alert_fires_on_its_history_and_none_while_all_is_well(tmp_path: Path) -> None:
-    (tmp_path / "alerts.yml").write_text(alerts())
+    (tmp_path / "alerts.yml").write_text(_ALERTS.read_text(encoding="utf-8"))
 
     def history(series: dict[str, str], expected: dict[str, bool]) -> dict[str, Any]:
         return {

@@ -111,7 +111,7 @@ def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
     assert offered("set", "pl") == ["planner.cpu_budget", "planner.push_s"]
     assert offered("plugins", "check", "se") == ["sensor"]
     assert offered("export", "LAST", "--what", "ma") == ["marks"]
-    assert offered("export", "LAST", "--format", "g") == ["geojson", "gpkg"]
+    assert offered("export", "LAST", "--format", "g") == ["geojson", "gpkg", "gpx"]
     assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
 
 

@@ -16,7 +16,7 @@ from rasterio.transform import from_origin
 from typer.testing import CliRunner, Result
 
 from launch_scripts.cli import command
-from launch_scripts.commands.deploy import app
+from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy.certificates import check_signed, hosts_of
 from launch_scripts.deploy.hosts import parse_hosts
 from launch_scripts.deploy.plan import make_plan

@@ -11,7 +11,7 @@ from cryptography import x509
 from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner, Result
 
-from launch_scripts.commands.deploy import app
+from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import THIS_MACHINE, check_signed, hosts_of
 from launch_scripts.launcher.options import as_process, tls_of

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from launch_scripts.commands.deploy import app
+from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy.size import Estimate, Machine, Swarm, fewest_machines, measured_table, too_much
 from swarm.errors import ConfigError
 

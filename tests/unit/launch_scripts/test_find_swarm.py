@@ -11,8 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from launch_scripts.commands.query import Where
-from launch_scripts.commands.running.find_swarm import find_swarm
+from launch_scripts.commands.running_swarm import Where, find_swarm
 from launch_scripts.commands.shared_options import Tls
 from launch_scripts.observe.run_folder import begin_run
 from launch_scripts.ports import free_ports
@@ -35,7 +34,7 @@ def listens() -> Iterator[list[int]]:
 def _nobody_at_the_usual_endpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     (port,) = free_ports(1)
     usual = NetworkConfig(connect=(f"tcp/127.0.0.1:{port}",))
-    monkeypatch.setattr("launch_scripts.commands.running.find_swarm.NetworkConfig", _usual_is(usual))
+    monkeypatch.setattr("swarm.config.scenario.NetworkConfig", _usual_is(usual))
 
 
 def _usual_is(usual: NetworkConfig) -> type[NetworkConfig]:

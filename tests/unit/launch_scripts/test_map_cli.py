@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, mark_sets, set_of
 from typer.testing import CliRunner
 
-from launch_scripts.commands.map import app
+from launch_scripts.commands.map_commands import app
 from shared_map.keeper.export import from_json, to_bands, to_json
 from shared_map.keeper.store import KeeperStore
 from shared_map.learning.words import Said

@@ -7,6 +7,7 @@ import json
 import re
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -15,7 +16,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
 
-from launch_scripts.commands.metrics import dashboard
+from launch_scripts import web
 from launch_scripts.observe.counts import Counts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, figures_of, named
@@ -204,7 +205,7 @@ def test_units_are_those_of_prometheus() -> None:
 
 
 def test_the_dashboard_asks_for_what_is_exported() -> None:
-    board = json.loads(dashboard())
+    board = json.loads(Path(web.__file__).with_name("dashboard.json").read_text(encoding="utf-8"))
     asked = {
         name
         for panel in board["panels"]

@@ -19,7 +19,7 @@ from launch_scripts import ports
 from launch_scripts.check import machine
 from launch_scripts.check.ground import places, plots
 from launch_scripts.cli import main
-from launch_scripts.commands.new import Choices, _asked
+from launch_scripts.commands.scenario_commands import Choices, _asked
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.agents import plan_agents
@@ -165,8 +165,8 @@ def test_who_breaks_off_gets_no_file(
     def leave(*question: object, **options: object) -> object:
         raise typer.Abort
 
-    monkeypatch.setattr("launch_scripts.commands.new._asked", leave)
-    monkeypatch.setattr("launch_scripts.commands.new.is_terminal", lambda: True)
+    monkeypatch.setattr("launch_scripts.commands.scenario_commands._asked", leave)
+    monkeypatch.setattr("launch_scripts.commands.scenario_commands.is_terminal", lambda: True)
     code, _, err = swarm("new my.toml", monkeypatch, capsys)
     assert (code, err) == (1, "swarm: stopped; nothing is written\n")
     assert not (tmp_path / "my.toml").exists()

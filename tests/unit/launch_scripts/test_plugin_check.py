@@ -99,16 +99,18 @@ def test_a_kind_that_is_none_and_a_plugin_that_is_nowhere_are_refused() -> None:
 def test_the_command_says_what_the_kit_finds(folder: Path) -> None:
     from typer.testing import CliRunner
 
-    from launch_scripts.commands import plugins
+    from launch_scripts.commands import plugin_commands
 
     (folder / "tried.py").write_text(HEAD.format(method="speed", body="return self.options.get('v', -1)"))
     arguments = ["check", "dynamics", "tried:Plugin", "--folder", str(folder), "--seeds", "1"]
-    told = CliRunner().invoke(plugins.app, arguments)
+    told = CliRunner().invoke(plugin_commands.app, arguments)
     assert told.exit_code == 1
     assert "broken: dynamics plug-in 'tried:Plugin' of dynamics: speed returned -1 m/s" in told.stdout
-    told = CliRunner().invoke(plugins.app, [*arguments, "--options", '{"v": 3}'])
+    told = CliRunner().invoke(plugin_commands.app, [*arguments, "--options", '{"v": 3}'])
     assert (told.exit_code, told.stdout) == (0, "tried:Plugin keeps what a dynamics promises\n")
-    listed = CliRunner().invoke(plugins.app, ["list"]).stdout
+    listed = CliRunner().invoke(plugin_commands.app, ["list"]).stdout
     assert "walk (terrain_swarm.walk)\n  still\n  random\n" in listed
     assert "cost_layer (terrain_swarm.cost_layer)\nassignment" in listed
-    assert isinstance(CliRunner().invoke(plugins.app, [*arguments, "--options", "[]"]).exception, ConfigError)
+    assert isinstance(
+        CliRunner().invoke(plugin_commands.app, [*arguments, "--options", "[]"]).exception, ConfigError
+    )

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from launch_scripts.commands.running.top import fields_of, table_of
+from launch_scripts.commands.top_view import fields_of, table_of
 from launch_scripts.launcher.tables import live_table
 from launch_scripts.observe.process_load import ProcessLoads, by_role
 from launch_scripts.observe.recorder import Recorder

@@ -16,7 +16,7 @@ from docs.generate import cli_page, scenario_page
 from docs.generate.__main__ import PAGES
 from docs.generate.docstrings import as_markdown, meanings, prose
 from launch_scripts import cli
-from launch_scripts.command_line.families import Family
+from launch_scripts.command_line.declaring import Family
 from swarm.config.scenario import Scenario
 
 ROOT = Path(__file__).parents[3]

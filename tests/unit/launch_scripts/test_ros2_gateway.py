@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from support.effort import few
 from support.ros_messages import path
 
-from launch_scripts.commands.ros2 import settings_of
+from launch_scripts.commands.gateway_commands import settings_of
 from launch_scripts.gateways.ros2.gateway import Channel, Declare, Gateway, Health, Put, Remove
 from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
 from launch_scripts.gateways.ros2.map_feed import MapFeed

@@ -18,11 +18,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from typer.testing import CliRunner
 
-from launch_scripts.commands.query import app
+from launch_scripts.commands.ask_commands import app
 from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, profile_of, write_route
-from launch_scripts.commands.terrain.reach import corridor
-from launch_scripts.commands.terrain.route_on_terrain import find_route
-from launch_scripts.commands.terrain.terrain import app as terrain_app
+from launch_scripts.commands.terrain_commands import app as terrain_app
+from launch_scripts.commands.terrain_routes import corridor, find_route
 from launch_scripts.launcher.options import find_scenario
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import SwarmError

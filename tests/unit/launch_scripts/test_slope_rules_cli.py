@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from launch_scripts.commands.terrain.route_on_terrain import find_route
-from launch_scripts.commands.terrain.terrain import app
+from launch_scripts.commands.terrain_commands import app
+from launch_scripts.commands.terrain_routes import find_route
 from shared_map.terrain.slope_rules import SLOPE_RULES
 from swarm.config.cost_rules import PRESETS
 from swarm.errors import ConfigError

@@ -9,7 +9,7 @@ from rich.console import Console
 from support.client_rig import run_info
 from support.swarm_model import SwarmModel
 
-from launch_scripts.commands.running.status import Status, print_status, status_fields, status_of
+from launch_scripts.commands.status_view import Status, print_status, status_fields, status_of
 from launch_scripts.observe.run_observer import OutsideObserver
 from swarm.bus.bus import AskEnded, Replied
 from swarm.grid import GridSpec

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from launch_scripts.commands.routes.swarm_route import Answer, as_json, show, write
+from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.observe.run_observer import frame_of_members
 from shared_map.terrain.places import MapFrame
 from swarm.errors import TerrainError

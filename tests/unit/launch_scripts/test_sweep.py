@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
-from launch_scripts.commands.sweep import sweep_study
+from launch_scripts.commands.simulation_commands import sweep_study
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.study import statistics
 from launch_scripts.simulation.study.plan import plan

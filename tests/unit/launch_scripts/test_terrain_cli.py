@@ -11,7 +11,7 @@ import rasterio
 from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain import terrain_picture
-from launch_scripts.commands.terrain.terrain import app
+from launch_scripts.commands.terrain_commands import app
 from shared_map.importers.sources import load_source
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from swarm.config.ground import TerrainConfig

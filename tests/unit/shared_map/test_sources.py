@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
 
-from launch_scripts.commands.terrain.terrain import info
+from launch_scripts.commands.terrain_commands import info
 from shared_map.importers.rasters.degrees import metres_per_degree
 from shared_map.importers.sources import FILE_KINDS, Source, load_source
 from shared_map.terrain.layers import TerrainClass

@@ -11,7 +11,7 @@ import pytest
 from support.zone_shapes import written
 from typer.testing import CliRunner
 
-from launch_scripts.commands.terrain.terrain import app
+from launch_scripts.commands.terrain_commands import app
 from launch_scripts.launcher.run_terrain import missing_files
 from shared_map.terrain.kept import kept_key
 from shared_map.terrain.prepared import scenario_key

@@ -9,19 +9,19 @@ from typing import Annotated
 import typer
 
 from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import command, family_app
+from swarm.config.plugin_names import PLUGIN_KINDS, installed
 from swarm.errors import ConfigError
 
-app = typer.Typer(no_args_is_help=True, help="List plug-ins, and check one of your own.")
+app = family_app("List plug-ins, and check one of your own.")
 
 
-@app.command(name="list")
+@command(app, name="list")
 def list_plugins() -> None:
     """Print every name that a scenario may use, by kind: those built in, and those of installed packages.
 
     swarm plugins list
     """
-    from swarm.config.plugin_names import PLUGIN_KINDS, installed
-
     for kind in PLUGIN_KINDS.values():
         typer.echo(f"{kind.name} ({kind.group})")
         for name in kind.built_in:
@@ -31,34 +31,35 @@ def list_plugins() -> None:
                 typer.echo(f"  {name}  {point.value}, of {point.dist.name if point.dist else 'an unknown package'}")
 
 
-@app.command()
+@command(app)
 def check(
     kind: Annotated[
-        str,
-        typer.Argument(
-            help="sensor, walk, cost_layer, assignment, strategy or dynamics.",
-            autocompletion=complete.words("swarm.config.plugin_names", "PLUGIN_KINDS"),
-        ),
+        str, typer.Argument(autocompletion=complete.words("swarm.config.plugin_names", "PLUGIN_KINDS"))
     ],
-    name: Annotated[str, typer.Argument(help="As in a scenario: module:Name, or an installed one's name.")],
-    options: Annotated[str, typer.Option(help="Its options, as a JSON object.")] = "{}",
-    folder: Annotated[Path, typer.Option(help="Where its module lies, if it is not installed.")] = Path(),
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="In how many sets of worlds it is asked.")] = 4,
+    name: str,
+    options: str = "{}",
+    folder: Path = Path(),
+    seeds: Annotated[int, typer.Option(min=1, max=1000)] = 4,
 ) -> None:
     """Ask a plug-in as a run would, and print which promises of its kind it breaks. It runs the plug-in's code.
 
     swarm plugins check sensor camera:Camera --options '{"misses": 0.5}'
+
+    kind     sensor, walk, cost_layer, assignment, strategy or dynamics.
+    name     As in a scenario: module:Name, or an installed one's name.
+    options  Its options, as a JSON object.
+    folder   Where its module lies, if it is not installed.
+    seeds    In how many sets of worlds it is asked.
     """
     from launch_scripts.check.plugin_check import check_plugin
 
+    refusal = f"--options: found {options[:40]!r}, expected a JSON object"
     try:
         table = json.loads(options)
     except ValueError as error:
-        raise ConfigError(
-            f"--options: found {options[:40]!r}, expected a JSON object: {str(error).lower()}"
-        ) from error
+        raise ConfigError(f"{refusal}: {str(error).lower()}") from error
     if not isinstance(table, dict):
-        raise ConfigError(f"--options: found {options[:40]!r}, expected a JSON object")
+        raise ConfigError(refusal)
     broken = check_plugin(kind, name, table, str(folder), range(seeds))
     for sentence in broken:
         typer.echo(f"broken: {sentence}")

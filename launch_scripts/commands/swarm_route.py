@@ -17,7 +17,6 @@ from launch_scripts.commands.routes.route_files import DescribedRoute, metres_al
 from launch_scripts.observe.run_observer import frame_of_run
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import AskEnded, Replied
-from swarm.bus.zenoh_bus import open_bus
 from swarm.config.classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
@@ -31,7 +30,6 @@ from swarm.wire.topics import COST, ROUTE
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
-    from swarm.config.scenario import NetworkConfig
 
 _TIMEOUT_S = 5.0
 
@@ -81,7 +79,7 @@ def _leads(route: Route) -> bool:
 
 
 def ask_planner(
-    network: NetworkConfig,
+    bus: Bus,
     where: object,
     target: str,
     start: Place,
@@ -91,18 +89,17 @@ def ask_planner(
     vehicle_class: str = GROUND,
 ) -> Answer:
     """Ask for the route, or with `cost` for its cost only. Raises BusError or ConfigError in one sentence."""
-    with open_bus(network) as bus:
-        frame = frame_of_run(bus, where)
-        cell = cell_of(start, frame, "--from")
-        row, col = frame.grid.row_col(cell)
-        request = (
-            CostRequest(row=row, col=col, vehicle_class=vehicle_class)
-            if cost
-            else RouteRequest(row=row, col=col, max_cells=steps, vehicle_class=vehicle_class)
-        )
-        began_s = time.monotonic()
-        reply = _ask(bus, request, target, where)
-        return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
+    frame = frame_of_run(bus, where)
+    cell = cell_of(start, frame, "--from")
+    row, col = frame.grid.row_col(cell)
+    request = (
+        CostRequest(row=row, col=col, vehicle_class=vehicle_class)
+        if cost
+        else RouteRequest(row=row, col=col, max_cells=steps, vehicle_class=vehicle_class)
+    )
+    began_s = time.monotonic()
+    reply = _ask(bus, request, target, where)
+    return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
 
 
 def _ask(bus: Bus, request: CostRequest | RouteRequest, target: str, where: object) -> RouteReply | CostReply:
@@ -168,7 +165,7 @@ def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
 
 
 def show(answer: Answer) -> None:
-    """Print an answer for people."""
+    """Prints an answer for people."""
     if isinstance(answer.reply, CostReply):
         _show_cost(answer, answer.reply)
     else:

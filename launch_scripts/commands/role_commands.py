@@ -6,19 +6,20 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
-from launch_scripts.command_line import complete, panels
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import ROLE, command
 from launch_scripts.commands.shared_options import (
+    HIGHEST_PORT,
     LogFormatOption,
     Namespace,
     Rank,
     Runs,
     SignalsAddress,
     Tls,
-    spread,
 )
 from swarm.liveness import ranked_id
 
@@ -31,8 +32,13 @@ app = typer.Typer()
 
 @dataclass(frozen=True)
 class Place:
-    """Where a process finds its scenario, its router and its files."""
+    """Where a process finds its scenario, its router and its files.
 
+    connect      The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.
+    health_port  Answer probes on this port, at /healthz and /readyz; 0 picks one.
+    """
+
+    panel: ClassVar = None
     scenario: Annotated[
         str,
         typer.Argument(
@@ -41,30 +47,22 @@ class Place:
             autocompletion=complete.scenarios,
         ),
     ] = "jacksboro"
-    connect: Annotated[
-        str | None,
-        typer.Option(
-            help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.",
-            rich_help_panel=panels.NETWORK,
-        ),
-    ] = None
+    connect: str | None = None
     namespace: Namespace = None
     runs: Runs = Path("runs")
-    health_port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Answer probes on this port, at /healthz and /readyz; 0 picks one."),
-    ] = None
+    health_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
     signals_address: SignalsAddress = "127.0.0.1"
     log_format: LogFormatOption = "text"
 
 
 @dataclass(frozen=True)
 class Part(Place):
-    """In which run a process takes part, and where it finds it."""
+    """In which run a process takes part, and where it finds it.
 
-    run_id: Annotated[
-        str | None, typer.Option(help="The run to take part in; if not given, the one in the namespace.")
-    ] = None
+    run_id  The run to take part in; if not given, the one in the namespace.
+    """
+
+    run_id: str | None = None
 
 
 @dataclass(frozen=True)
@@ -76,98 +74,74 @@ class Joins:
     at: str | None
 
 
-@app.command(rich_help_panel=panels.ROLE)
-@spread
-def router(
-    place: Place,
-    tls: Tls,
-    listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
-    id: Annotated[str, typer.Option("--id", help="Its name, where several routers pass on for each other.")] = "0",
-) -> None:
+@command(app, ROLE)
+def router(place: Place, tls: Tls, listen: str | None = None, id: str = "0") -> None:
     """Pass everybody's messages on: the process that all others connect to. --connect names another router.
 
     With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
 
     swarm router my.toml --listen tcp/127.0.0.1:7447
+
+    listen  Where to listen, such as tls/0.0.0.0:7447.
+    id      Its name, where several routers pass on for each other.
     """
     run_role("router", id, place, tls, listen=listen)
 
 
-@app.command(rich_help_panel=panels.ROLE)
-@spread
-def keeper(
-    part: Part,
-    tls: Tls,
-    store: Annotated[
-        Path | None, typer.Option(help="The SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.")
-    ] = None,
-    rebuild: Annotated[
-        bool, typer.Option(help="Move a damaged store aside and fill a new one from the swarm.")
-    ] = False,
-    id: Annotated[str, typer.Option("--id", help="Its name, where several keepers keep the same map.")] = "0",
-) -> None:
+@command(app, ROLE)
+def keeper(part: Part, tls: Tls, store: Path | None = None, rebuild: bool = False, id: str = "0") -> None:
     """Keep the shared map's marks in a store that survives every crash.
 
     Also gives the terrain to machines that lack its files. Several keepers agree with each other:
 
     swarm keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
+
+    store    The SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.
+    rebuild  Move a damaged store aside and fill a new one from the swarm.
+    id       Its name, where several keepers keep the same map.
     """
     run_role("keeper", id, part, tls, store_path=store, rebuild=rebuild)
 
 
-@app.command(rich_help_panel=panels.ROLE)
-@spread
+@command(app, ROLE)
 def planner(
-    target: Annotated[
-        str,
-        typer.Option(
-            help="The target whose tree this planner keeps, such as t0.", autocompletion=complete.target_ids
-        ),
-    ],
-    part: Part,
-    tls: Tls,
-    rank: Rank = 0,
+    target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, tls: Tls, rank: Rank = 0
 ) -> None:
     """Plan for one target, or stand by to do so.
 
     swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
+
+    target  The target whose tree this planner keeps, such as t0.
+    rank    0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
     """
     run_role("planner", ranked_id(target, rank), part, tls)
 
 
-@app.command(rich_help_panel=panels.ROLE)
-@spread
+@command(app, ROLE)
 def agent(
-    id: Annotated[
-        str,
-        typer.Option(
-            "--id",
-            help="The agent, such as a0: it hosts that part of the vehicles.",
-            autocompletion=complete.agent_ids,
-        ),
-    ],
-    part: Part,
-    tls: Tls,
+    id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part, tls: Tls
 ) -> None:
     """Drive the vehicles of one agent process.
 
     swarm agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
+
+    id  The agent, such as a0: it hosts that part of the vehicles.
     """
     run_role("agent", id, part, tls)
 
 
-@app.command(rich_help_panel=panels.ROLE)
-@spread
+@command(app, ROLE)
 def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
     """Move the simulated targets and referee the run, or stand by to do so.
 
     swarm targets jacksboro --rank 1
+
+    rank  0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
     """
     run_role("targets", ranked_id("0", rank), part, tls)
 
 
-@app.command(rich_help_panel=panels.ROLE)
-@spread
+@command(app, ROLE)
 def monitor(part: Part, tls: Tls) -> None:
     """Show and record the run.
 
@@ -186,6 +160,10 @@ def run_role(
     joins: Joins | None = None,
     **role_options: Any,
 ) -> None:
+    """Finds the run and its terrain, then becomes the process of this role until it is stopped.
+
+    joins  vehicles that the scenario does not have, for an agent that is added
+    """
     import msgspec
 
     from launch_scripts.launcher import options
@@ -200,59 +178,58 @@ def run_role(
     from swarm.errors import ConfigError
     from swarm.runtime.role import RoleSetup
 
+    log, is_router = logging.getLogger(__name__), role == "router"
+    wanted_run = part.run_id if isinstance(part, Part) else None
     scenario = options.with_network(
         options.find_scenario(part.scenario),
-        connect=None if role == "router" else part.connect,
+        connect=None if is_router else part.connect,
         listen=listen,
         namespace=part.namespace,
         tls=tls.config(),
     )
-    if role == "router" and part.connect is not None:
+    if is_router and part.connect is not None:
         network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
         scenario = msgspec.structs.replace(scenario, network=network)
-    ids = [spec.id for spec in processes_of(scenario, (role,))]
     if joins is not None:
         added_agent(scenario, id or "added0", joins.group, joins.count, joins.at)  # refused before anybody is asked
     if role in ("router", "keeper") or (joins is not None and id):
-        _check_id(id)
+        check_name("--id", id)
     elif joins is not None and scenario.network.tls is not None:
         raise ConfigError("give a name with --id: the one in the certificate agent.GROUP.NAME")
-    elif joins is None and id not in ids:
+    elif joins is None and id not in (ids := [spec.id for spec in processes_of(scenario, (role,))]):
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     scenario = options.as_process(scenario, role, id if joins is None else f"{joins.group}.{id}")
-    log_to(None, part.log_format, Speaker(role, id, (part.run_id if isinstance(part, Part) else None) or ""))
-    health = _told_health(f"{role}-{id}", part)
+    log_to(None, part.log_format, Speaker(role, id, wanted_run or ""))
+    health = _health_of(f"{role}-{id}", part)
     health.starts("its router")
     found: list[RunInfo] = []
-    run_id = part.run_id if isinstance(part, Part) else None
-    if role != "router":
+    if not is_router:
         found = find_members(scenario)
         if not found and scenario.network.tls is not None:
             # Denied messages are silent. A router of ours answers everybody that it admits, zenohd does not.
-            logging.getLogger(__name__).warning(
+            log.warning(
                 "nobody answers, not even a router: does it admit the name in %s?", scenario.network.tls.certificate
             )
         found = [info for info in found if info.run_id]
         id = id or _free_id(found)
         check_vacant(found, role, id)
-        run_id = run_id or (found[0].run_id if found else None)
-    run_id = run_id or options.common_run_id(scenario)
+    run_id = wanted_run or next((info.run_id for info in found), None) or options.common_run_id(scenario)
     added = None if joins is None else added_agent(scenario, id, joins.group, joins.count, joins.at)
     run_dir = options.make_run_dir(part.runs, run_id)
     log_to(None, part.log_format, Speaker(role, id, run_id))
     health.starts("the ground of the run")
-    if role != "router":
+    if not is_router:
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
     life = next_incarnation(run_dir, role, id)
-    logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
+    log.info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(
         scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added, health=health
     )
     load_entry(TABLE[role].entry)(setup, None, **role_options)
 
 
-def _told_health(name: str, place: Place) -> Health:
+def _health_of(name: str, place: Place) -> Health:
     """What the role tells of itself: to its supervisor, and to probes if they are given a port."""
     from launch_scripts.web.health_verdict import Process, health_pages
     from launch_scripts.web.server import Server
@@ -273,11 +250,12 @@ def _free_id(found: list[RunInfo]) -> str:
     return next(id for n in range(len(taken) + 1) if (id := f"added{n}") not in taken)
 
 
-def _check_id(id: str) -> None:
+def check_name(option: str, name: str) -> None:
+    """Raises ConfigError if the value of an option is no id."""
     from swarm.errors import ConfigError
     from swarm.wire.fields import check_id
 
     try:
-        check_id("--id", id)
+        check_id(option, name)
     except ValueError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(str(error)) from None

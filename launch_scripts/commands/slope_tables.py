@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import msgspec
@@ -53,15 +52,13 @@ class Curve(NamedTuple):
         return self.cost.flat_speed_m_per_s / found if self.unit == "m/s" else found
 
 
-@dataclass(frozen=True)
-class Shown:
-    """Groups of curves under their titles."""
+Shown = dict[str, list[Curve]]
+"""Groups of curves under their titles."""
 
-    groups: dict[str, list[Curve]]
 
-    def facts(self) -> dict[str, Any]:
-        """The same for programs. What is too steep is null."""
-        return {title: [_facts(curve) for curve in curves] for title, curves in self.groups.items()}
+def facts_of(shown: Shown) -> dict[str, Any]:
+    """Curves for programs. What is too steep is null."""
+    return {title: [_facts(curve) for curve in curves] for title, curves in shown.items()}
 
 
 def _facts(curve: Curve) -> dict[str, Any]:
@@ -85,7 +82,7 @@ def of_all() -> Shown:
         settings = ", ".join(f"{key} = {_toml(value)}" for key, value in told.settings.items())
         notes = {"about": told.about, "source": told.source, "settings": settings}
         presets.append(Curve(preset, "m/s", cost_of_preset(preset), notes))
-    return Shown({"rules": rules, "presets": presets})
+    return {"rules": rules, "presets": presets}
 
 
 def _toml(value: object) -> str:
@@ -105,12 +102,12 @@ def of_scenario(scenario: Scenario, name: str) -> Shown:
     title = f"{name}: slope rule {cost.slope_rule}{f', preset {cost.preset}' if cost.preset else ''}"
     step = Curve("each step" if cost.directional else "if directional", "m/s", msgspec.structs.replace(cost), notes)
     cell = Curve("each cell", "m/s", cost, notes, is_mean=True)
-    return Shown({title: [step] if cost.directional else [cell, step]})
+    return {title: [step] if cost.directional else [cell, step]}
 
 
 def show(shown: Shown, console: Console) -> None:
     """Print a table of each group, and what its lines are."""
-    for title, curves in shown.groups.items():
+    for title, curves in shown.items():
         unit = "pace over that of level ground" if curves[0].unit == "factor" else "m/s on open ground"
         table = Table(
             title=f"{title}: {unit}, by slope in % (negative is downhill)", title_justify="left", box=None

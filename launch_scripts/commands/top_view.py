@@ -39,7 +39,7 @@ _ANSWER_WITHIN_S = 10.0
 _SHOWN_ALARMS = 3
 
 
-def top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_json: bool) -> None:
+def show_top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_json: bool) -> None:
     """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if nobody answers at the beginning."""
     make_output_outlive_readers()
     console = Console(highlight=False)

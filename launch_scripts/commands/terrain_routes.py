@@ -1,17 +1,22 @@
-"""How long it takes to a place from everywhere on a terrain, and where good ways between two places lead."""
+"""Driving on a terrain without a swarm: a route, how long it takes from everywhere, where good ways lead."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from launch_scripts.commands.terrain.route_on_terrain import between, finder_for
+from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, profile_of, write_route
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.report.export import COSTS, Feature, Layer, areas_of, write_layers, write_raster
+from planner_service.route_finder import FoundRoute, RouteFinder
 from shared_map.arrays import Floats
+from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import PlannerConfig, Scenario
@@ -20,7 +25,105 @@ from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 from swarm.places import cell_of, read_place, written
 from swarm.wire.routes import RouteStatus
 
+
+def find_route(source: str, start: str, end: str, preset: str | None = None) -> DescribedRoute:
+    """The cheapest route between two places of a terrain file, a scenario or a built-in one.
+
+    Raises
+    ------
+    TerrainError, ConfigError
+        With one sentence, also if there is no way.
+    """
+    scenario, terrain, first, last = between(source, start, end, preset)
+    finder = finder_for(scenario, terrain, last)
+    found = finder.route(*terrain.grid.row_col(first))
+    if found.status is not RouteStatus.OK:
+        raise TerrainError(_why_not(found.status, terrain, first, last))
+    return _described(scenario.name, terrain, finder, found, scenario.planner)
+
+
+def print_route(found: DescribedRoute, out: Path | None, as_json: bool) -> None:
+    """Prints a route, and writes it where that is asked for."""
+    if out is not None:
+        write_route(found, out)
+    facts = found.facts()
+    if as_json:
+        typer.echo(json.dumps(facts))
+        return
+    frame = MapFrame(found.grid)
+    typer.echo(f"from {written(frame, int(found.cells[0]))}")
+    typer.echo(f"to {written(frame, int(found.cells[-1]))}")
+    # A route from a place to itself takes no time, which is the optimum.
+    above = max(found.gap - 1, 0) if found.cost_s > 0 else 0.0
+    climbed = f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
+    typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} cells")
+    typer.echo(f"proven to be at most {above:.2%} above the optimum")
+    typer.echo(profile_of(found))
+
+
+class Ends(NamedTuple):
+    """Two cells of a terrain, and the scenario that says what driving on it costs."""
+
+    scenario: Scenario
+    terrain: Terrain
+    first: int
+    last: int
+
+
+def between(source: str, start: str, end: str, preset: str | None = None) -> Ends:
+    """The terrain of a file, a scenario or a built-in one, and the cells of two places on it.
+
+    Places are read before the terrain is built: a mistake in one takes no time. Raises ConfigError or TerrainError.
+    """
+    places = read_place(start, "--from"), read_place(end, "--to")
+    scenario = find_scenario(source, preset)
+    terrain = build_terrain(scenario)
+    frame = MapFrame(terrain.grid)
+    return Ends(scenario, terrain, cell_of(places[0], frame, "--from"), cell_of(places[1], frame, "--to"))
+
+
+def finder_for(scenario: Scenario, terrain: Terrain, target: int) -> RouteFinder:
+    """Routes to a cell by the scenario's rules."""
+    names = ("neighbours", "edge", "corner_cutting", "length_weight")
+    rules = {name: getattr(scenario.planner, name) for name in names}
+    resolution_m, climb = terrain.grid.resolution_m, terrain.climb
+    target_cell = terrain.grid.row_col(target)
+    return RouteFinder(terrain.pace_s_per_m, target_cell, resolution_m=resolution_m, climb=climb, **rules)
+
+
+def _why_not(status: RouteStatus, terrain: Terrain, first: int, last: int) -> str:
+    lethal = terrain.lethal.reshape(-1)
+    for option, cell in (("--from", first), ("--to", last)):
+        if lethal[cell]:
+            kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
+            return f"no route: {option} is on lethal ground, {written(MapFrame(terrain.grid), cell)}, class {kind}"
+    return f"no route ({status}): lethal ground lies between the two places all around"
+
+
+def _described(
+    name: str, terrain: Terrain, finder: RouteFinder, found: FoundRoute, planner: PlannerConfig
+) -> DescribedRoute:
+    grid = terrain.grid
+    cells = found.cells[:, 0] * grid.cols + found.cells[:, 1]
+    # What is left to drive tells what has been driven, by whichever rule the planner counts.
+    left_s = finder.cost_to_go_s().reshape(-1)[cells].astype(np.float64)
+    return DescribedRoute(
+        name=name,
+        grid=grid,
+        cells=cells,
+        cost_s=found.cost_s,
+        lower_bound_s=found.lower_bound_s,
+        at_m=metres_along(grid, cells, np.sqrt(2.0) if planner.edge == "octile" else 1.0),
+        at_s=left_s[0] - left_s,
+        height_m=terrain.elevation_m.reshape(-1)[cells].astype(np.float64),
+        terrain=terrain,
+    )
+
+
+# --- from everywhere --------------------------------------------------------------------------------------------
+
 _MOST_BANDS = 200
+"""Most areas of a file: more cannot be told apart on a map."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Vehicles that join and leave while the swarm runs: `swarm vehicle add`, `remove` and `gone`."""
+"""`swarm vehicle`: vehicles join a running swarm, leave it, stop and go."""
 
 from __future__ import annotations
 
@@ -7,42 +7,48 @@ import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec.structs import replace
 
 from launch_scripts.command_line import complete
-from launch_scripts.commands.orders.vehicle import app as app
-from launch_scripts.commands.query import Where
-from launch_scripts.commands.roles import Joins, Part, run_role
-from launch_scripts.commands.shared_options import AsJson, Tls, spread
+from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.commands.order_commands import go, stop
+from launch_scripts.commands.role_commands import Joins, Part, run_role
+from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.shared_options import AsJson, GroupName, Tls
+from launch_scripts.observe.run_observer import ask_run
+from swarm.bus.bus import AskEnded, Replied
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.config.agents import agent_of
+from swarm.errors import BusError, ConfigError
+from swarm.grid import GridSpec
+from swarm.places import read_place
+from swarm.right_of_way.removal import say_gone
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.run_secret import authenticator_of
+from swarm.wire.messages.vehicles import Removed, RemoveVehicles
+from swarm.wire.topics import LEAVE
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
-    from swarm.bus.zenoh_bus import ZenohBus
     from swarm.config.scenario import NetworkConfig
     from swarm.wire.messages.processes import RunInfo
-    from swarm.wire.messages.vehicles import Removed
 
 _WITHIN_S = 5.0
+"""Longest wait until cells are free: wardens answer within a lease, which is shorter."""
 _AGAIN_S = 0.2
+app = family_app("Let vehicles join a running swarm and leave it; stop vehicles, and let them go again.")
+command(app)(stop)
+command(app)(go)
 
 
-@app.command()
-@spread
+@command(app)
 def add(
-    group: Annotated[
-        str,
-        typer.Option(help="The group of the scenario to which they belong.", autocompletion=complete.group_names),
-    ],
+    group: GroupName,
     part: Part,
     tls: Tls,
-    count: Annotated[int, typer.Option(min=1, help="How many vehicles.")] = 1,
-    id: Annotated[
-        str,
-        typer.Option("--id", help="Name of the agent that hosts them; if not given, added0 or the next free one."),
-    ] = "",
-    at: Annotated[
-        str | None,
-        typer.Option(metavar="PLACE", help="LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere."),
-    ] = None,
+    count: Annotated[int, typer.Option(min=1)] = 1,
+    id: str = "",
+    at: Annotated[str | None, typer.Option(metavar="PLACE")] = None,
 ) -> None:
     """Drive more vehicles in a running swarm, until all have left or this is stopped.
 
@@ -50,23 +56,20 @@ def add(
     killed they stay where they are; the same command finds them again.
 
     swarm vehicle add my.toml --group all --count 5 --at 36.41,-84.29
-    """
-    from swarm.places import read_place
 
+    group  The group of the scenario to which they belong.
+    count  How many vehicles.
+    id     Name of the agent that hosts them; if not given, added0 or the next free one.
+    at     LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere.
+    """
     if at is not None:
         read_place(at, "--at")
     run_role("agent", id, part, tls, joins=Joins(group, count, at))
 
 
-@app.command()
-@spread
+@command(app)
 def remove(
-    names: Annotated[
-        list[str],
-        typer.Argument(
-            help="Agents, such as extra, or vehicles, such as a0-03.", autocompletion=complete.vehicle_ids
-        ),
-    ],
+    names: Annotated[list[str], typer.Argument(autocompletion=complete.vehicle_ids)],
     where: Where,
     tls: Tls,
     as_json: AsJson = False,
@@ -76,22 +79,21 @@ def remove(
     An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.
 
     swarm vehicle remove extra a0-03
-    """
-    from swarm.config.agents import agent_of
-    from swarm.errors import ConfigError
 
+    names  Agents, such as extra, or vehicles, such as a0-03.
+    """
     network = where.network(tls)
-    found, run = _members(network, where)
+    found = _members(network, where)
     agents = {info.id for info in found if info.role == "agent"}
     asked: dict[str, list[str]] = {}
     for name in names:
         agent = name if name in agents else agent_of(name)
         if agent not in agents:
             raise ConfigError(f"no agent {agent} takes part {where}; it has {', '.join(sorted(agents)) or 'none'}")
-        asked.setdefault(agent, []).extend([] if name == agent else [name])
-    whole = {name for name in names if name in agents}
-    with _open(network, run.run_id) as bus:
-        said = {agent: _remove(bus, agent, [] if agent in whole else asked[agent]) for agent in asked}
+        asked.setdefault(agent, []).append(name)
+    with _open(network, found[0].run_id) as bus:
+        # Who names the agent itself means all of its vehicles, which an empty list says.
+        said = {agent: _remove(bus, agent, [] if agent in some else some) for agent, some in asked.items()}
     if as_json:
         typer.echo(json.dumps({agent: {"left": one.left, "held": one.held} for agent, one in said.items()}))
     for one in said.values():
@@ -103,62 +105,41 @@ def remove(
         raise typer.Exit(1)
 
 
-@app.command()
-@spread
-def gone(
-    name: Annotated[str, typer.Argument(help="The guest, such as extra or rover7.")],
-    where: Where,
-    tls: Tls,
-) -> None:
+@command(app)
+def gone(name: str, where: Where, tls: Tls) -> None:
     """Say that vehicles of a dead process are not on the map any more, so that others may drive there.
 
     Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
     Between machines it takes the guest's own certificate.
 
     swarm vehicle gone extra
-    """
-    from swarm.errors import BusError
-    from swarm.grid import GridSpec
-    from swarm.right_of_way.removal import say_gone
 
+    name  The guest, such as extra or rover7.
+    """
     network = where.network(tls)
-    _, run = _members(network, where)
+    run = _members(network, where)[0]
     with _open(network, run.run_id) as bus:
         if not say_gone(bus, name, GridSpec(run.rows, run.cols, run.resolution_m), _WITHIN_S):
             raise BusError(f"the cells of {name} are not known to be free after {_WITHIN_S:g} s: say it again")
     typer.echo(f"{name} is gone, and its cells are free")
 
 
-def _members(network: NetworkConfig, where: Where) -> tuple[list[RunInfo], RunInfo]:
-    """The processes of the run, and one of them."""
-    from launch_scripts.observe.run_observer import ask_run
-    from swarm.bus.zenoh_bus import open_bus
-    from swarm.errors import BusError
-
+def _members(network: NetworkConfig, where: Where) -> list[RunInfo]:
+    """The processes of the run, at least one."""
     with open_bus(network) as bus:
         found = ask_run(bus)
     if not found:
         raise BusError(f"no process of a run answers {where}")
-    return found, found[0]
+    return found
 
 
 def _open(network: NetworkConfig, run_id: str) -> ZenohBus:
-    from swarm.bus.zenoh_bus import open_bus
-    from swarm.runtime.run_secret import authenticator_of
-
+    """A session whose messages the run's vehicles accept as those of its operator."""
     return open_bus(network, authenticator=authenticator_of(network, run_id))
 
 
 def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
-    """Ask until the cells of all that left are free, but not for ever."""
-    from msgspec.structs import replace
-
-    from swarm.bus.bus import AskEnded, Replied
-    from swarm.errors import BusError
-    from swarm.runtime.inbox import Inbox
-    from swarm.wire.messages.vehicles import Removed, RemoveVehicles
-    from swarm.wire.topics import LEAVE
-
+    """Asks until the cells of all that left are free, but not for ever."""
     inbox = Inbox()
     until_s = time.monotonic() + _WITHIN_S
     said: Removed | None = None

@@ -1,32 +1,47 @@
-"""`swarm map`: inspect a keeper's store, export its marks, import them into another."""
+"""`swarm map`: inspects a keeper's store, exports its marks, imports them into another, shows what was learned."""
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from launch_scripts.commands.query import Where
-from launch_scripts.commands.shared_options import AsJson, Tls, spread
+from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.shared_options import AsJson, Tls
+from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.report.export import FORMATS, Layer, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
+from shared_map.learning.learned import learned_kinds
+from shared_map.replication.marks import supersedes
+from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.places import MapFrame
+from swarm.bus.bus import AskEnded, Replied
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import StoreError
+from swarm.errors import BusError, StoreError
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
-from swarm.wire.messages.map_data import MarkSet
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.map_data import MarkSet, MarksRequest
+from swarm.wire.topics import MARKS
 
-app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is_help=True)
+if TYPE_CHECKING:
+    from swarm.bus.bus import Bus
 
+app = family_app("Look at shared maps and the keeper's store.")
 Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
 _TEXT = (".json",)
 _PIXELS = (".tif", ".tiff")
+_TIMEOUT_S = 2.0
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
@@ -42,7 +57,7 @@ def _parted(grid: GridSpec, sets: list[MarkSet]) -> tuple[list[MarkSet], list[Ma
     return [each for each in sets if each.tile != grid.tiles], [each for each in sets if each.tile == grid.tiles]
 
 
-@app.command()
+@command(app)
 def inspect(store: Store, as_json: AsJson = False) -> None:
     """Show what a store holds, by author.
 
@@ -51,12 +66,15 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
     terrain, grid, held = _read(store)
     sets, words = _parted(grid, held)
     _, kind = stored_marks.to_bands(grid, sets, time.time_ns())
-    authors: dict[str, list[MarkSet]] = {}
-    for each in sets:
-        authors.setdefault(each.author, []).append(each)
     with KeeperStore(store, read_only=True) as kept:
         seen = kept.sightings()
     frame = MapFrame(grid)
+    authors: dict[str, dict[str, int]] = {}
+    for each in sorted(sets, key=lambda each: each.author):
+        counts = authors.setdefault(each.author, {"sets": 0, "marks": 0, "tombstones": 0})
+        counts["sets"] += 1
+        counts["marks"] += len(each.kinds)
+        counts["tombstones"] += not each.kinds
     found = {
         "store": str(store),
         "terrain": terrain,
@@ -66,14 +84,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         "marks": sum(len(each.kinds) for each in sets),
         "cells_with_marks": int((kind != stored_marks.NOTHING_SAID_BAND).sum()),
         "cells_lethal": int((kind == 1).sum()),
-        "authors": {
-            author: {
-                "sets": len(of),
-                "marks": sum(len(each.kinds) for each in of),
-                "tombstones": sum(not each.kinds for each in of),
-            }
-            for author, of in sorted(authors.items())
-        },
+        "authors": authors,
         "authors_that_learned": sorted(each.author for each in words if each.kinds),
         "sightings": {
             each.target: {
@@ -88,15 +99,15 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         },
     }
     if as_json:
-        print(json.dumps(found, indent=2))
+        typer.echo(json.dumps(found, indent=2))
         return
     print(f"{store}: terrain {terrain}, {grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m")
     if grid.crs != "local":
         print(f"it lies at {extent_of(frame, 'latlon')}")
     print(f"{found['marks']} marks in {len(sets)} sets; {found['cells_with_marks']} cells marked, "
           f"{found['cells_lethal']} of them lethal")  # fmt: skip
-    for author, of in sorted(authors.items()):
-        print(f"  {author:40} {sum(len(each.kinds) for each in of):7} marks in {len(of):5} tiles")
+    for author, counts in authors.items():
+        print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
     if any(each.kinds for each in words):
         print(f"  what was learned of kinds of ground, by {len(words)} authors: swarm map learned {store}")
     for sighted in seen:
@@ -104,17 +115,16 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
 
 
-@app.command()
-def export(
-    store: Store,
-    out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.")],
-) -> None:
+@command(app)
+def export(store: Store, out: Path) -> None:
     """Write the marks of a store: all of them, and what was learned, as JSON, which can be imported; the winners as
     pixels or polygons.
 
     swarm map export runs/LAST/map.sqlite marks.json
 
     swarm map export runs/LAST/map.sqlite marks.gpkg
+
+    out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
     """
     terrain, grid, sets = _read(store)
     kind_of_file = out.suffix.lower()
@@ -131,7 +141,13 @@ def export(
             raise StoreError(f"{out}: the name must end in {', '.join((*_TEXT, *_PIXELS, *FORMATS))}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    print(f"{out}: {_counted(grid, sets) if kind_of_file in _TEXT else _counted_for_all(grid, sets)}")
+    if kind_of_file in _TEXT:
+        print(f"{out}: {_counted(grid, sets)}")
+        return
+    # Pixels and polygons show the winners among the marks for all vehicles.
+    own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
+    left_out = f"; {own} marks for one class alone are left out, .json has them" if own else ""
+    print(f"{out}: {_counted(grid, [each for each in sets if each.tile < grid.tiles])}{left_out}")
 
 
 def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
@@ -140,26 +156,19 @@ def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
     return f"{text}, and what {len(words)} authors have learned" if words else text
 
 
-def _counted_for_all(grid: GridSpec, sets: list[MarkSet]) -> str:
-    """Of pixels and polygons, which show the winners among the marks for all vehicles."""
-    text = _counted(grid, [each for each in sets if each.tile < grid.tiles])
-    own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
-    return f"{text}; {own} marks for one class alone are left out, .json has them" if own else text
-
-
 def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
     pace, kind, stamps_ns = stored_marks.to_cells(grid, sets, time.time_ns())
     return mark_layer(grid, kind, pace, stamps_ns)
 
 
-@app.command("import")
-def import_(
-    file: Annotated[Path, typer.Argument(help="A .json file of `swarm map export`.")],
-    store: Annotated[Path, typer.Argument(help="The store; made if missing.")],
-) -> None:
+@command(app, name="import")
+def import_(file: Path, store: Path) -> None:
     """Import exported marks into a store, where they merge with those it holds. No keeper may use it meanwhile.
 
     swarm map import marks.json my.sqlite
+
+    file   A .json file of `swarm map export`.
+    store  The store; made if missing.
     """
     terrain, grid, sets, classes = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
     with KeeperStore(store) as into:
@@ -168,17 +177,11 @@ def import_(
     print(f"{store}: merged {_counted(grid, sets)}")
 
 
-@app.command()
-@spread
+@command(app)
 def learned(
     where: Where,
     tls: Tls,
-    store: Annotated[
-        Path | None,
-        typer.Argument(
-            help="A keeper's store, or the folder of its run; if not given, the running swarm is asked."
-        ),
-    ] = None,
+    store: Annotated[Path | None, typer.Argument()] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what vehicles have learned of kinds of ground (map.learning): driven over prior pace, and by what the
@@ -187,22 +190,63 @@ def learned(
     swarm map learned
 
     swarm map learned runs/LAST
-    """
-    from launch_scripts.commands.running.learned import ask_learned, print_learned
-    from swarm.bus.zenoh_bus import open_bus
 
+    store  A keeper's store, or the folder of its run; if not given, the running swarm is asked.
+    """
     if store is not None:
         _, grid, held = _read(store / "map.sqlite" if store.is_dir() else store)
         words = _parted(grid, held)[1]
     else:
-        with open_bus(where.network(tls)) as bus:
+        with where.bus(tls) as bus:
             words = ask_learned(bus, where)
     print_learned(words, as_json=as_json)
 
 
-def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
-    import numpy as np
+def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
+    """The newest word of each author. Raises BusError if nobody answers.
 
+    where  names the swarm in errors
+    """
+    beyond = beyond_tile(frame_of_run(bus, where).grid)
+    inbox = Inbox()
+    bus.ask(MARKS, MarksRequest(tiles=[beyond]), inbox.post, tag="learned", timeout_s=_TIMEOUT_S)
+    found: dict[str, MarkSet] = {}
+    deadline_s = time.monotonic() + _TIMEOUT_S + 1.0
+    while time.monotonic() < deadline_s:
+        match inbox.take(0.1):
+            case Replied(message=MarkSet() as word) if word.tile == beyond:
+                held = found.get(word.author)
+                if held is None or supersedes(word, held):
+                    found[word.author] = word
+            case AskEnded(failure=failure):
+                if failure is not None and not found:
+                    raise BusError(f"nobody {where} says what was learned: {failure}")
+                break
+    return [found[author] for author in sorted(found)]
+
+
+def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
+    """Prints what was learned of each kind of ground."""
+    kinds = learned_kinds(words)
+    if as_json:
+        print(json.dumps({"kinds": [each._asdict() for each in kinds]}, indent=2))
+        return
+    console = Console(highlight=False)
+    if not kinds:
+        console.print("nothing was learned: map.learning is off, or no vehicle has driven yet")
+        return
+    table = Table("kind of ground, degrees", pad_edge=False)
+    for heading in ("cells driven", "authors", "driven / prior pace", "standard error", "factor applied"):
+        table.add_column(heading, justify="right")
+    for each in kinds:
+        factor = "-" if each.factor == 1 else f"{each.factor:.2f}"
+        error = f"{each.standard_error:.1%}"
+        table.add_row(each.kind, f"{each.cells:,}", f"{each.authors}", f"{each.measured:.2f}", error, factor)
+    console.print(table)
+    console.print("factor -: not yet 4.5 standard errors from 1, so the prior stands")
+
+
+def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
     pace, kind = stored_marks.to_bands(grid, sets, time.time_ns())
     said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
     bands = [

@@ -1,0 +1,141 @@
+"""Turns functions into commands of Typer: options come from a signature, what they mean from its docstring.
+
+A command is a function and `@command(app, PANEL)`. Its docstring is its help: prose and examples, and rows
+`name  meaning` for its arguments and options, as the docstrings of scenario sections have them. A parameter without
+a default is an argument, one with a default an option; `Annotated[..., typer.Option(...)]` says what else there is,
+such as bounds or completion. A parameter whose type is a dataclass stands for one option per field, which the
+class's own docstring explains: options that several commands share are declared and explained once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable
+from copy import copy
+from dataclasses import fields, is_dataclass
+from functools import cached_property
+from typing import Annotated, Any, get_type_hints
+
+import typer
+from typer.core import TyperGroup
+
+from swarm.config.explain import meanings
+
+RUN = "Run a swarm"
+PREPARE = "Before a run"
+ASK = "Ask a running swarm"
+ORDER = "Give a running swarm orders"
+LEFT = "What runs have left"
+ROLE = "One role, by hand"
+ADMIN = "Several machines, and figures"
+"""The panels in which help shows commands."""
+
+NETWORK = "Where the swarm is"
+CERTIFICATES = "Certificates (all three, or none)"
+PART = "A part of a swarm"
+"""The panels in which help shows options."""
+
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+"""Settings of every command, which inherits them from the root."""
+_ROW = re.compile(r"\w+(, \w+)*  +\S")
+_AS_IT_STANDS = (" ", "\b", "[", "swarm ")
+"""Lines of examples and tables begin so: they keep their line ends, whereas prose fills the terminal's width."""
+
+
+def command(
+    app: typer.Typer, panel: str | None = None, name: str | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Adds a function to an app as a command, and returns the function as it is."""
+
+    def added(function: Callable[..., None]) -> Callable[..., None]:
+        app.command(name, rich_help_panel=panel, help=_prose(function.__doc__))(_called_with_options(function))
+        return function
+
+    return added
+
+
+def family_app(help: str) -> typer.Typer:
+    """The app of a sub-command that has sub-commands of its own."""
+    return typer.Typer(help=_prose(help), no_args_is_help=True, add_completion=False)
+
+
+def _prose(docstring: str | None) -> str:
+    """The prose of a docstring, each paragraph on one line, without the rows that explain options."""
+    paragraphs = re.split(r"\n\s*\n", inspect.cleandoc(docstring or ""))
+    return "\n\n".join(
+        each if any(line.startswith(_AS_IT_STANDS) for line in each.splitlines()) else " ".join(each.split())
+        for each in paragraphs
+        if not _ROW.match(each)
+    )
+
+
+def _called_with_options(function: Callable[..., None]) -> Callable[..., None]:
+    """The function as Typer reads it: every dataclass parameter is replaced by the fields of its class."""
+    said = meanings(function)
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for each in inspect.signature(function, eval_str=True).parameters.values():
+        if not is_dataclass(each.annotation):
+            parameters.append(_parameter(each.name, each.annotation, each.default, said))
+            continue
+        group: Any = each.annotation
+        groups[each.name] = group
+        explained = {name: text for base in reversed(group.__mro__) for name, text in meanings(base).items()}
+        hints = get_type_hints(group, include_extras=True)
+        for field in fields(group):
+            parameters.append(_parameter(field.name, hints[field.name], field.default, explained, group.panel))
+
+    def run(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+        function(**values)
+
+    run.__name__ = function.__name__
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return run
+
+
+def _parameter(
+    name: str, hint: Any, default: Any, said: dict[str, str], panel: str | None = None
+) -> inspect.Parameter:
+    """A parameter with its meaning; one that is true or false is given as `--name` alone."""
+    kind, *declared = (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)
+    is_argument = default is inspect.Parameter.empty
+    info = copy(declared[0]) if declared else typer.Argument() if is_argument else typer.Option()
+    info.help = said.get(name, info.help)
+    info.rich_help_panel = panel
+    if kind is bool and not info.param_decls:
+        info.param_decls = (f"--{name.replace('_', '-')}",)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info]
+    )
+
+
+class Family(TyperGroup):
+    """A group whose commands are those of the Typer app `MODULE.app`, which is imported when one is asked for.
+
+    help  the line beside its name among the other commands; the app has a longer one of its own
+    """
+
+    def __init__(self, name: str, module: str, help: str, panel: str) -> None:
+        self.module = module
+        super().__init__(name=name, help=help, no_args_is_help=True, rich_help_panel=panel)
+
+    @cached_property
+    def group(self) -> Any:
+        """The group of the app itself."""
+        return typer.main.get_command(importlib.import_module(self.module).app)
+
+    @property
+    def commands(self) -> Any:
+        return self.group.commands
+
+    @commands.setter
+    def commands(self, none_yet: Any) -> None:
+        """Typer gives a new group the commands that it knows, and of a family it knows none."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        self.group.format_help(ctx, formatter)

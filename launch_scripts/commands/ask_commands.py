@@ -1,0 +1,288 @@
+"""Commands that ask a running swarm: `route`, `status`, `top`, `health` and `metrics`."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch_scripts.command_line.declaring import ASK, command
+from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.shared_options import (
+    HIGHEST_PORT,
+    AsJson,
+    PresetOption,
+    SignalsAddress,
+    TargetId,
+    Tls,
+    VehicleClass,
+)
+from swarm.errors import BusError, ConfigError
+
+if TYPE_CHECKING:
+    from launch_scripts.commands.status_view import Status
+    from launch_scripts.web.health_probe import Answer
+    from swarm.config.scenario import NetworkConfig
+
+app = typer.Typer()
+_STATUS_LISTEN_S, _STATUS_MOST_S = 1.5, 4.0
+"""`swarm status` listens for so long; longer while a process that has answered has not said how it is."""
+_TURN_S = 0.1
+
+
+@command(app, ASK)
+def route(
+    where: Where,
+    tls: Tls,
+    target: TargetId = None,
+    row: int | None = None,
+    col: int | None = None,
+    steps: Annotated[int, typer.Option(min=0)] = 0,
+    cost: bool = False,
+    terrain: str | None = None,
+    start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
+    end: Annotated[str | None, typer.Option("--to", metavar="PLACE")] = None,
+    vehicle_class: VehicleClass = "ground",
+    out: Path | None = None,
+    preset: PresetOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Ask a planner for the cheapest route from a place to its target; or find one on a terrain, without a swarm.
+
+    swarm route --target t3 --row 40 --col 200
+
+    swarm route --target t3 --from 36.41,-84.29 --steps 1
+
+    swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
+
+    swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --preset hiker --out way.gpx
+
+    target         The target, such as t3.
+    row            Row of the start, counted from the north.
+    col            Column of the start, counted from the west.
+    steps          Most steps to show; 1 is the next, 0 is all.
+    cost           Only the cost, or that there is no way.
+    terrain        Without a swarm: on this terrain file, scenario or built-in scenario.
+    start          LAT,LON, xy:X,Y in metres or cell:ROW,COL; instead of --row and --col.
+    end            With --terrain: where to, as --from.
+    vehicle_class  Which class of the swarm's vehicles drives there.
+    out            Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture.
+    """
+    from launch_scripts.commands import terrain_routes
+    from launch_scripts.commands.routes.route_files import check_route_file
+    from swarm.places import read_place
+
+    if terrain is not None:
+        if start is None or end is None or target is not None or row is not None or col is not None:
+            raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
+        check_route_file(out)
+        terrain_routes.print_route(terrain_routes.find_route(terrain, start, end, preset), out, as_json)
+        return
+    if preset is not None:
+        raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
+    by_cell = row is not None and col is not None
+    if target is None or (start is None) == (not by_cell) or end is not None or (cost and out is not None):
+        raise ConfigError(
+            "give --target, --row and --col (or --from) to ask a swarm, or --terrain, --from and --to without one"
+        )
+    check_route_file(out)
+    place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
+    from launch_scripts.commands import swarm_route
+
+    with where.bus(tls) as bus:
+        answer = swarm_route.ask_planner(
+            bus, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
+        )
+    if out is not None:
+        swarm_route.write(answer, out)
+    if as_json:
+        typer.echo(swarm_route.as_json(answer))
+    else:
+        swarm_route.show(answer)
+
+
+@command(app, ASK)
+def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
+
+    Without --connect it asks the newest run of this machine that runs, whatever its ports.
+
+    swarm status
+
+    swarm status --json | jq .planners
+    """
+    from rich.console import Console
+
+    from launch_scripts.commands.status_view import print_status, status_fields
+
+    told = _ask_status(where, tls)
+    if as_json:
+        typer.echo(json.dumps(status_fields(told), indent=2))
+    else:
+        print_status(told, Console(markup=False))
+
+
+def _ask_status(where: Where, tls: Tls) -> Status:
+    """A running swarm as it is now. Raises BusError if nobody answers."""
+    from launch_scripts.commands.status_view import status_of
+    from launch_scripts.observe.run_observer import OutsideObserver
+    from swarm.clock import MonotonicClock
+
+    clock = MonotonicClock()
+    with where.bus(tls) as bus:
+        observer = OutsideObserver(bus)
+        began_s = time.monotonic()
+        while (spent_s := time.monotonic() - began_s) < _STATUS_MOST_S:
+            if spent_s >= _STATUS_LISTEN_S and observer.whole:
+                break
+            observer.listen(clock, 0.1)
+        told = status_of(observer, clock.now_ns())
+    if told is None:
+        admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
+        raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
+    return told
+
+
+@command(app, ASK)
+def top(
+    where: Where,
+    tls: Tls,
+    each: bool = False,
+    once: bool = False,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
+) -> None:
+    """Watch a running swarm: processes, vehicles and targets, once a second; `q` or Ctrl-C ends it.
+
+    Processes on other machines are shown, too: each tells what it takes up. CPU of 100 % is one core; late/s counts
+    ticks that came late or not at all, of a role the worst.
+
+    swarm top --each
+
+    swarm top --json --once | jq .processes[0]
+
+    each     A line for each process, not only for each role.
+    once     Show it once and end.
+    as_json  Print one JSON object a second, or one with --once.
+    """
+    from launch_scripts.commands.top_view import show_top
+
+    show_top(where.network(tls), where, each=each, once=once, as_json=as_json)
+
+
+@command(app, ASK)
+def health(where: Where, tls: Tls, url: str | None = None, live: bool = False, as_json: AsJson = False) -> None:
+    """Say whether a swarm is ready: exit code 0 if it is, 1 if not, 4 if nobody answers. For probes.
+
+    With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
+    there in a fraction of a second. Otherwise it asks the whole swarm over its router, for two seconds.
+
+    swarm health --url http://127.0.0.1:9464
+
+    swarm health --url http://127.0.0.1:9464 --live
+
+    swarm health --connect tcp/127.0.0.1:7447 --json
+
+    url   Ask the machine whose figures or health are served there, such as http://127.0.0.1:9464.
+    live  With --url: whether its processes live, not whether they are ready.
+    """
+    from launch_scripts.web.health_probe import ask
+
+    if url is None and live:
+        raise ConfigError("--live goes with --url: of a whole swarm it is asked whether it is ready")
+    if url is not None and (where.connect or where.run or where.namespace or tls != Tls()):
+        raise ConfigError(
+            "--url asks one machine without TLS; what says how a whole swarm is reached goes without it"
+        )
+    answer = swarm_answer(_ask_status(where, tls)) if url is None else ask(url, live=live)
+    raise typer.Exit(answer.show(as_json=as_json))
+
+
+def swarm_answer(status: Status) -> Answer:
+    """Whether all processes that the run needs are there and ready."""
+    from launch_scripts.web.health_probe import Answer
+    from swarm.runtime.stats import READY
+
+    observed = status.latest
+    missing = [f"{name.replace(' ', '-', 1)}: does not run" for name in observed.missing()]
+    for role, id in sorted(observed.up()):
+        stats = observed.newest_stats(role, id)
+        if stats is not None and stats.gauges.get(READY) == 0.0:
+            missing.append(f"{role}-{id}: not ready, as it says")
+    if not any(info.run_id for info in status.members):
+        missing.append("no run: only routers answer")
+    told = {
+        "status": "not ready" if missing else "ready",
+        "missing": missing,
+        "processes": [{"name": f"{role}-{id}"} for role, id in sorted(observed.up())],
+    }
+    return Answer(not missing, told)
+
+
+@command(app, ASK)
+def metrics(
+    where: Where,
+    tls: Tls,
+    port: Annotated[int, typer.Option(min=0, max=HIGHEST_PORT)] = 9464,
+    signals_address: SignalsAddress = "127.0.0.1",
+    dashboard: bool = False,
+    alerts: bool = False,
+) -> None:
+    """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
+
+    swarm metrics --port 9464
+
+    swarm metrics --dashboard > swarm.json
+
+    swarm metrics --alerts > swarm-alerts.yml
+
+    `swarm up --metrics-port 9464` does the same for as long as the run lasts.
+
+    port       Where it listens; 0 picks one.
+    dashboard  Print a dashboard for Grafana, as JSON, and exit.
+    alerts     Print rules for alerts of Prometheus, as YAML, and exit.
+    """
+    if dashboard and alerts:
+        raise ConfigError("--dashboard and --alerts print a file each: give one of them")
+    if dashboard or alerts:
+        name = "dashboard.json" if dashboard else "alerts.yml"
+        typer.echo(files("launch_scripts.web").joinpath(name).read_text(encoding="utf-8"), nl=False)
+    else:
+        _serve_metrics(where.network(tls), port, signals_address)
+
+
+def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
+    """Serves until Ctrl-C, on an address of this machine. Raises BusError if the port is taken, or there is no
+    router."""
+    from launch_scripts.observe.run_observer import OutsideObserver
+    from launch_scripts.web.health_verdict import Process
+    from launch_scripts.web.prometheus import MetricsEndpoint, families, figures_of
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.clock import MonotonicClock
+    from swarm.runtime.health import Health
+    from swarm.runtime.supervisor import supervisor_of
+    from swarm.wire.topics import STATS, STATUS
+
+    health = Health(supervisor=supervisor_of(os.environ))
+    health.begins(1.0 / _TURN_S)
+    endpoint = MetricsEndpoint(port, lambda: [Process("metrics", health.board.read())], address)
+    try:
+        with open_bus(network) as bus:
+            clock, observer = MonotonicClock(), OutsideObserver(bus, topics={STATS: 0.0, STATUS: 0.0}, follows=True)
+            typer.echo(f"metrics at {endpoint.url}; Ctrl-C ends it")
+            told = None
+            while True:
+                observer.listen(clock, _TURN_S)
+                endpoint.answer(lambda: families(figures_of(observer.run, observer.latest)))
+                health.turned([] if observer.run is not None else ["a run"])
+                if observer.run is not None and observer.run.run_id != told:
+                    told = observer.run.run_id
+                    typer.echo(f"run {told}, scenario {observer.run.scenario}")
+    except KeyboardInterrupt:
+        pass
+    finally:
+        endpoint.close()

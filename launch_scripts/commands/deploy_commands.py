@@ -1,0 +1,345 @@
+"""`swarm deploy`: a plan of all machines, certificates, zenohd's configuration, and how many machines it takes."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from launch_scripts.check.settings import check_start
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
+from launch_scripts.deploy import certificates, revocations
+from launch_scripts.deploy.host_scenario import CERTIFICATES
+from launch_scripts.deploy.hosts import load_hosts
+from launch_scripts.deploy.kits import keepers_before, write_kits
+from launch_scripts.deploy.plan import COLUMNS, Plan, make_plan, rows
+from launch_scripts.deploy.plan import as_json as plan_fields
+from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
+from launch_scripts.deploy.size import (
+    CELLS_PER_VEHICLE,
+    Estimate,
+    Machine,
+    Needs,
+    Swarm,
+    fewest_machines,
+    measured_table,
+    too_much,
+)
+from launch_scripts.launcher.options import common_run_id, find_scenario, own_certificate, with_network
+from launch_scripts.process_table import admitting_all, certificate_names
+from swarm.bus.access_control import ROUTER, bearer, common_name
+from swarm.config.input_files import quoted
+from swarm.config.load import check_endpoint
+from swarm.config.scenario import Scenario
+from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
+from swarm.errors import ConfigError, StoreError
+
+app = family_app("A plan, certificates and configurations for several machines.")
+KitName = Literal["systemd", "compose"]
+Days = Annotated[int, typer.Option(min=1, max=3650)]
+_IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
+"""With a tag, which "-all" may be added to: no digest."""
+_LEAST_SIDE, _MOST_SIDE = 32, 16_384
+
+
+@command(app)
+def plan(
+    scenario: ScenarioArgument,
+    hosts: Annotated[Path, typer.Option()],
+    out: Path | None = None,
+    kit: KitName = "systemd",
+    image: str = "",
+    wheel: Path | None = None,
+    days: Days = 365,
+    namespace: Namespace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which process runs on which machine, and make an archive for each: service, scenario, certificates.
+
+    swarm deploy plan my.toml --hosts hosts.toml --out kits
+
+    then on each machine NAME, with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
+
+    Every process runs once; keepers, and planners and their standbys, on machines of their own. A second plan into
+    the same folder keeps the certificates, but for those that end soon or whose names were revoked, and removes the
+    archives of machines that it does not have.
+
+    hosts  The machines, in TOML: see docs/deploy.md.
+    out    Write an archive for each machine here, certificates included; if not given, only show.
+    kit    What starts the processes: systemd, or compose (containers).
+    image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
+    wheel  Put this wheel of the swarm into the archives, to be installed from them.
+    days   Days until new certificates expire.
+    """
+    chosen = with_network(find_scenario(scenario), namespace=namespace)
+    try:
+        run_id = common_run_id(chosen)
+        keepers = {} if out is None else keepers_before(out, run_id)
+        made = make_plan(chosen, load_hosts(hosts), run_id, keepers)
+    except ConfigError as error:
+        sentence = str(error)
+        raise ConfigError(sentence if sentence.startswith(str(hosts)) else f"{hosts}: {sentence}") from error
+    _check_image(image, kit)
+    if wheel is not None and not (wheel.suffix == ".whl" and wheel.is_file()):
+        raise ConfigError(f"--wheel: found {wheel}, expected a file NAME.whl; `uv build --wheel` makes one")
+    if kit != "systemd" and wheel is not None:
+        raise ConfigError(f"--wheel: found {wheel} with --kit {kit}, expected none: containers have an image")
+    if out is None and (image or wheel is not None):
+        raise ConfigError("--image and --wheel go into what --out writes, and it is not given")
+    check_start(chosen, joins=True, has_ground=True)
+    written = [] if out is None else _write(made, out, kit, image, days, wheel)
+    if as_json:
+        typer.echo(json.dumps({**plan_fields(made), "archives": list(map(str, written))}, indent=2))
+        return
+    _show(made, kit)
+    for host, archive in zip(made.hosts, written, strict=True) if written else ():
+        typer.echo(f"{archive}: on {host.address} `tar xzf {archive.name} && sudo swarm-{host.name}/install`")
+    if out is not None:
+        typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
+
+
+def _check_image(image: str, kit: KitName) -> None:
+    if image and kit == "systemd":
+        raise ConfigError(f"--image: found {quoted(image)} with --kit systemd, expected none: it has no containers")
+    if image and re.fullmatch(_IMAGE, image) is None:
+        raise ConfigError(f"--image: found {quoted(image)}, expected NAME:TAG; the monitor's is NAME:TAG-all")
+
+
+def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
+    if kit == "systemd":
+        return write_kits(made, out, systemd_files, days, wheel)
+    compose = partial(compose_files, image=image, revoked=revocations.revoked_in(out / CERTIFICATES))
+    return write_kits(made, out, compose, days, launcher=False)
+
+
+def _show(made: Plan, kit: KitName) -> None:
+    # One column a machine: names of processes are many and short, machines few.
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    machines = rows(made)
+    table.add_column("")
+    for machine in machines:
+        table.add_column(Text(machine[0]), overflow="fold")
+    for n, column in enumerate(COLUMNS[1:], 1):
+        table.add_row(Text(column, "dim"), *(Text(machine[n] or "-") for machine in machines))
+    console = Console(highlight=False)
+    console.print(table)
+    lost = made.survive
+    what = "no machine may be lost" if not lost else f"{lost} of {len(made.hosts)} machines may be lost at once"
+    console.print(f"run {made.run_id}: {len(made.processes)} processes; {what}", soft_wrap=True)
+    if kit == "systemd":
+        console.print(f"{made.records} records the run and writes its report", soft_wrap=True)
+
+
+@command(app)
+def size(
+    vehicles: Annotated[int, typer.Option(min=1, max=100_000)] = 1000,
+    targets: Annotated[int, typer.Option(min=1, max=MOST_TARGETS)] = 10,
+    cells: Annotated[int | None, typer.Option("--map", show_default="262 for each vehicle")] = None,
+    per_agent: Annotated[int, typer.Option(min=1, max=MOST_PER_AGENT)] = 200,
+    tick_hz: Annotated[float, typer.Option(min=0.1, max=100)] = 5.0,
+    standbys: Annotated[int, typer.Option(min=0, max=3)] = 0,
+    cores: Annotated[int, typer.Option(min=1)] = 16,
+    memory: Annotated[float, typer.Option(min=0.1)] = 64.0,
+    link: Annotated[float, typer.Option(min=1)] = 1000.0,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
+) -> None:
+    """How many machines a swarm needs, by a table of swarms that were measured.
+
+    swarm deploy size --vehicles 1000 --targets 10
+
+    swarm deploy size --vehicles 10000 --targets 100 --cores 32 --memory 128 --link 10000
+
+    Machines are used to 60 % of cores and memory, and links to half. What one process cannot carry is named: more
+    machines do not help it. What is larger than the measured swarms is extrapolated. They had the speeds and the
+    density of the scenario `thousand`; see docs/scaling.md for the table and its errors.
+
+    Exit code 1 if a process has to do more than one core can.
+
+    vehicles   Vehicles.
+    targets    Targets, each with a planner.
+    cells      Cells of the map.
+    per_agent  Vehicles of an agent.
+    tick_hz    Ticks a second of agents and planners.
+    standbys   Standbys of each planner.
+    cores      Cores of a machine.
+    memory     Memory of a machine, GB.
+    link       Link of a machine, Mbit/s.
+    as_json    Print one JSON object instead of tables.
+    """
+    for option, value in (("--memory", memory), ("--link", link)):
+        if not math.isfinite(value):
+            raise ConfigError(f"{option} is {value}, expected a number")
+    least, most = max(_LEAST_SIDE**2, 4 * vehicles), _MOST_SIDE**2
+    if cells is not None and not least <= cells <= most:
+        raise ConfigError(f"--map is {cells}, expected {least} to {most} cells for {vehicles} vehicles")
+    side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), _LEAST_SIDE)
+    if cells is not None:
+        side = math.isqrt(cells - 1) + 1
+    agents = -(-vehicles // per_agent)
+    swarm = Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
+    runs, machine = measured_table(), Machine(cores, memory, link)
+    found = fewest_machines(Estimate(runs, swarm, standbys), machine)
+    full = too_much(found, machine)
+    beyond = found.machines > 1 or not runs.reaches(swarm)
+    if as_json:
+        typer.echo(json.dumps({**msgspec.to_builtins(found), "full": full, "extrapolated": beyond}))
+    else:
+        _show_size(found)
+        for each in full:
+            typer.echo(f"{each}: more machines do not help.")
+        if beyond:
+            typer.echo("Extrapolated: larger than the swarms that were measured.")
+    if full:
+        raise typer.Exit(1)
+
+
+def _show_size(found: Needs) -> None:
+    machines = f"{found.machines:,} machine{'s' * (found.machines > 1)}"
+    table = Table("", machines, title="What this swarm needs", title_justify="left")
+    table.columns[1].justify = "right"
+    for name, value in (
+        ("cores, all machines", sum(found.cpu_cores.values())),
+        *((f"  {role}", each) for role, each in found.cpu_cores.items()),
+        ("cores, a machine", found.machine_cores),
+        ("cores, the first", found.first_cores),
+        ("memory, a machine, GB", found.memory_gb),
+        ("memory, the first, GB", found.first_memory_gb),
+        ("between machines, messages/s", found.crossings_per_s),
+        ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
+        ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
+        ("out, routers each with each, Mbit/s", found.link_mbit_per_s),
+        ("out, by a router of the region, Mbit/s", found.link_out_mbit_per_s),
+        ("sessions of a router", found.sessions),
+    ):
+        table.add_row(name, f"{value:,.3g}" if value < 100 else f"{value:,.0f}")
+    Console(highlight=False).print(table)
+
+
+@command(app)
+def certs(
+    folder: Path,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME[=HOST,...]...]")] = None,
+    scenario: Annotated[str | None, typer.Option(autocompletion=complete.scenarios)] = None,
+    days: Days = 365,
+    renew: bool = False,
+) -> None:
+    """Make certificates for mutual TLS, signed by the folder's own authority, which is made if missing.
+
+    swarm deploy certs certs --scenario my.toml router.0=10.0.0.1,base.local
+
+    makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
+    allows. operator.0 is for the launcher and for tools. On the router's machine, and on another:
+
+    swarm router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
+
+    swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
+
+    Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
+    What is there is kept while more than a third of its time is left.
+
+    folder    Folder of the authority and of all certificates.
+    names     Names to make certificates for. A router needs the hosts that others connect to.
+    scenario  Make those that its processes lack or that end soon, too, and number anew what it revokes.
+    days      Days until they expire.
+    renew     Replace existing certificates of the names given.
+    """
+    chosen = Scenario() if scenario is None else find_scenario(scenario)
+    given = {name: hosts for name, _, hosts in (each.partition("=") for each in names or ())}
+    wanted = [*given, *(() if scenario is None else certificate_names(chosen))]
+    for name in wanted:
+        bearer(name)
+    revoked = {*chosen.network.revoked, *revocations.revoked_in(folder)}
+    for name in dict.fromkeys(wanted):
+        path, again = folder / f"{name}.pem", renew
+        hosts = [host for host in given.get(name, "").split(",") if host]
+        if bearer(name).role == ROUTER:
+            hosts += certificates.THIS_MACHINE
+        if name not in given and (again := path.exists()):
+            if certificates.may_stay(path, (), certificates.called_of(path)):
+                continue
+            hosts = sorted(certificates.hosts_of(path))
+        called = common_name(name, revoked)
+        certificates.issue(folder, name, hosts, days, renew=again, called=called)
+        print(f"{path}, {path.with_suffix('.key')}: {called}, good until {certificates.ends_on(path)}")
+    print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
+
+
+@command(app)
+def revoke(folder: Path, names: list[str]) -> None:
+    """Deny everything to who has these names in a certificate. A running router notices within a second.
+
+    swarm deploy revoke certs agent.all.a0
+
+    adds them to the file `revoked` in the folder. Do so, or copy the file, on every machine with a router. All
+    links of the router end, and are back at once, those of the names with no rights. `swarm deploy certs --renew`
+    makes the next certificate of a name.
+
+    folder  Folder with the certificate of a router.
+    names   Names as they stand in the certificates: agent.all.a0~2.
+    """
+    path = revocations.revoke(folder, names)
+    print(f"revoked, as {path} says: {', '.join(names)}")
+
+
+@command(app)
+def zenohd(
+    out: Path,
+    tls: Tls,
+    listen: list[str] | None = None,
+    peer: list[str] | None = None,
+    namespace: Namespace = None,
+    scenario: Annotated[str | None, typer.Option(autocompletion=complete.scenarios)] = None,
+    plugins: Path | None = None,
+    volume: str = "memory",
+) -> None:
+    """Write a configuration for zenohd as the router of a swarm, with its marks in zenohd's own storages.
+
+    swarm deploy zenohd router.json5 --listen tcp/127.0.0.1:7447 --plugins /usr/lib/zenoh
+
+    out       The file to write, for `zenohd -c FILE`.
+    listen    Where to listen, such as tls/0.0.0.0:7447; several times if need be.
+    peer      Another router to connect to.
+    scenario  Whose processes may take part: needed with certificates.
+    plugins   Folder with libzenoh_plugin_storage_manager.so, to store marks, too.
+    volume    Volume of the storage: memory, or one whose backend is installed.
+    """
+    if scenario is None and tls.tls_ca is not None:
+        raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
+    chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))
+    network = with_network(chosen, namespace=namespace, tls=tls.config()).network
+    for option, endpoints in (("--listen", listen), ("--peer", peer)):
+        for endpoint in endpoints or ():
+            check_endpoint(endpoint, network.tls is not None, option)
+    network = msgspec.structs.replace(
+        network,
+        listen=tuple(listen or network.listen),
+        peers=tuple(peer or network.peers),
+        tls=own_certificate(network.tls, "router.0"),
+    )
+    network = revocations.with_revocations(network)
+    if network.tls is not None:  # zenohd may run elsewhere than here
+        files = (network.tls.ca, network.tls.certificate, network.tls.key)
+        ca, certificate, key = (str(Path(file).resolve()) for file in files)
+        absolute = msgspec.structs.replace(network.tls, ca=ca, certificate=certificate, key=key)
+        network = msgspec.structs.replace(network, tls=absolute)
+    config = zenohd_config(
+        network,
+        plugins=None if plugins is None else str(plugins.resolve()),
+        volume=volume,
+    )
+    try:
+        out.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
+    print(f"{out}: run `zenohd -c {out}`")

@@ -1,0 +1,229 @@
+"""`swarm ros2` and `swarm mavlink`: a running swarm meets ROS 2, and vehicles that speak MAVLink."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import typer
+
+from launch_scripts.command_line.declaring import ASK, ORDER, command
+from launch_scripts.commands.role_commands import check_name
+from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.shared_options import GroupName, TargetId, Tls, VehicleClass
+from swarm.errors import BusError, ConfigError
+
+if TYPE_CHECKING:
+    from launch_scripts.gateways.ros2.gateway_settings import Settings
+    from swarm.client import Swarm
+    from swarm.config.scenario import NetworkConfig
+
+app = typer.Typer()
+_MOST_ALTITUDE_M = 10_000.0
+
+
+@dataclass(frozen=True)
+class RosSide:
+    """How the ROS side is reached.
+
+    ros           Router of the ROS side, rmw_zenohd; tcp/127.0.0.1:7447 if not given.
+    domain        ROS_DOMAIN_ID; 0 if not given.
+    distribution  humble, jazzy, kilted, lyrical or rolling; jazzy if not given.
+    """
+
+    panel: ClassVar = "The ROS side"
+    ros: Annotated[str | None, typer.Option(metavar="ENDPOINT")] = None
+    domain: Annotated[int | None, typer.Option(min=0, max=232)] = None
+    distribution: str | None = None
+
+
+@command(app, ASK)
+def ros2(
+    where: Where,
+    tls: Tls,
+    side: RosSide,
+    settings: Annotated[Path | None, typer.Argument(metavar="[SETTINGS]")] = None,
+    vehicles: list[str] | None = None,
+    topics: Annotated[bool, typer.Option("--list")] = False,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
+) -> None:
+    """Show a running swarm to ROS 2 (rmw_zenoh), until Ctrl-C: map, transforms, odometry, plans, targets, markers.
+    ROS need not be installed here.
+
+    swarm ros2 --ros tcp/127.0.0.1:7447
+
+    swarm ros2 gateway.toml --run LAST
+
+    swarm ros2 --list
+
+    settings  A .toml file: topics, rates, names, both sides.
+    vehicles  Ids of vehicles that ROS hears of, with * and ?; may be given several times.
+    topics    Print what is forwarded, and exit.
+    as_json   With --list: as JSON.
+    """
+    told = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
+    chosen = settings_of(settings, {**told, "vehicles": vehicles})
+    if topics:
+        _list_topics(chosen, as_json=as_json)
+        return
+    ours = chosen.swarm
+    where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
+    tls = tls if tls.tls_ca else Tls(ours.ca, ours.certificate, ours.key)
+    _serve_ros2(chosen, where.network(tls), where.runs)
+
+
+def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
+    """The settings of a file, and what options say over them. Raises ConfigError.
+
+    changes  key -> value, such as {"ros.domain": 3}; None changes nothing
+    """
+    for package in ("rosbags", "xxhash"):
+        if find_spec(package) is None:
+            raise ConfigError(
+                f"swarm ros2 needs {package}, which is not installed: pip install 'terrain-swarm[ros2]'"
+            )
+    from launch_scripts.gateways.ros2.gateway_settings import load_settings
+
+    return load_settings(file, changes)
+
+
+def _list_topics(settings: Settings, *, as_json: bool) -> None:
+    from launch_scripts.gateways.ros2.gateway_settings import incoming_rows
+
+    rows = list(settings.rows())
+    rows += incoming_rows(settings.incoming, has_map=any(row.name == "map" for row in rows))
+    if as_json:
+        told = [
+            {"name": row.name, "topic": row.topic, "type": row.type_name, "qos": row.qos.name.lower(),
+             "direction": row.direction, "hz": row.hz, "says": row.says}
+            for row in rows
+        ]  # fmt: skip
+        typer.echo(json.dumps(told, indent=2))
+        return
+    topic, kind = (max(len(getattr(row, name)) for row in rows) for name in ("topic", "type_name"))
+    for row in rows:
+        rate = "on change" if row.hz is None else f"{row.hz:g} Hz"
+        typer.echo(f"{row.topic:{topic}}  {row.type_name:{kind}}  {row.direction:3}  {rate}")
+
+
+def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
+    """Forwards until Ctrl-C. Raises BusError if one of the two sides does not answer at the start."""
+    from launch_scripts.gateways.ros2.service import Ros2Service
+    from launch_scripts.stop_requests import stop_requests
+    from swarm.bus.endpoints import listening
+
+    ros = settings.ros.endpoint
+    if ros in network.connect:
+        typer.echo(
+            f"the swarm and ROS have one router, {ros}: ROS nodes there can say and hear all that the swarm does. "
+            "Let rmw_zenohd listen elsewhere, and name it by --ros",
+            err=True,
+        )
+    if not listening(ros):
+        raise BusError(f"no router of the ROS side listens at {ros}: start rmw_zenohd, or name it by --ros")
+    service = Ros2Service(settings, network, runs, lambda sentence: typer.echo(sentence, err=True))
+    with stop_requests() as stopping, suppress(KeyboardInterrupt):
+        service.run(stopping=stopping)
+
+
+@dataclass(frozen=True)
+class Drives:
+    """How a vehicle is driven.
+
+    target         Follow routes to this target; without it the vehicle is avoided, and no more.
+    drive          By missions, or by guided setpoints.
+    arm            Arm it and set its mode; without it that is the pilot's.
+    altitude       Metres at which one that flies follows.
+    above          What --altitude is above; terrain: ArduPilot only.
+    vehicle_class  Which class of the swarm's vehicles it drives as.
+    """
+
+    panel: ClassVar = "How it is driven"
+    target: TargetId = None
+    drive: Literal["mission", "guided"] = "mission"
+    arm: bool = False
+    altitude: Annotated[float | None, typer.Option(min=1.0, max=_MOST_ALTITUDE_M)] = None
+    above: Literal["home", "terrain"] = "home"
+    vehicle_class: VehicleClass = "ground"
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Who a vehicle is, in the swarm and on its link.
+
+    id           Its name in the swarm; if not given, mav1 of system 1.
+    group        Whose it is.
+    radius       Metres around it that others keep clear.
+    sysid        Its MAVLink system; if not given, the first autopilot.
+    lost_after   Seconds without a heartbeat or a position, after which it is left to its own fail-safe.
+    signing_key  File of 64 hexadecimal digits: messages are signed, and others not heard.
+    """
+
+    panel: ClassVar = "Who the vehicle is"
+    id: str | None = None
+    group: GroupName = "all"
+    radius: Annotated[float, typer.Option(min=0.0, max=100.0)] = 1.0
+    sysid: Annotated[int | None, typer.Option(min=1, max=244)] = None
+    lost_after: Annotated[float, typer.Option(min=1.5, max=60.0)] = 5.0
+    signing_key: Path | None = None
+
+
+@command(app, ORDER)
+def mavlink(
+    link: Annotated[str, typer.Argument(metavar="LINK")], where: Where, tls: Tls, drives: Drives, vehicle: Vehicle
+) -> None:
+    """Let a PX4 or ArduPilot vehicle take part in a running swarm, until Ctrl-C.
+
+    The swarm's vehicles avoid it. With --target it follows the swarm's routes to that target. It is armed, and its
+    mode is set, with --arm only. One process for each vehicle; docs/mavlink.md has the rest.
+
+    swarm mavlink udpin:127.0.0.1:14540
+
+    swarm mavlink udpin:127.0.0.1:14540 --target t0 --arm
+
+    swarm mavlink serial:/dev/ttyACM0:57600 --target t0 --drive guided --class drone --altitude 60
+
+    link  udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
+    """
+    from launch_scripts.gateways.mavlink.guidance import Wishes
+    from launch_scripts.gateways.mavlink.link import read_address
+    from launch_scripts.gateways.mavlink.mavlink_codec import pymavlink
+    from launch_scripts.gateways.mavlink.service import Body, read_key, run
+    from swarm.client import connect
+    from swarm.config.agents import agent_of
+
+    address = read_address(link)
+    key = None if vehicle.signing_key is None else read_key(vehicle.signing_key)
+    id, target, altitude = vehicle.id, drives.target, drives.altitude
+    named = {"--id": id, "--group": vehicle.group, "--class": drives.vehicle_class, "--target": target}
+    for option, value in named.items():
+        if value is not None:
+            check_name(option, value)
+    if id is not None and agent_of(id) != id:
+        raise ConfigError(f"--id: {id!r} has a '-', by which the swarm names vehicles of its own agents")
+    if target is None and (drives.arm or altitude is not None):
+        option = "--arm" if drives.arm else "--altitude"
+        raise ConfigError(f"{option} goes with --target: without it nothing is driven")
+    if drives.above == "terrain" and altitude is None:
+        raise ConfigError("--above terrain goes with --altitude: how many metres above it")
+    pymavlink()
+    network = where.network(tls)
+
+    def join() -> Swarm:
+        files = network.tls
+        return connect(
+            network.connect[0],
+            namespace=network.namespace,
+            ca=None if files is None else files.ca,
+            certificate=None if files is None else files.certificate,
+            key=None if files is None else files.key,
+            timeout_s=network.connect_timeout_s,
+        )
+
+    wishes = Wishes(target, drives.drive, drives.arm, altitude, drives.above, vehicle.lost_after)
+    body = Body(id, vehicle.group, vehicle.radius, drives.vehicle_class)
+    run(join, address, body, wishes, sysid=vehicle.sysid, key=key, tell=typer.echo)

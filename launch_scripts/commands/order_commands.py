@@ -1,0 +1,270 @@
+"""Orders to a running swarm: `pause`, `resume`, `group`, `set`, `orders`, `target` and `vehicle stop|go`.
+
+Each is one `GiveOrder`, made of a subject and the fields that its command has read (`give`). A keeper holds what is
+ordered, and each process acknowledges it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import ORDER, command, family_app
+from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.shared_options import AsJson, Tls, Walk
+
+if TYPE_CHECKING:
+    from swarm.runtime.operator import Acknowledged
+    from swarm.wire.messages import Message
+
+M = TypeVar("M", bound="Message")
+app = typer.Typer()
+target_app = family_app("Add, move and remove simulated targets while the swarm runs.")
+
+Id = Annotated[
+    str, typer.Argument(metavar="ID", help="The target, such as t3.", autocompletion=complete.target_ids)
+]
+At = Annotated[
+    str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
+]
+Vehicles = Annotated[
+    list[str], typer.Argument(metavar="ID...", help="Vehicles, such as a0-03.", autocompletion=complete.vehicle_ids)
+]
+
+
+@command(app, ORDER)
+def pause(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
+
+    Vehicles drive to the middle of the cell that they are entering and stand there. Planners go on planning.
+
+    swarm pause
+    """
+    give(where, tls, as_json, {"subject": "pause"})
+
+
+@command(app, ORDER)
+def resume(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Let all go on after a pause.
+
+    swarm resume
+    """
+    give(where, tls, as_json, {"subject": "pause", "off": True})
+
+
+@command(app, ORDER)
+def group(
+    name: Annotated[str, typer.Argument(metavar="GROUP", autocompletion=complete.group_names)],
+    where: Where,
+    tls: Tls,
+    targets: Annotated[
+        list[str] | None, typer.Argument(metavar="[targets] TARGET...", autocompletion=complete.target_ids)
+    ] = None,
+    as_scenario: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say which targets the vehicles of a group may chase.
+
+    swarm group red targets t1 t2
+
+    swarm group red --as-scenario
+
+    name         The group.
+    targets      The targets that it may chase.
+    as_scenario  Those that the scenario says.
+    """
+    from swarm.errors import ConfigError
+
+    chosen = list(targets or ())
+    if chosen[:1] == ["targets"]:
+        chosen = chosen[1:]
+    if as_scenario == bool(chosen):
+        raise ConfigError("group: give either targets or --as-scenario")
+    give(where, tls, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
+
+
+@command(app, ORDER, "set")
+def set_(
+    key: Annotated[
+        str, typer.Argument(metavar="KEY", autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"))
+    ],
+    where: Where,
+    tls: Tls,
+    value: Annotated[float | None, typer.Argument(metavar="VALUE")] = None,
+    as_scenario: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """Change a setting while the swarm runs: time_scale, vehicles.reassign_s, planner.cpu_budget, planner.push_s.
+
+    swarm set time_scale 5
+
+    swarm set time_scale --as-scenario
+
+    key          A key of the scenario, such as time_scale.
+    value        Its new value.
+    as_scenario  The value that the scenario says.
+    """
+    from swarm.config.explain import choice
+    from swarm.errors import ConfigError
+    from swarm.runtime.order_book import SETTINGS
+
+    if as_scenario == (value is not None):
+        raise ConfigError("set: give either a value or --as-scenario")
+    if key not in SETTINGS:
+        raise ConfigError(f"set: {key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
+    give(where, tls, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
+
+
+@command(app, ORDER)
+def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Print what is ordered and not taken back. Zones are in `swarm zone list`.
+
+    swarm orders --json
+    """
+    import msgspec
+
+    from swarm.runtime.operator import Operator
+    from swarm.runtime.order_book import OrderBook
+
+    with where.bus(tls) as bus:
+        book = Operator(bus).orders()
+    if as_json:
+        typer.echo(json.dumps([msgspec.to_builtins(order) for order in book.orders], indent=2))
+        return
+    known = OrderBook()
+    known.merge(book.orders, time.time_ns())
+    for ordered in known.standing or ["no orders"]:
+        typer.echo(ordered)
+
+
+@command(target_app)
+def add(
+    id: Id,
+    at: At,
+    where: Where,
+    tls: Tls,
+    walk: Walk = "waypoints",
+    speed: float = 4.0,
+    as_json: AsJson = False,
+) -> None:
+    """Add a target. A launcher starts its planner; groups that may chase every target chase it.
+
+    swarm target add x --at 36.41,-84.29 --walk evade
+
+    swarm target add x --at cell:40,200
+
+    walk   still, random, waypoints or evade, as in a scenario.
+    speed  Metres per second on level open ground.
+    """
+    fields = {"subject": "target", "name": id, "new": True, "walk": walk, "speed_m_per_s": speed}
+    give(where, tls, as_json, fields, at=at)
+
+
+@command(target_app)
+def move(id: Id, at: At, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Put a target somewhere else; it goes on from there.
+
+    swarm target move t3 --at cell:40,200
+    """
+    give(where, tls, as_json, {"subject": "target", "name": id}, at=at)
+
+
+@command(target_app)
+def remove(id: Id, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Remove a target. Its planner ends, and the vehicles that chased it chase others.
+
+    swarm target remove t3
+    """
+    give(where, tls, as_json, {"subject": "target", "name": id, "off": True})
+
+
+def stop(ids: Vehicles, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Let vehicles stand in the middle of their cells until they are let go. Others drive around them.
+
+    swarm vehicle stop a0-03 a0-04
+    """
+    give(where, tls, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
+
+
+def go(ids: Vehicles, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Let stopped vehicles go.
+
+    swarm vehicle go a0-03
+    """
+    give(where, tls, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
+
+
+# --- how an order is given --------------------------------------------------------------------------------------
+
+
+def give(where: Where, tls: Tls, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> None:
+    """Gives orders, one after the other, and prints who obeys. Exit code 1 if somebody has not said so.
+
+    orders  fields of `GiveOrder` each
+    at      the place that they are about, if any: becomes their `cell`
+    """
+    import msgspec
+
+    from launch_scripts.observe.run_observer import frame_of_run
+    from swarm.places import cell_of, fields_of, read_place, written
+    from swarm.runtime.operator import Operator
+    from swarm.wire.messages.orders import GiveOrder
+
+    # The cell is known once the swarm has said where its terrain lies; all else is checked before it is asked.
+    place = None if at is None else read_place(at, "--at")
+    made = [checked(GiveOrder, fields if place is None else {**fields, "cell": 0}) for fields in orders]
+    silent = False
+    printed: list[dict[str, Any]] = []
+    with where.bus(tls) as bus:
+        operator = Operator(bus)
+        for order in made:
+            said: dict[str, Any] = {}
+            if place is not None:
+                frame = frame_of_run(bus, where)
+                cell = cell_of(place, frame, "--at")
+                order = msgspec.structs.replace(order, cell=cell)
+                said = {"at": fields_of(frame, cell)}
+            given, acknowledged = operator.give(order)
+            silent = silent or bool(acknowledged.silent)
+            if as_json:
+                told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+                printed.append({"given": msgspec.to_builtins(given), **told, **said})
+                continue
+            if place is not None:
+                typer.echo(f"{order.subject} {order.name} is put at {written(frame, cell)}")
+            print_obeyed(acknowledged)
+    if as_json:
+        typer.echo(json.dumps(printed[0] if len(printed) == 1 else printed, indent=2))
+    if silent:
+        raise typer.Exit(1)
+
+
+def checked(kind: type[M], fields: dict[str, Any]) -> M:
+    """The order of these fields; those which are None are left out. Raises ConfigError."""
+    import msgspec
+
+    from swarm.config.explain import explain
+    from swarm.errors import ConfigError
+    from swarm.wire.versions import schema_of_type
+
+    given = {name: value for name, value in fields.items() if value is not None}
+    try:
+        return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
+    except (msgspec.ValidationError, ValueError) as error:
+        said = str(error)
+        ours = not said.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
+        said = said.partition(" - at `$")[0] if ours else explain(said, given, kind)
+        raise ConfigError(f"the order is not possible: {said}") from None
+
+
+def print_obeyed(acknowledged: Acknowledged) -> None:
+    """Prints who obeys an order, and who has not said so."""
+    took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
+    typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
+    if acknowledged.silent:
+        names = ", ".join(acknowledged.silent)
+        typer.echo(f"no answer yet from {names}: they obey as soon as they hear a keeper", err=True)

@@ -1,0 +1,288 @@
+"""`swarm compare`, `report`, `export` and `replay`: what runs have left."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import LEFT, command
+from launch_scripts.commands.shared_options import AsJson, Runs
+from launch_scripts.plain_text import plain
+from swarm.config.explain import choice
+from swarm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from launch_scripts.replay.run import Replayed
+    from launch_scripts.report.compare import LeftRun
+    from swarm.recording.replaying import Difference
+
+app = typer.Typer()
+RunArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete.runs
+    ),
+]
+_ROW = "{:<22} {:>4} {:>9} {:>9} {:>9}  {}"
+_SHOWN = 300
+"""Characters of an output."""
+
+
+@command(app, LEFT)
+def compare(
+    run: Annotated[list[str], typer.Argument(metavar="RUN...", autocompletion=complete.runs)],
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Show what differs between runs: settings, versions and machines, and all figures beside each other.
+
+    Where a run listened is left out: free ports differ each time.
+
+    swarm compare 20261122-154115-44bb LAST
+
+    run  Folders of runs, or their names in --runs.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from launch_scripts.launcher.console import REPORTED
+    from launch_scripts.observe.run_folder import SCENARIO_FILE
+    from launch_scripts.report.compare import (
+        circumstances_that_differ,
+        figures,
+        remarks,
+        settings_that_differ,
+        text_of,
+    )
+
+    if len(run) < 2:
+        raise ConfigError("compare takes two runs or more, such as two folders in runs/")
+    found = [_left(name, runs) for name in run]
+    settings, made = settings_that_differ(found), circumstances_that_differ(found)
+    numbers = figures(found, REPORTED)
+    if as_json:
+        told = {"scenario": dict(settings), "made": dict(made), "figures": dict(numbers)}
+        named = {"runs": [each.name for each in found], "remarks": remarks(found)}
+        typer.echo(json.dumps({**named, **told}, indent=2, default=str))
+        return
+    console = Console(highlight=False)
+    unknown = (each.name for each in found if each.settings is None)
+    for sentence in (
+        *(f"{name} has no {SCENARIO_FILE}: its settings are not known" for name in unknown),
+        *remarks(found),
+    ):
+        console.print(Text(plain(sentence), style="yellow"))
+    if not settings:
+        console.print("the scenarios are the same")
+    for heading, rows in (("setting", settings), ("version or machine", made), ("figure", numbers)):
+        table = Table(heading, pad_edge=False)
+        for each in found:
+            table.add_column(Text(plain(each.name)), justify="right", overflow="fold")
+        for label, values in rows:
+            table.add_row(Text(plain(label)), *(Text(plain(text_of(label, value))) for value in values))
+        if rows:
+            console.print(table)
+
+
+def _left(name: str, runs: Path) -> LeftRun:
+    from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
+    from launch_scripts.report.compare import LeftRun
+    from swarm.config.input_files import FileKind, parse_toml, read_text
+
+    folder = find_run(name, runs)
+    report, path = read_report(folder), folder / SCENARIO_FILE
+    settings = None
+    if path.exists():
+        settings = parse_toml(read_text(path, FileKind.SCENARIO), str(path), ConfigError)
+    return LeftRun(folder.resolve().name, report, settings)
+
+
+@command(app, LEFT)
+def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
+    """Write a run's page again: report.html, one file that opens anywhere without a network.
+
+    It has the run's figures and what they mean, its map, plots over time, tables per target, group and vehicle, the
+    scenario as it ran, machine and versions. Every run writes it at its end.
+
+    swarm report LAST
+    """
+    from launch_scripts.observe.run_folder import find_run
+    from launch_scripts.report.run_page import write_page
+
+    typer.echo(write_page(find_run(run, runs)))
+
+
+@command(app, LEFT)
+def export(
+    run: RunArgument = "LAST",
+    what: Annotated[
+        list[str] | None,
+        typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "WHAT")),
+    ] = None,
+    format: Annotated[
+        str, typer.Option(autocompletion=complete.words("launch_scripts.report.run_layers", "ENDINGS"))
+    ] = "geojson",
+    out: Path | None = None,
+    force: bool = False,
+    mcap: bool = False,
+    runs: Runs = Path("runs"),
+) -> None:
+    """Write what a run has left for a GIS, a spreadsheet or Foxglove.
+
+    Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
+    their certified gaps, and marks as areas that say the same. GeoJSON and the columns lat and lon of CSV are in
+    WGS 84 where the terrain has a place, else in metres of its map; a GeoPackage is in the map's metres.
+
+    swarm export LAST
+
+    swarm export LAST --format gpkg --what tracks --what marks
+
+    swarm export LAST --mcap
+
+    what    tracks, targets, captures, routes or marks; may be given several times; all by default.
+    format  geojson, csv or gpx, a file per layer; gpkg or kml, one file with all layers.
+    out     Folder to write to; by default export/ in the run's folder.
+    force   Replace files that are there.
+    mcap    Write a recording with ROS 2 messages instead, for Foxglove.
+    """
+    from launch_scripts.observe.run_folder import find_run
+    from launch_scripts.report.run_layers import ENDINGS, WHAT, export_run
+
+    for option, given, allowed in (("--what", what or (), tuple(WHAT)), ("--format", [format], ENDINGS)):
+        for each in given:
+            if each not in allowed:
+                raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
+    folder = find_run(run, runs)
+    if mcap:
+        from launch_scripts.report.mcap_export import export_mcap
+
+        typer.echo(export_mcap(folder, out, force))
+        return
+    for line in export_run(folder, what or (), format, out, force):
+        typer.echo(line)
+
+
+@command(app, LEFT)
+def replay(
+    run: RunArgument = "LAST",
+    process: str | None = None,
+    until: Annotated[float | None, typer.Option(min=0)] = None,
+    keep: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Feed what the processes of a run heard to the services of this build, and say where their outputs first
+    differ.
+
+    swarm demo --record-inputs, then swarm replay
+
+    swarm replay LAST --process planner-t3 --until 34.5 --keep my-case
+
+    A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
+
+    process  Only this process, such as planner-t3.
+    until    Only so many seconds from the start of the run, by its own clock.
+    keep     Copy what is replayed into a folder: a test case.
+    """
+    from launch_scripts.launcher.console import progress
+    from launch_scripts.observe.run_folder import find_run
+    from launch_scripts.replay.run import keep as keep_recorded
+    from launch_scripts.replay.run import other_versions, recordings_of, replay_run, unreadable
+
+    logging.getLogger().addHandler(logging.NullHandler())  # what the processes logged is in their own logs
+    folder = find_run(run, runs)
+    if keep is not None:
+        for recorded in recordings_of(folder, process):
+            typer.echo(f"kept {keep_recorded(recorded, keep, until)}", err=as_json)
+        folder = keep
+    refused = unreadable(folder, process)
+    others = {
+        name: two for recorded in recordings_of(folder, process) for name, two in other_versions(recorded).items()
+    }
+    if not as_json:
+        for package, (then, now) in others.items():
+            typer.echo(f"recorded with {package} {then}, replayed with {now}")
+        typer.echo(_ROW.format("process", "life", "events", "outputs", "seconds", "result"))
+    rows: list[Replayed] = []
+    with progress() as tell:
+        for row in replay_run(folder, process, until, progress=lambda share: tell("replaying", share)):
+            rows.append(row)
+            if not as_json:
+                typer.echo(_line(row))
+    if as_json:
+        told = {
+            "run": str(folder),
+            "versions": others,
+            "processes": list(map(_fields, rows)),
+            "unreadable": refused,
+        }
+        typer.echo(json.dumps(told, indent=2))
+    else:
+        _explain(rows)
+        for sentence in refused:
+            typer.echo(plain(sentence))
+    if refused or not all(row.same for row in rows):
+        raise typer.Exit(1)
+
+
+def _line(row: Replayed) -> str:
+    recorded, outcome = row.recorded, row.outcome
+    if outcome is None:
+        return _ROW.format(recorded.process, recorded.life, "-", "-", "-", "not replayed")
+    if outcome.difference is not None:
+        result = f"differs at event {outcome.difference.event:,}"
+    elif outcome.damaged is not None:
+        result = "damaged; same until there"
+    else:
+        result = "same" if outcome.ended == "ended as asked" else f"same ({outcome.ended})"
+    figures = (f"{outcome.events:,}", f"{outcome.outputs:,}", f"{outcome.seconds:.2f}")
+    return _ROW.format(recorded.process, recorded.life, *figures, plain(result))
+
+
+def _explain(rows: list[Replayed]) -> None:
+    for row in rows:
+        who = f"{row.recorded.process}, life {row.recorded.life}"
+        if row.outcome is None:
+            typer.echo(plain(f"{who}: {row.why}"))
+        elif row.outcome.difference is not None:
+            _show(who, row.outcome.difference)
+        elif row.outcome.damaged is not None:
+            typer.echo(plain(f"{who}: {row.recorded.path} is {row.outcome.damaged}"))
+    outcomes = [row.outcome for row in rows if row.outcome is not None]
+    same = sum(row.same for row in rows)
+    typer.echo(
+        f"{sum(each.events for each in outcomes):,} events, {sum(each.outputs for each in outcomes):,} outputs: "
+        f"{same} of {len(rows)} recordings give the same"
+    )
+
+
+def _show(who: str, difference: Difference) -> None:
+    typer.echo(plain(f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"))
+    typer.echo(f"    recorded: {_short(difference.recorded)}")
+    typer.echo(f"    replayed: {_short(difference.replayed)}")
+
+
+def _short(output: str | None) -> str:
+    if output is None:
+        return "nothing more"
+    return plain(output) if len(output) <= _SHOWN else f"{plain(output[:_SHOWN])} ..."
+
+
+def _fields(row: Replayed) -> dict[str, Any]:
+    recorded = row.recorded
+    return {
+        "process": recorded.process,
+        "life": recorded.life,
+        "incarnation": recorded.head.incarnation,
+        "bytes": recorded.bytes,
+        "same": row.same,
+        "why": row.why,
+        **({} if row.outcome is None else dataclasses.asdict(row.outcome)),
+    }

@@ -1,0 +1,108 @@
+"""`swarm demo` and `swarm up`: all processes of a swarm on this machine, or some of them."""
+
+from __future__ import annotations
+
+import time
+from contextlib import nullcontext
+
+import typer
+
+from launch_scripts.command_line.declaring import RUN, command
+from launch_scripts.commands.shared_options import Meeting, RunOptions, ScenarioArgument, SomeProcesses, Tls
+
+app = typer.Typer()
+
+
+@command(app, RUN)
+def demo(run: RunOptions) -> None:
+    """Run the whole swarm on real mountains: 99 rovers, a drone, 10 targets, 19 processes.
+
+    The same as `swarm up demo`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
+    report.html, report.json, report.png and a log file per process.
+
+    swarm demo --seconds 20 --port 0
+    """
+    up("demo", run, Tls(), Meeting(), SomeProcesses())
+
+
+@command(app, RUN)
+def up(scenario: ScenarioArgument, run: RunOptions, tls: Tls, meeting: Meeting, part: SomeProcesses) -> None:
+    """Run a scenario: all of its processes on this machine, or some of them.
+
+    swarm up jacksboro --seconds 20 --port 0
+
+    swarm up my.toml --only router --only keeper
+
+    swarm up my.toml --only router.1 --only planner.t3 --only planner.t0.r1 --only agent
+
+    swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
+
+    swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
+    """
+    from launch_scripts.launcher.console import busy_loading
+    from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
+
+    # Beside the imports below and the terrain, which take as long. `entry` has done so where it could.
+    named = {word.partition(".")[0] for word in part.only or ()}
+    start_forkserver(ROLES_AND_KERNELS if not named or "planner" in named else ROLES_ONLY)
+
+    with busy_loading(as_json=run.as_json, plain=run.plain) if run.log_format == "text" else nullcontext():
+        import msgspec
+
+        from launch_scripts.launcher import options
+        from launch_scripts.launcher.options import UpOptions, chosen_processes
+        from launch_scripts.launcher.up import run_swarm
+        from launch_scripts.process_table import ROLES
+
+    chosen = options.find_scenario(scenario)
+    if run.port is not None:
+        chosen = options.with_port(chosen, run.port)
+    chosen = options.with_network(
+        chosen,
+        connect=meeting.connect,
+        also_listen=meeting.listen,
+        namespace=meeting.namespace,
+        tls=tls.config(),
+    )
+    chosen = options.with_follow(chosen, run.follow)
+    chosen = msgspec.structs.replace(
+        chosen,
+        seconds=chosen.seconds if run.seconds is None else run.seconds,
+        seed=chosen.seed if run.seed is None else run.seed,
+        monitor=msgspec.structs.replace(chosen.monitor, live=chosen.monitor.live and not run.no_live),
+    )
+    some = chosen_processes(chosen, part.only or (), part.rank)
+    roles = tuple(
+        role
+        for role in ROLES
+        if (not named or role in named) and not (role == "router" and meeting.connect is not None)
+    )
+    one_by_one = any("." in word for word in part.only or ())
+    code = run_swarm(
+        UpOptions(
+            chosen,
+            run.runs,
+            roles=roles,
+            joins="router" not in roles,
+            rank=part.rank,
+            table=tuple(spec for spec in some if spec.role in roles) if one_by_one else None,
+            run_id=part.run_id,
+            as_json=run.as_json,
+            plain=run.plain,
+            metrics_port=run.metrics_port,
+            signals_address=run.signals_address,
+            log_format=run.log_format,
+            began_s=_began_s(),
+            record_inputs=run.record_inputs,
+            takes_over=part.take_over,
+        )
+    )
+    raise typer.Exit(code)
+
+
+def _began_s() -> float:
+    """Start of this process on the monotonic clock, so that imports count as start-up time."""
+    import psutil
+
+    began_s: float = psutil.Process().create_time()
+    return time.monotonic() - max(time.time() - began_s, 0.0)

@@ -1,1 +1,0 @@
-"""Commands about a swarm that runs: where it is, how it is."""

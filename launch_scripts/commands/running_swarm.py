@@ -1,0 +1,167 @@
+"""Which running swarm a command asks."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import typer
+
+from launch_scripts.command_line.declaring import NETWORK
+from launch_scripts.commands.shared_options import Tls
+
+if TYPE_CHECKING:
+    from swarm.bus.zenoh_bus import ZenohBus
+    from swarm.config.scenario import NetworkConfig
+
+_CONNECT_S = 3.0
+_NEWEST = 50
+"""Number of runs that are tried: each costs a connection to a port of this machine."""
+_NAMED = 3
+"""Number of runs that a sentence names."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Router and namespace of the swarm that a command asks.
+
+    connect    The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447.
+    namespace  Prefix of all keys; if not given, that of the run, or `swarm`.
+    run        The run to ask, where several run here: its name in --runs, or its folder.
+    runs       Folder of the runs of this machine.
+    """
+
+    panel: ClassVar = NETWORK
+    connect: str | None = None
+    namespace: str | None = None
+    run: str | None = None
+    runs: Path = Path("runs")
+
+    @cached_property
+    def _found(self) -> NetworkConfig:
+        from swarm.config.scenario import NetworkConfig
+        from swarm.errors import ConfigError
+
+        if self.connect is not None:
+            if self.run is not None:
+                raise ConfigError("--connect and --run both say which swarm: give one of them")
+            return NetworkConfig()
+        found = find_swarm(self.runs, self.run)
+        if found.others:
+            told = ", ".join(found.others[:_NAMED])
+            typer.echo(f"asking run {found.run}, the newest; also running: {told} (--run NAME)", err=True)
+        return found.network
+
+    def network(self, tls: Tls) -> NetworkConfig:
+        """How this command reaches the swarm. Raises BusError if none runs here, ConfigError for a wrong option."""
+        import msgspec
+
+        from launch_scripts.launcher.options import as_process, with_network
+        from launch_scripts.process_table import LAUNCHER
+        from swarm.config.scenario import Scenario
+
+        chosen = with_network(
+            msgspec.structs.replace(Scenario(), network=self._found),
+            connect=self.connect,
+            namespace=self.namespace,
+            tls=tls.config(),
+        )
+        network = as_process(chosen, LAUNCHER, "0").network
+        return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
+
+    def bus(self, tls: Tls) -> ZenohBus:
+        """A session with the swarm; closed by `with`."""
+        from swarm.bus.zenoh_bus import open_bus
+
+        return open_bus(self.network(tls))
+
+    def __str__(self) -> str:
+        endpoint = self.connect or ", ".join(self._found.connect)
+        return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A router that listens, and whose it is as far as that is known.
+
+    others  names of further runs whose routers listen
+    """
+
+    network: NetworkConfig
+    run: str | None = None
+    others: tuple[str, ...] = ()
+
+
+def find_swarm(runs: Path, name: str | None = None) -> Found:
+    """The newest run in a folder whose router listens; a router at the usual endpoint if there is none.
+
+    name  of the run, or its folder; only that is looked at then
+    Raises BusError with what was looked at, ConfigError if there is no run of that name.
+    """
+    from launch_scripts.observe.run_folder import find_run
+    from swarm.bus.endpoints import listening
+    from swarm.config import scenario
+    from swarm.errors import BusError
+
+    folders = [find_run(name, runs)] if name is not None else _newest_first(runs)
+    tried = [(folder.resolve().name, network) for folder in folders if (network := _network_of(folder)) is not None]
+    if name is None:
+        tried.append(("", scenario.NetworkConfig()))
+    # Of runs with the same router only the newest can be behind it.
+    by_router = {network.connect: (run, network) for run, network in reversed(tried)}
+    newest_first = sorted(by_router.values(), key=tried.index)
+    found = [each for each in newest_first if any(map(listening, each[1].connect))]
+    if found:
+        run, network = found[0]
+        return Found(network, run or None, tuple(run for run, _ in found[1:] if run))
+    looked = [f"{run} at {', '.join(at.connect)}" if run else at.connect[0] for run, at in newest_first]
+    if name is not None:
+        raise BusError(
+            f"run {name} does not run here: nobody listens ({'; '.join(looked) or 'it names no router'})"
+        )
+    more = f" and {len(looked) - _NAMED} more" if len(looked) > _NAMED else ""
+    raise BusError(
+        f"no swarm runs here: nobody listens at any router of the runs in {runs} or at the usual endpoint "
+        f"({'; '.join(looked[:_NAMED])}{more}); --connect names another"
+    )
+
+
+def _network_of(folder: Path) -> NetworkConfig | None:
+    """The network of a run, from its scenario as it ran; None if that cannot be read."""
+    import msgspec
+
+    from launch_scripts.observe.run_folder import SCENARIO_FILE
+    from swarm.config.input_files import FileKind, read_text
+    from swarm.config.scenario import NetworkConfig
+    from swarm.errors import SwarmError
+
+    try:
+        raw = tomllib.loads(read_text(folder / SCENARIO_FILE, FileKind.SCENARIO)).get("network", {})
+        return msgspec.convert(raw, NetworkConfig)
+    except (OSError, ValueError, SwarmError, msgspec.ValidationError):
+        return None
+
+
+def _newest_first(runs: Path) -> list[Path]:
+    """Folders of runs: those that have left no report yet first, and of these the newest."""
+    from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE
+    from swarm.config.input_files import FileKind, read_text
+    from swarm.errors import SwarmError
+
+    def newness(folder: Path) -> tuple[bool, str, str]:
+        began = ""
+        # A folder whose file says nothing is sorted by its name alone.
+        with suppress(OSError, ValueError, KeyError, TypeError, RecursionError, SwarmError):
+            began = str(json.loads(read_text(folder / RUN_FILE, FileKind.RUN))["began"])
+        return not (folder / REPORT_FILE).exists(), began, folder.name
+
+    try:
+        folders = [each for each in runs.iterdir() if each.name != LAST and (each / RUN_FILE).is_file()]
+    except OSError:
+        return []
+    return sorted(folders, key=newness, reverse=True)[:_NEWEST]

@@ -1,0 +1,333 @@
+"""`swarm simulate` and `swarm sweep`: a swarm in one process, with many seeds, and over many machines."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.declaring import RUN, command
+from launch_scripts.commands.shared_options import AsJson, Runs, Seed
+from swarm.errors import ConfigError, StoreError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from launch_scripts.simulation.study.run import Sweep
+    from launch_scripts.simulation.study.summary import Summary
+    from launch_scripts.simulation.study.trial import Result, Trial
+    from launch_scripts.simulation.trial import Verdict
+
+app = typer.Typer()
+_SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
+_SHOWN_FAILURES = 20
+
+
+@command(app, RUN)
+def simulate(
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", autocompletion=complete.scenarios_and_worlds)
+    ] = None,
+    seed: Seed = None,
+    seeds: Annotated[str | None, typer.Option(metavar="A:B")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1)] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=256)] = 1,
+    runs: Runs = Path("runs"),
+    trace: Path | None = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run the same swarm in one process, on a memory bus and a manual clock, and leave the same folder.
+
+    swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
+
+    With --seeds, processes crash and hang, links are cut, also one way, clocks are set, agents run twice, messages
+    are lost, late, repeated and out of order. Exit code 1 if a law broke in any seed: a collision, a lethal entry,
+    an acknowledged mark lost, replicas that differ, a wait of ten seconds without a reason, a vehicle without a
+    route.
+
+    swarm simulate --seeds 0:100 --jobs 2
+
+    swarm simulate doors --seeds 17:18
+
+    scenario  A .toml file or a built-in name; with --seeds also a small world: small, wide, open, doors, corridor,
+              maze. With --seeds and without a name each seed takes the next of these worlds.
+    seed      Seed of everything random.
+    seeds     Try the seeds A to B - 1, each with faults of every kind.
+    seconds   Simulated seconds.
+    jobs      With --seeds: seeds that run at the same time.
+    trace     Write the event log here; the same seed writes the same log.
+    """
+    if seeds is None:
+        if scenario is None:
+            raise ConfigError("give a SCENARIO, or --seeds A:B to try many seeds of small worlds")
+        _simulate_once(scenario, seed, seconds, trace, runs, as_json)
+        return
+    if seed is not None or trace is not None:
+        raise ConfigError("--seeds goes with neither --seed nor --trace")
+    if not simulate_seeds(scenario, seeds, seconds, jobs, as_json):
+        raise typer.Exit(1)
+
+
+def _simulate_once(
+    name: str, seed: int | None, seconds: float | None, trace: Path | None, runs: Path, as_json: bool
+) -> None:
+    """Runs a scenario without faults, prints its report and leaves a run's folder in `runs`."""
+    import msgspec
+
+    from launch_scripts.launcher.console import Terminal
+    from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
+    from launch_scripts.observe.run_folder import begin_run
+    from launch_scripts.report.write_report import with_series, write_report
+    from launch_scripts.simulation.simulate import simulate as run_simulation
+    from launch_scripts.simulation.worlds import WORLDS
+
+    if name in WORLDS:
+        raise ConfigError(f"{name!r} is a small world, which goes with --seeds A:B; without it give a scenario")
+    if trace is not None and not trace.parent.is_dir():
+        raise StoreError(f"cannot write --trace {trace}: there is no folder {trace.parent}")
+    scenario = find_scenario(name)
+    terminal = Terminal(as_json, plain=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
+        except OSError as error:
+            raise StoreError(f"cannot write {trace}: {error.strerror or error}") from error
+        scenario = msgspec.structs.replace(
+            scenario,
+            seed=scenario.seed if seed is None else seed,
+            seconds=scenario.seconds if seconds is None else seconds,
+        )
+        folder = make_run_dir(runs, f"{new_run_id()}-simulated")
+        for sentence in begin_run(folder, scenario, folder.name):
+            terminal.say(sentence, "yellow")
+        result = run_simulation(scenario, trace=log, record_to=folder)
+    if as_json:
+        numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
+        typer.echo(json.dumps(numbers, indent=2))
+    else:
+        terminal.report(result.report)
+    report = with_series({**result.report, "run_id": folder.name}, result.recorder, result.terrain)
+    write_report(folder, report, result.recorder, result.terrain, truth=result.truth)
+    terminal.say(
+        f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
+        f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
+    )
+    terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
+    if result.trace_cut is not None:
+        raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")
+
+
+def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: int, as_json: bool) -> bool:
+    """Runs many seeds with faults, and prints what they break. True if every law held in all of them."""
+    import msgspec
+
+    from launch_scripts.launcher.options import find_scenario
+    from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds
+    from launch_scripts.simulation.trial import SECONDS
+    from launch_scripts.simulation.worlds import WORLDS
+
+    some = parse_seeds(seeds)
+    name = MIX if name is None else name
+    given = None if name in (MIX, *WORLDS) else find_scenario(name)
+    began_s = time.monotonic()
+    verdicts: list[Verdict] = []
+    for verdict in run_seeds(name, some, jobs, SECONDS if seconds is None else seconds, given):
+        verdicts.append(verdict)
+        typer.echo(_line(verdict, len(verdicts), len(some)), err=as_json)
+    verdicts.sort(key=lambda verdict: verdict.seed)
+    total = _total(verdicts, time.monotonic() - began_s)
+    if as_json:
+        typer.echo(json.dumps({**total, "verdicts": msgspec.to_builtins(verdicts)}, indent=2))
+        return not total["failing"]
+    faults = ", ".join(f"{many} {kind.replace('_', ' ')}" for kind, many in total["faults"].items())
+    typer.echo(
+        f"{total['seeds']} seeds, {total['simulated_s']:g} simulated seconds, {total['deliveries']:,} deliveries "
+        f"in {total['wall_s']:.0f} s; {faults}\n"
+        f"longest wait without a reason {total['longest_wait_s']:.1f} s, all routed at most "
+        f"{total['routed_after_s']:.2f} s after the last fault"
+    )
+    for failure in total["failing"]:
+        typer.echo(f"failed: {failure['replay']}")
+    typer.echo(f"{len(total['failing'])} of {total['seeds']} seeds broke a law")
+    return not total["failing"]
+
+
+def _line(verdict: Verdict, done: int, many: int) -> str:
+    routed = "never" if verdict.routed_after_s is None else f"{verdict.routed_after_s:.2f} s"
+    text = (
+        f"{done}/{many} {'FAILED' if verdict.broken else 'held  '} {verdict.world} seed {verdict.seed}: "
+        f"longest wait {verdict.longest_wait_s:.1f} s, routed after {routed}, {verdict.captures} captures, "
+        f"{verdict.wall_s:.0f} s"
+    )
+    return "\n".join([text, *(f"    {law}" for law in verdict.broken)])
+
+
+def _total(verdicts: Sequence[Verdict], wall_s: float) -> dict[str, Any]:
+    failing = [each for each in verdicts if each.broken]
+    return {
+        "seeds": len(verdicts),
+        "failing": [
+            {"world": each.world, "seed": each.seed, "broken": list(map(str, each.broken)), "replay": each.replay}
+            for each in failing
+        ],
+        "longest_wait_s": max(each.longest_wait_s for each in verdicts),
+        "routed_after_s": max(each.routed_after_s or 0.0 for each in verdicts),
+        "simulated_s": sum(each.seconds for each in verdicts),
+        "deliveries": sum(each.deliveries for each in verdicts),
+        "faults": dict(sum((Counter(each.faults) for each in verdicts), Counter())),
+        "wall_s": wall_s,
+    }
+
+
+@command(app, RUN)
+def sweep(
+    study: Annotated[str, typer.Argument(metavar="STUDY", autocompletion=complete.studies)],
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024)] = None,
+    out: Path | None = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
+
+    Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: started again,
+    also with other seeds or settings, it runs what is missing only. Exit code 1 if a law broke in any trial.
+    It needs the extra "sweep" (Dask, pyarrow).
+
+    swarm sweep study.toml
+
+    swarm sweep study.toml --scheduler tcp://127.0.0.1:8786 --out results
+
+    study      A .toml file with scenarios, settings and seeds, or a built-in name.
+    scheduler  A cluster of Dask that is there, such as tcp://127.0.0.1:8786.
+    workers    Processes of this machine; as many as it has cores if not given.
+    out        Folder of the results; sweeps/NAME of the study if not given.
+    """
+    if not sweep_study(study, scheduler, workers, out, as_json):
+        raise typer.Exit(1)
+
+
+def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path | None, as_json: bool) -> bool:
+    """Runs what a study lacks, and prints its summary. True if every trial has a result and no law broke."""
+    from rich.console import Console
+
+    from launch_scripts.simulation.study.needs import check_installed
+    from swarm.config.input_files import quoted
+
+    check_installed()
+    if scheduler is not None and workers is not None:
+        raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
+    if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:
+        raise ConfigError(
+            f"--scheduler: found {quoted(scheduler)}, expected an address such as tcp://127.0.0.1:8786"
+        )
+    from launch_scripts.simulation.study.cluster import cores
+    from launch_scripts.simulation.study.run import Sweep
+    from launch_scripts.simulation.study.study import study_path
+    from launch_scripts.simulation.study.summary import as_json as told
+
+    sweep = Sweep(study_path(name), out)
+    console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+    kept = sweep.trials - len(sweep.missing)
+    if kept:
+        console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
+    stops = _hear_stops()
+    try:
+        _run(sweep, console, workers or cores(), scheduler, stops)
+    except KeyboardInterrupt:
+        there = sum(trial.key in sweep.store.results for trial in sweep.missing) + kept
+        with contextlib.suppress(KeyboardInterrupt):
+            console.print(f"{there:,} of {sweep.trials:,} trials are kept in {sweep.folder}; start again to go on")
+        raise
+    summary = sweep.finish()
+    if as_json:
+        typer.echo(json.dumps(told(summary), indent=2))
+    else:
+        _print_summary(summary, sweep.folder)
+    return not summary.failing and not summary.missing
+
+
+def _hear_stops() -> list[int]:
+    """The signals to stop that have come, to which more are added as they come. Each interrupts at once, too; but
+    what is raised while Python clears something away, as a future of Dask, is lost.
+
+    SIGTERM is one of them, as a batch system or `timeout` ends a sweep: workers and their folder go with it.
+    """
+    stops: list[int] = []
+    interrupt = signal.getsignal(signal.SIGINT)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stops.append(number)
+        if callable(interrupt):
+            interrupt(signal.SIGINT, frame)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return stops
+
+
+def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, stops: list[int]) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    name, law = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[failed]} broke a law")
+    columns = (name, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), law)
+    failed = 0
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(sweep.study.name, total=sweep.trials, failed=0)
+        bar.update(task, completed=sweep.trials - len(sweep.missing))
+
+        def told(trial: Trial, result: Result | None) -> None:
+            nonlocal failed
+            failed += bool(result is not None and result.broken)
+            for law in result.broken[:1] if result is not None else ():
+                console.print(f"{trial.world} seed {trial.seed} broke a law: {law}")
+            if result is None:
+                console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
+            while sweep.warned:
+                console.print(sweep.warned.pop(0))
+            bar.update(task, advance=1, failed=failed)
+            if stops:
+                raise KeyboardInterrupt
+
+        sweep.run(workers, scheduler, told)
+
+
+def _print_summary(summary: Summary, folder: Path) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from launch_scripts.simulation.study.page import between, number
+    from launch_scripts.simulation.study.run import PAGE, RESULTS
+
+    console = Console(highlight=False, markup=False, emoji=False)
+    several = len({case.scenario for case in summary.cases}) > 1
+    for name in summary.cases[0].outcomes:
+        table = Table("case", title=name, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+        for heading in ("n", "mean", "95 %", "to the first", "95 %"):
+            table.add_column(heading, justify="right")
+        for case in summary.cases:
+            outcome = case.outcomes[name]
+            table.add_row(
+                f"{case.scenario}: {case.label}" if several else case.label,
+                str(len(outcome.values)),
+                number(outcome.mean),
+                between(outcome.mean),
+                number(outcome.difference, "+"),
+                between(outcome.difference, "+"),
+            )
+        console.print(table)
+    for failure in summary.failing[:_SHOWN_FAILURES]:
+        console.print(f"failed: {failure.replay}", soft_wrap=True)
+    missing = f"; {summary.missing:,} have no result" if summary.missing else ""
+    console.print(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
+    console.print(f"summary: {folder / PAGE}, results: {folder / RESULTS}", soft_wrap=True)

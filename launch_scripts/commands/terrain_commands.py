@@ -1,0 +1,443 @@
+"""`swarm terrain`: inspects elevation and photo, builds costs, makes synthetic landscapes, classifies a photo, and
+says how long driving takes."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
+from launch_scripts.launcher.console import progress
+from launch_scripts.launcher.options import find_scenario
+from launch_scripts.report.export import FORMATS, write_raster
+from shared_map.terrain.layers import TerrainClass
+from swarm.config.cost_rules import cost_of_preset
+from swarm.config.ground import TerrainConfig
+from swarm.config.scenario import Scenario
+from swarm.config.values import ElevationEncoding
+from swarm.errors import ConfigError, TerrainError
+from swarm.grid import GridSpec
+
+if TYPE_CHECKING:
+    from shared_map.terrain.terrain import Terrain
+
+app = family_app("""Look at terrains: what a file holds, what it costs, what a photo shows.
+
+    See what a file holds, what a scenario costs on it, what a photo shows;
+    correct the scenario, and look again. Without files: synth, jacksboro.
+
+    swarm terrain info dem.tif
+    swarm terrain cost jacksboro --picture cost.png
+    swarm terrain classify dem.tif photo.tif --picture classes.png
+    swarm terrain rules --picture rules.png
+    swarm terrain synth --out dem.tif --photo photo.tif
+
+    Where to get an elevation model, and the rule for cost: docs/terrain.md.
+    """)
+console = Console()
+_TIFF = (".tif", ".tiff")
+
+Crs = Annotated[str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632.")]
+Metres = Annotated[
+    float | None, typer.Option(min=1e-6, max=1e6, help="Cell size in metres to bring everything to.")
+]
+Picture = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
+
+
+@command(app)
+def info(
+    file: str,
+    crs: Crs = None,
+    resolution_m: Metres = None,
+    height_scale: Annotated[float | None, typer.Option(min=1e-9, max=1e6)] = None,
+    fill: bool = False,
+    cover: str | None = None,
+    cover_codes: str | None = None,
+    elevation_encoding: ElevationEncoding | None = None,
+    preset: PresetOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
+
+    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
+    these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
+    Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
+    ROS map_server .yaml or .yml, and .png with --resolution-m and
+    --height-scale. The lines after the table
+    say what was done to the file, and what you should know about it; those
+    with a ! what looks wrong. Costs are those of the scenario, of a file
+    those of an empty one or of a preset.
+
+    swarm terrain info srtm.hgt
+    swarm terrain info dem.tif --resolution-m 20 --fill
+    swarm terrain info dem.tif --cover worldcover.tif
+
+    file                A terrain file, a scenario, or jacksboro.
+    height_scale        Metres per unit of height, where the file does not say it.
+    fill                Fill voids from their surroundings instead of forbidding them.
+    cover               A raster of land-cover codes on the same ground.
+    cover_codes         What its codes mean: worldcover, corine, corine-level-3, nlcd, or a CSV file.
+    elevation_encoding  What stands for a height, where the file does not show it.
+    """
+    from shared_map.terrain.terrain import build_terrain
+    from shared_map.terrain.terrain_report import doubts_about, facts_of
+
+    if file.endswith(".toml"):
+        scenario = find_scenario(file, preset)
+    else:
+        raw = {
+            "source": file,
+            "crs": crs,
+            "resolution_m": resolution_m,
+            "height_scale": height_scale,
+            "nodata": "fill" if fill else "lethal",
+            "cover": cover,
+            "cover_codes": cover_codes,
+            "elevation_encoding": elevation_encoding,
+        }
+        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig), cost=cost_of_preset(preset))
+    with progress() as tell:
+        terrain = build_terrain(scenario, tell)
+    rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
+    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
+    doubts = doubts_about(facts)
+    if as_json:
+        zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
+        console.print_json(json.dumps({**facts, "zones": zones, "notes": terrain.notes, "doubts": doubts}))
+        return
+    table = Table(show_header=False, box=None)
+    for key, value in facts.items():
+        shown = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+        table.add_row(key, shown)
+    console.print(table)
+    _say(*(f"- {note}" for note in terrain.notes), *(f"! {doubt}" for doubt in doubts))
+
+
+def _say(*lines: str) -> None:
+    """Prints lines as they are, however long."""
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _crs_name(grid: GridSpec) -> str:
+    if len(grid.crs) < 60:
+        return grid.crs
+    import rasterio
+
+    from shared_map.importers.rasters.georeference import crs_name
+
+    return crs_name(rasterio.CRS.from_user_input(grid.crs))
+
+
+@command(app)
+def cost(
+    scenario: str,
+    out: Path | None = None,
+    picture: Picture = None,
+    preset: PresetOption = None,
+    vehicle_class: VehicleClass = "ground",
+) -> None:
+    """Build the prior cost map of a scenario; write it and a picture of it.
+
+    Cost is a pace in seconds per metre: 0.1 is 10 m/s. Lethal cells are never
+    entered. What looks wrong is corrected in the scenario: cost.max_slope_deg,
+    cost.class_factor, cost.zones, terrain.labels.
+
+    swarm terrain cost jacksboro --picture cost.png
+    swarm terrain cost mine.toml --out cost.tif
+
+    scenario       A scenario file, the name of a built-in one, or a terrain file.
+    out            Write seconds per metre as GeoTIFF; lethal is -1.
+    vehicle_class  For which of the scenario's classes of vehicles.
+    """
+    from shared_map.class_grounds import class_terrains
+    from shared_map.terrain.terrain import build_terrain
+
+    _check_target(out, "--out", *_TIFF)
+    _check_target(picture, "--picture", ".png")
+    loaded = find_scenario(scenario, preset)
+    with progress() as tell:
+        started = time.perf_counter()
+        terrain = class_terrains(loaded, build_terrain(loaded, tell), [vehicle_class])[vehicle_class]
+        seconds = time.perf_counter() - started
+        if out is not None:
+            pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
+            write_raster(
+                out, [pace], terrain.grid, descriptions=["pace, seconds per metre; -1 lethal"], nodata=-1.0
+            )
+            tell("writing", 1.0)
+    name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
+    _draw(terrain, picture, name)
+    finite = terrain.pace_s_per_m[np.isfinite(terrain.pace_s_per_m)]
+    _say(
+        f"{terrain.grid.rows} x {terrain.grid.cols} cells of {terrain.grid.resolution_m:g} m in {seconds:.1f} s,"
+        f" {1 - finite.size / terrain.grid.cells:.1%} lethal, pace {finite.min():.3g} to {finite.max():.3g} s/m"
+        f" (median {np.median(finite):.3g}), digest {terrain.digest}"
+    )
+    _say(_shares(terrain), *(f"- {note}" for note in terrain.notes))
+
+
+@command(app)
+def rules(
+    scenario: Annotated[str | None, typer.Argument()] = None,
+    picture: Picture = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the rules by which slope becomes pace, and the presets of vehicle classes.
+
+    A rule is chosen by cost.slope_rule, a class of vehicles by cost.preset,
+    whose settings stand for those that the scenario does not give.
+
+    swarm terrain rules --picture rules.png
+    swarm terrain rules mine.toml
+
+    scenario  A scenario file or the name of a built-in one: show its rule alone, in m/s.
+    """
+    from launch_scripts.commands import slope_tables
+
+    _check_target(picture, "--picture", ".png")
+    if scenario is None:
+        shown = slope_tables.of_all()
+    else:
+        shown = slope_tables.of_scenario(find_scenario(scenario), Path(scenario).stem)
+    if picture is not None:
+        from launch_scripts.commands.terrain.slope_picture import draw_rules
+
+        draw_rules(shown, picture)
+    if as_json:
+        console.print_json(json.dumps(slope_tables.facts_of(shown)))
+        return
+    slope_tables.show(shown, console)
+
+
+@command(app)
+def synth(
+    out: Annotated[Path, typer.Option()],
+    rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
+    cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
+    resolution_m: Annotated[float, typer.Option(min=0.01, max=1e6)] = 30.0,
+    relief_m: Annotated[float, typer.Option(min=0, max=20_000)] = 400.0,
+    rivers: Annotated[int, typer.Option(min=0, max=50)] = 2,
+    roads: Annotated[int, typer.Option(min=0, max=200)] = 6,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    photo: Path | None = None,
+    picture: Picture = None,
+) -> None:
+    """Make a synthetic landscape: mountains, valleys, rivers, forest, roads. A seed makes the same again.
+
+    swarm terrain synth --out dem.tif --photo photo.tif --picture look.png
+    swarm terrain info dem.tif
+
+    out           Write the heights: .tif (in UTM 32) or .npz.
+    rows          Cells from north to south.
+    cols          Cells from west to east.
+    resolution_m  Metres a cell.
+    relief_m      Metres from lowest to highest.
+    rivers        From border to border, with fords.
+    roads         Between seeded places.
+    seed          The same seed makes the same landscape.
+    photo         Write a photo of it (.tif) too.
+    """
+    from shared_map.terrain.terrain import build_terrain
+
+    _check_target(out, "--out", *_TIFF, ".npz")
+    _check_target(photo, "--photo", *_TIFF)
+    _check_target(picture, "--picture", ".png")
+    config = TerrainConfig(
+        source="synthetic",
+        rows=rows,
+        cols=cols,
+        relief_m=relief_m,
+        resolution_m=resolution_m,
+        rivers=rivers,
+        roads=roads,
+    )
+    with progress() as tell:
+        terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
+    grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
+    if out.suffix.lower() == ".npz":
+        try:
+            np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
+        except OSError as error:
+            raise TerrainError(f"cannot write {out}: {error.strerror or error}") from error
+    else:
+        write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
+    if photo is not None:
+        write_raster(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
+    _draw(terrain, picture, f"synthetic, seed {seed}")
+    console.print(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}: {out}")
+
+
+@command(app)
+def reach(
+    terrain: str,
+    to: Annotated[str, typer.Option(metavar="PLACE")],
+    start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
+    slack: Annotated[float, typer.Option(min=0.0, max=100.0)] = 0.05,
+    out: Path | None = None,
+    every_s: Annotated[float, typer.Option(min=0.001, max=1e9)] = 600.0,
+    preset: PresetOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as areas.
+
+    With --from: the corridor of near-optimal ways between two places. Each of
+    its cells has the time of a good way that passes it, which can be driven
+    and may take a little longer than the best that does; areas tell the
+    seconds lost against the best way of all.
+
+    swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
+    swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
+    swarm terrain reach dem.tif --from 46.81,9.84 --to 46.78,9.87 --slack 0.1 --out corridor.tif
+
+    terrain  A terrain file, a scenario file or a built-in scenario.
+    to       Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.
+    start    Only where good ways from there lead: a corridor.
+    slack    With --from: a way may take this share longer than the best.
+    out      Write .tif: seconds, -1 where there is no way; .geojson, .gpkg, .kml or .csv: areas.
+    every_s  How far apart areas are, in seconds.
+    """
+    from launch_scripts.commands import terrain_routes
+
+    _check_target(out, "--out", *_TIFF, *(ending for ending in FORMATS if ending != ".gpx"))
+    if start is None:
+        found = terrain_routes.reach(terrain, to, preset)
+    else:
+        found = terrain_routes.corridor(terrain, start, to, slack, preset)
+    if out is not None:
+        terrain_routes.write_reach(found, out, every_s)
+    median_s, longest_s = found.quantiles_s()
+    if as_json:
+        facts = {"share": round(found.share, 4), "median_s": round(median_s, 2), "longest_s": round(longest_s, 2)}
+        if found.fastest_s is not None:
+            facts["fastest_s"] = round(found.fastest_s, 2)
+        console.print_json(json.dumps(facts))
+    elif found.fastest_s is not None:
+        best = f"the best takes {found.fastest_s:.0f} s"
+        _say(f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}")
+    else:
+        furthest = f"{longest_s:.0f} s from the furthest"
+        _say(f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}")
+
+
+@command(app)
+def classify(
+    elevation: Path,
+    photo: Path,
+    labels: Path | None = None,
+    out: Path | None = None,
+    picture: Picture = None,
+    crs: Crs = None,
+    resolution_m: Metres = None,
+) -> None:
+    """Say what a photo shows: water, forest, rock, grass, soil, road, built, snow.
+
+    swarm terrain classify dem.tif photo.tif --labels labels.toml --picture classes.png
+
+    Without --labels by rules. With labels the classes are learnt from them,
+    and two tables show what the labelled cells were taken for: by the rules,
+    and by a model that had not seen the polygon it was asked about.
+    A file of labels, in metres east and south of the north-west corner:
+
+    [\\[labels]]
+    class = "water"        # forest, rock, grass, soil, road, built, snow
+    polygon_m = [[4300, 1750], [4900, 1700], [4600, 2400]]
+    [\\[labels]]
+    class = "forest"
+    points_m = [[4700, 4200], [5300, 2900]]
+
+    elevation  The elevation file.
+    photo      The colour photo.
+    labels     Learn from these labels (TOML), and compare with them.
+    out        Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ...
+    """
+    from shared_map.terrain.terrain import build_terrain
+
+    _check_target(out, "--out", *_TIFF)
+    _check_target(picture, "--picture", ".png")
+    config = TerrainConfig(
+        source=str(elevation),
+        photo=str(photo),
+        labels=None if labels is None else str(labels),
+        crs=crs,
+        resolution_m=resolution_m,
+    )
+    with progress() as tell:
+        terrain = build_terrain(Scenario(terrain=config), tell)
+    _say(_shares(terrain))
+    if labels is not None:
+        _compare(terrain, labels)
+    if out is not None:
+        write_raster(out, [terrain.classes], terrain.grid, descriptions=["class"])
+    _draw(terrain, picture, f"{photo.name} on {elevation.name}")
+    _say(*(f"- {note}" for note in terrain.notes))
+
+
+def _compare(terrain: Terrain, path: Path) -> None:
+    from shared_map.importers.photos.classify import by_rules, confusion, held_out
+    from shared_map.importers.photos.labels import read_labels
+
+    labels = read_labels(path, terrain.grid)
+    inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)
+    labelled = labels.classes != TerrainClass.UNKNOWN
+    ruled = by_rules(*inputs)
+    _print_confusion("by rules", confusion(labels.classes[labelled], ruled[labelled]))
+    _print_confusion("learnt, on polygons not seen", confusion(*held_out(*inputs, labels.classes, labels.groups)))
+
+
+def _print_confusion(title: str, counts: Any) -> None:
+    labelled = [kind for kind in TerrainClass if counts[kind].any()]
+    present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
+    unknown = counts[:, TerrainClass.UNKNOWN].sum() / counts.sum()
+    right = np.trace(counts) / counts.sum()
+    table = Table(
+        title=f"{title}: {right:.1%} of the labelled cells, {unknown:.1%} unknown, {1 - right - unknown:.1%} wrong",
+        title_justify="left",
+    )
+    table.add_column("labelled")
+    for kind in present:
+        table.add_column(kind.name.lower(), justify="right")
+    table.add_column("IoU", justify="right")
+    overlaps = []
+    for kind in labelled:
+        union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
+        cells = [str(counts[kind, other]) for other in present]
+        overlaps.append(counts[kind, kind] / union)
+        table.add_row(kind.name.lower(), *cells, f"{overlaps[-1]:.2f}")
+    table.caption = f"mean IoU {np.mean(overlaps):.2f}"
+    console.print(table)
+
+
+def _check_target(path: Path | None, option: str, *endings: str) -> None:
+    """Raises ConfigError now, not after the work, if a file cannot be written."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
+    if path.suffix.lower() not in endings:
+        raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
+
+
+def _draw(terrain: Terrain, path: Path | None, title: str) -> None:
+    if path is not None:
+        from launch_scripts.commands.terrain.terrain_picture import draw
+
+        draw(terrain, path, title)
+
+
+def _shares(terrain: Terrain) -> str:
+    counts = np.bincount(terrain.classes.reshape(-1), minlength=max(TerrainClass) + 1)
+    total = terrain.classes.size
+    shares = (f"{kind.name.lower()} {counts[kind] / total:.1%}" for kind in TerrainClass if counts[kind])
+    return f"classes: {', '.join(shares)}"

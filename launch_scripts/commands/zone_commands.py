@@ -1,0 +1,228 @@
+"""`swarm zone`: areas that operators close or slow down while the swarm runs."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from launch_scripts.command_line.declaring import command, family_app
+from launch_scripts.commands.order_commands import checked, print_obeyed
+from launch_scripts.commands.running_swarm import Where
+from launch_scripts.commands.shared_options import AsJson, Tls
+from launch_scripts.observe.run_observer import frame_of_run
+from swarm.errors import ConfigError
+from swarm.places import FORMS, corners_of, fields_of, read_place, written
+from swarm.runtime.operator import Acknowledged, Operator
+from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
+
+if TYPE_CHECKING:
+    from shared_map.terrain.places import MapFrame
+
+app = family_app("""Close areas of the terrain, slow them down, and open them again, while the swarm runs.
+
+    A zone is held by the shared map: every planner and vehicle goes by it, processes that start later do, too, and
+    what vehicles find there does not change it.
+    """)
+_LASTS = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
+_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+@command(app)
+def add(
+    where: Where,
+    tls: Tls,
+    polygon: str | None = None,
+    polygon_m: str | None = None,
+    file: Path | None = None,
+    layer: str | None = None,
+    crs: str | None = None,
+    kind: str = "lethal",
+    until: str | None = None,
+    name: str = "",
+    vehicle_class: Annotated[str | None, typer.Option("--class")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Close an area, or set its pace. Returns once all maps and trees go by it.
+
+    swarm zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --until 10m --name bridge
+
+    swarm zone add --polygon "46.80,9.84 46.81,9.84 46.81,9.86" --kind pace:0.5
+
+    swarm zone add --file quarry.geojson --name quarry --class truck
+
+    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several.
+
+    polygon        Corners as 'LAT,LON LAT,LON ...', each of them also xy:X,Y or cell:ROW,COL; cell:0,0 is the
+                   north-west corner of the terrain.
+    polygon_m      Corners as 'x,y x,y ...' in metres, as poses have them.
+    file           A GeoJSON, GeoPackage or Shapefile of areas instead, in any system.
+    layer          Which layer, of a file that has several.
+    crs            Coordinate system, where the file names none: EPSG:32632, or local.
+    kind           lethal, or pace:X for X seconds per metre.
+    until          How long it lasts: 90s, 10m, 2h. Until it is removed, if not given.
+    name           Its name; an existing zone of that name is replaced.
+    vehicle_class  For vehicles of this class of the scenario only.
+    """
+    fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _lasts_s(until)}
+    fields["vehicle_class"] = vehicle_class
+    if file is None:
+        if layer is not None or crs is not None:
+            raise ConfigError("zone add: --layer and --crs go with --file")
+        if polygon is None and polygon_m is None:
+            raise ConfigError("zone add: give --polygon, --polygon-m or --file; `swarm zone add -h` shows examples")
+        places = [read_place(word, "--polygon") for word in _words("--polygon", polygon, f", each {FORMS}")]
+        fields["polygon"] = [(0.0, 0.0) for _ in places]
+        fields["polygon_m"] = [_corner(word) for word in _words("--polygon-m", polygon_m, " such as 40,200")]
+        order = checked(ZoneOrder, fields)
+        _give(
+            lambda frame: [
+                msgspec.structs.replace(order, polygon=corners_of(places, frame, "--polygon")) if places else order
+            ],
+            where,
+            tls,
+            as_json,
+        )
+        return
+    if polygon is not None or polygon_m is not None:
+        raise ConfigError("zone add: give either --file or a polygon")
+    if not file.is_file():
+        raise ConfigError(f"--file: {file} does not exist")
+    checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
+
+    def of_file(frame: MapFrame) -> Iterable[ZoneOrder]:
+        from shared_map.importers.zones.zone_outlines import outlines_of
+
+        outlines = outlines_of(file, frame.grid, layer, crs, MOST_CORNERS)
+        several = len(outlines) > 1 and name
+        for number, outline in enumerate(outlines, 1):
+            called = f"{name}-{number}" if several else name
+            yield checked(ZoneOrder, fields | {"name": called, "polygon": outline})
+
+    _give(of_file, where, tls, as_json)
+
+
+@command(app)
+def remove(
+    name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, tls: Tls, as_json: AsJson = False
+) -> None:
+    """Open a zone again.
+
+    swarm zone remove bridge
+
+    name  The zone.
+    """
+    order = checked(ZoneOrder, {"action": "remove", "name": name})
+    _give(lambda frame: [order], where, tls, as_json)
+
+
+@command(app, name="list")
+def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Print the zones that stand.
+
+    swarm zone list
+    """
+    with where.bus(tls) as bus:
+        zones, frame = Operator(bus).zones(), frame_of_run(bus, where)
+    if as_json:
+        typer.echo(json.dumps(_fields(zones, frame), indent=2))
+        return
+    for zone in zones.zones:
+        typer.echo(_line(zone, frame))
+    if not zones.zones:
+        typer.echo("no zones")
+
+
+def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, tls: Tls, as_json: bool) -> None:
+    """Gives orders and prints who obeys; as JSON all at once. Exit code 1 if somebody has not said so.
+
+    orders_on  makes the orders for the swarm's terrain; all are made before the first is given
+    """
+    obeyed: dict[str, float] = {}
+    silent: set[str] = set()
+    with where.bus(tls) as bus:
+        frame = frame_of_run(bus, where)
+        for order in list(orders_on(frame)):
+            zones, acknowledged = Operator(bus).zone(order)
+            obeyed, silent = obeyed | acknowledged.obeyed, silent | set(acknowledged.silent)
+            if not as_json:
+                stands = [zone for zone in zones.zones if zone.name == zones.changed]
+                typer.echo(_line(stands[0], frame) if stands else f"zone {zones.changed} is removed")
+                print_obeyed(Acknowledged(obeyed, sorted(silent)))
+    if as_json:
+        told = {"changed": zones.changed, "obeyed_s": obeyed, "silent": sorted(silent)}
+        typer.echo(json.dumps({**_fields(zones, frame), **told}, indent=2))
+    if silent:
+        raise typer.Exit(1)
+
+
+def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:
+    shown = [
+        {**msgspec.to_builtins(zone), "corners": [fields_of(frame, cell) for cell in _ends(zone, frame)]}
+        for zone in zones.zones
+    ]
+    return {"crs": frame.grid.crs, "zones": shown}
+
+
+def _line(zone: Zone, frame: MapFrame) -> str:
+    row0, col0, row1, col1 = zone.window
+    kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
+    left = "" if zone.until_ns is None else f", ends in {max(zone.until_ns / 1e9 - time.time(), 0):.0f} s"
+    within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
+    ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
+    whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"
+    return f"zone {zone.name}: {kind}{whom}, {within}{left}" + (f"; {ends}" if ends else "")
+
+
+def _ends(zone: Zone, frame: MapFrame) -> list[int]:
+    """The north-west and the south-east cell around a zone; none if they are not on this terrain."""
+    row0, col0, row1, col1 = zone.window
+    if not (frame.grid.inside(row0, col0) and frame.grid.inside(row1 - 1, col1 - 1)):
+        return []
+    return [frame.grid.cell(row0, col0), frame.grid.cell(row1 - 1, col1 - 1)]
+
+
+# --- how options are read ---------------------------------------------------------------------------------------
+
+
+def _kind(text: str) -> dict[str, object]:
+    if text == "lethal":
+        return {"kind": "lethal"}
+    head, _, value = text.partition(":")
+    try:
+        if head == "pace" and math.isfinite(pace := float(value)):
+            return {"kind": "pace", "pace_s_per_m": pace}
+    except ValueError:
+        pass
+    raise ConfigError(f"--kind: {text!r} is neither lethal nor pace:X, with X in seconds per metre")
+
+
+def _lasts_s(text: str | None) -> float | None:
+    if text is None:
+        return None
+    match = _LASTS.fullmatch(text)
+    if match is None or not float(match[1]) > 0:
+        raise ConfigError(f"--until: {text!r} is no time such as 90s, 10m, 2h or 1d")
+    return float(match[1]) * _SECONDS[match[2]]
+
+
+def _words(option: str, text: str | None, expected: str) -> list[str]:
+    """The corners as they are written; an option that is given has one at least."""
+    if text is not None and not text.split():
+        raise ConfigError(f"{option}: there is no corner in {text!r}, expected at least three{expected}")
+    return (text or "").split()
+
+
+def _corner(word: str) -> tuple[float, float]:
+    try:
+        one, other = (float(number) for number in word.split(","))
+    except ValueError:
+        raise ConfigError(f"--polygon-m: {word!r} is no corner, expected two numbers such as 40,200") from None
+    return one, other
