@@ -14,7 +14,7 @@ from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
-from shared_map.terrain.prepared import load_homes
+from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S

@@ -133,7 +133,7 @@ def _crs_name(grid: GridSpec) -> str:
         return grid.crs
     import rasterio
 
-    from shared_map.importers.rasters.georeference import crs_name
+    from shared_map.importers.georeference import crs_name
 
     return crs_name(rasterio.CRS.from_user_input(grid.crs))
 
@@ -383,8 +383,8 @@ def classify(
 
 
 def _compare(terrain: Terrain, path: Path) -> None:
-    from shared_map.importers.photos.classify import by_rules, confusion, held_out
-    from shared_map.importers.photos.labels import read_labels
+    from shared_map.importers.classify import by_rules, confusion, held_out
+    from shared_map.importers.labels import read_labels
 
     labels = read_labels(path, terrain.grid)
     inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)

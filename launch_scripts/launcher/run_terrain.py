@@ -12,8 +12,8 @@ from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.process_table import TABLE
 from shared_map.keeper.base_map import NEEDED
 from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
-from shared_map.terrain.prepared import load_prepared, save_prepared, scenario_key
 from shared_map.terrain.row_bands import Progress, no_progress
+from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
 from shared_map.terrain.terrain import build_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES

@@ -44,7 +44,7 @@ from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, TABLE
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
-from shared_map.terrain.prepared import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
+from shared_map.terrain.store import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import cast
 
-from shared_map.terrain.prepared import load_terrain
+from shared_map.terrain.store import load_terrain
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock

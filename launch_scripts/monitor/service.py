@@ -31,7 +31,7 @@ from shared_map.cost_map import CostMap
 from shared_map.prepared_classes import load_classes
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
-from shared_map.terrain.prepared import load_terrain, load_truth
+from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S

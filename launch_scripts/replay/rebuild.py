@@ -17,7 +17,7 @@ from shared_map.arrays import Floats
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KEEPER_STORE, KeeperStore
 from shared_map.prepared_classes import load_classes
-from shared_map.terrain.prepared import load_terrain, load_truth
+from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event
 from swarm.config.load import parse_scenario

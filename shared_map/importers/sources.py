@@ -1,27 +1,23 @@
-"""Where elevation, photo and classes come from: built-in terrains and files, put on one square metric grid."""
+"""Where a terrain comes from: built in, or from a file of any kind, put on one square metric grid."""
 
 from __future__ import annotations
 
 import importlib.util
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 
 from shared_map.arrays import Bools, Floats
-from shared_map.importers.ground_cover import classified, with_photo, with_water, without_voids
-from shared_map.importers.rasters.degrees import equidistant, metres_per_degree
-from shared_map.importers.rasters.raster_kinds import is_raster
-from shared_map.importers.source import Source as Source
+from shared_map.importers.metric_grids import from_degrees, from_metres, nearest
+from shared_map.importers.raster_files import is_raster
+from shared_map.importers.source import Source, classified, with_photo, with_water, without_voids
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
-from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import TerrainError
-from swarm.grid import MAX_CELLS, GridSpec
+from swarm.grid import GridSpec
 
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
@@ -67,12 +63,12 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
     if config.photo is not None:
         source = with_photo(source, Path(config.photo), config, progress)
     if source.photo is not None:
-        source = classified(source, config, seed, progress)
+        source = classified(source, config, progress)
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
     source = with_water(source, config)
     if config.cover is not None:
-        from shared_map.importers.cover.land_cover import with_cover
+        from shared_map.importers.land_cover import with_cover
 
         source = with_cover(source, config, progress)
     return source
@@ -80,7 +76,7 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
 
 def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
     """The settings with a photo that is a drawn map of land cover named as such."""
-    from shared_map.importers.cover.cover_meaning import is_drawn
+    from shared_map.importers.cover_meaning import is_drawn
 
     if config.photo is None or config.cover is not None or config.labels is not None:
         return config
@@ -101,18 +97,19 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
-    from shared_map.importers.grids.plain_files import read_npz
+    from shared_map.importers.plain_grids import read_npz
     from shared_map.terrain.synthetic.landscape import cover
 
     plain = read_npz(_jacksboro_path())
     assert plain.heights is not None
-    elevation_m, grid, note = _from_degrees(
-        plain.heights, plain.step, plain.west, plain.north, config, JACKSBORO_FILE
+    resolution_m = config.resolution_m or JACKSBORO_RESOLUTION_M
+    elevation_m, grid, note = from_degrees(
+        plain.heights, plain.step, plain.west, plain.north, resolution_m, JACKSBORO_FILE
     )
     classes = cover(elevation_m, grid.resolution_m, seed)
-    _, level, told = _looked_at(plain.heights, 1.0, config)
+    _, level, told = _looked_at(plain.heights, config)
     if config.level_is == "water":
-        classes[level[_nearest(level.shape[0], level.shape[1], grid)]] = TerrainClass.WATER
+        classes[level[nearest(level, grid)]] = TerrainClass.WATER
     origin = "Jacksboro fault, Tennessee: USGS 3 arc seconds, public domain, from matplotlib's sample data"
     return Source(grid, elevation_m, classes, notes=(origin, note, *told))
 
@@ -143,74 +140,21 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.rasters.coded_rasters import of_other_contents
-    from shared_map.importers.rasters.rasters import elevation_of, opened
+    from shared_map.importers.rasters import read_raster
 
-    _check_hgt(path)
-    with opened(path, "terrain") as dataset:
-        source = of_other_contents(dataset, path, config, progress)
-        if source is not None:
-            return source
-        raster = elevation_of(dataset, path, config, progress)
-    classes = np.zeros(raster.elevation_m.shape, np.uint8)
-    return Source(raster.grid, raster.elevation_m, classes, level=raster.level, notes=(str(path), *raster.notes))
-
-
-def _check_hgt(path: Path) -> None:
-    """.hgt has no header: its length is its only description."""
-    sides = (1201, 3601)
-    length = check_bytes(path, FileKind.VIRTUAL_RASTER if path.suffix.lower() == ".vrt" else FileKind.IMAGE)
-    if path.suffix.lower() == ".hgt" and length not in [2 * side * side for side in sides]:
-        raise TerrainError(
-            f"terrain {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
-            f" {2 * 1201 * 1201}, one of 3601 has {2 * 3601 * 3601}"
-        )
-
-
-def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
-    from shared_map.importers.rasters.coded_rasters import of_other_contents
-    from shared_map.importers.rasters.georeference import check_size
-    from shared_map.importers.rasters.rasters import opened
-
-    with opened(path, "terrain") as dataset:
-        source = of_other_contents(dataset, path, config, progress)
-        if source is not None:
-            return source
-        if config.resolution_m is None or config.height_scale is None:
-            raise TerrainError(
-                f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
-                " terrain.height_scale (metres per grey level)"
-            )
-        if dataset.count not in (1, 2):
-            raise TerrainError(f"terrain {path} has {dataset.count} colour bands; heights are one grey band")
-        check_size(dataset.height, dataset.width, f"terrain {path}")
-        stored = dataset.read(1).astype(np.float32)
-    heights, found, told = _looked_at(stored, config.height_scale, config)
-    grid = GridSpec(heights.shape[0], heights.shape[1], config.resolution_m)
-    notes = (str(path), f"{config.height_scale:g} m per grey level, {config.resolution_m:g} m per pixel", *told)
-    return Source(grid, heights, np.zeros(heights.shape, np.uint8), level=found, notes=notes)
-
-
-def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
-    """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.importers.water.level_ground import looked_at
-    from shared_map.importers.water.voids import without
-
-    voids, level, told = looked_at(stored.astype(np.float32), config, scale)
-    return without(stored.astype(np.float32), voids) * np.float32(scale), level, told
+    return read_raster(path, config, progress)
 
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.importers.grids.plain_files import read_asc, read_npz
-    from shared_map.importers.grids.text_grids import read_text_grid
+    """Heights in a text or an archive of arrays."""
+    from shared_map.importers.plain_grids import read_asc, read_npz
+    from shared_map.importers.text_grids import read_text_grid
 
     suffix = path.suffix.lower()
-    read = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)
-    plain = read(path)
+    plain = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
-    heights, level, told = _looked_at(plain.heights, config.height_scale or 1.0, config)
+    heights, level, told = _looked_at(plain.heights, config)
     if step == (0.0, 0.0):
         if config.resolution_m is None:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
@@ -220,38 +164,38 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         raise TerrainError(
             f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
         )
-    if degrees:
-        heights, grid, note = _from_degrees(heights, step, plain.west, plain.north, config, str(path))
-    else:
-        heights, grid, note = _from_metres(heights, step, plain.west, plain.north, config, str(path))
+    place = (heights, step, plain.west, plain.north, config.resolution_m, str(path))
+    heights, grid, note = from_degrees(*place) if degrees else from_metres(*place, config.crs or "local")
     if photo is not None and photo.shape[:2] != heights.shape:
-        photo = photo[_nearest(photo.shape[0], photo.shape[1], grid)]
-    classes = np.zeros(heights.shape, np.uint8)
-    level = level[_nearest(level.shape[0], level.shape[1], grid)]
+        photo = photo[nearest(photo, grid)]
     notes = [str(path), *plain.notes, note, *told]
-    if read is read_text_grid and plain.step != (0.0, 0.0) and grid.crs == "local":
+    if suffix in (".csv", ".xyz") and plain.step != (0.0, 0.0) and grid.crs == "local":
         notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
-    return Source(grid, heights, classes, photo=photo, level=level, notes=tuple(notes))
+    classes = np.zeros(heights.shape, np.uint8)
+    return Source(grid, heights, classes, photo=photo, level=level[nearest(level, grid)], notes=tuple(notes))
 
 
-def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
-    """Which of rows x cols cells over the same ground lie nearest to each cell of a grid."""
-    at_row = ((np.arange(grid.rows) + 0.5) * rows / grid.rows).astype(np.intp)
-    at_col = ((np.arange(grid.cols) + 0.5) * cols / grid.cols).astype(np.intp)
-    return np.ix_(at_row, at_col)
+def _looked_at(stored: Floats, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
+    """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
+    from shared_map.importers.level_ground import looked_at
+    from shared_map.importers.voids import without
+
+    scale = config.height_scale or 1.0
+    voids, level, told = looked_at(stored, config, scale)
+    return without(stored, voids) * np.float32(scale), level, told
 
 
 def _geographic(crs: str | None) -> bool:
     if crs is None:
         return False
-    from shared_map.importers.rasters.georeference import crs_of
+    from shared_map.importers.georeference import crs_of
 
     return bool(crs_of(None, crs, "terrain").is_geographic)
 
 
 def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A map without heights: level, with the pace that the file states."""
-    from shared_map.importers.grids.plain_files import read_map, read_ros
+    from shared_map.importers.plain_grids import read_map, read_ros
 
     plain = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
     assert plain.factor is not None
@@ -285,7 +229,7 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".npz": _heights,
     ".csv": _heights,
     ".xyz": _heights,
-    ".png": _png,
+    ".png": _raster,
     ".map": _map,
     ".yaml": _map,
     ".yml": _map,
@@ -297,50 +241,3 @@ FILE_KINDS = ", ".join(_READERS)
 def is_terrain(path: Path) -> bool:
     """Whether a file is named as one that holds a terrain, or begins as a raster."""
     return path.suffix.lower() in _READERS or is_raster(path)
-
-
-# --- onto the grid ------------------------------------------------------------------------------------------
-
-
-def _from_degrees(
-    heights: Floats, step: tuple[float, float], west: float, north: float, config: TerrainConfig, what: str
-) -> tuple[Floats, GridSpec, str]:
-    """Degrees put on metres, equidistant at the mean latitude. Needs no rasterio: the demo builds in a second."""
-    middle = north - step[1] * heights.shape[0] / 2
-    if not (abs(middle) < 85 and abs(west) <= 360):
-        raise TerrainError(f"{what}: its middle is at latitude {middle:g}; degrees must lie between -85 and 85")
-    per_lat, per_lon = metres_per_degree(middle)
-    crs = equidistant(middle, west)
-    metric = (step[0] * per_lon, step[1] * per_lat)
-    if what == JACKSBORO_FILE and config.resolution_m is None:
-        config = _at(config, JACKSBORO_RESOLUTION_M)
-    return _from_metres(heights, metric, 0.0, round(north * per_lat, 3), config, what, crs)
-
-
-def _at(config: TerrainConfig, resolution_m: float) -> TerrainConfig:
-    return replace(config, resolution_m=resolution_m)
-
-
-def _from_metres(
-    heights: Floats,
-    step: tuple[float, float],
-    west: float,
-    north: float,
-    config: TerrainConfig,
-    what: str,
-    crs: str | None = None,
-) -> tuple[Floats, GridSpec, str]:
-    from shared_map.importers.rasters.resample import resample
-
-    resolution_m = config.resolution_m or float(f"{math.sqrt(step[0] * step[1]):.4g}")
-    col_step, row_step = resolution_m / step[0], resolution_m / step[1]
-    rows, cols = int(heights.shape[0] / row_step + 1e-6), int(heights.shape[1] / col_step + 1e-6)
-    if rows < 1 or cols < 1:
-        raise TerrainError(f"terrain.resolution_m = {resolution_m:g} is coarser than the whole of {what}")
-    if rows * cols > MAX_CELLS:
-        raise TerrainError(f"{what} would be {rows} x {cols} cells; set a larger terrain.resolution_m")
-    grid = GridSpec(rows, cols, resolution_m, west, north, crs or config.crs or "local")
-    if abs(col_step - 1) < 1e-9 and abs(row_step - 1) < 1e-9:
-        return heights, grid, f"{rows} x {cols} cells of {resolution_m:g} m"
-    note = f"resampled from {step[1]:.1f} x {step[0]:.1f} m to {resolution_m:g} m"
-    return resample(heights, rows, cols, row_step, col_step), grid, note

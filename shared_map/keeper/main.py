@@ -7,7 +7,7 @@ from pathlib import Path
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KEEPER_STORE, KeeperStore
-from shared_map.terrain.prepared import load_terrain
+from shared_map.terrain.store import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.recording.recording import recorded

@@ -56,7 +56,7 @@ class MapFrame:
     @cached_property
     def degrees(self) -> Any:
         """rasterio's CRS of latitudes and longitudes on the body on which the map lies."""
-        from shared_map.importers.rasters.georeference import degrees_of
+        from shared_map.importers.georeference import degrees_of
 
         return degrees_of(self.system)
 

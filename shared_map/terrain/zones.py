@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.importers.rasters.rasters import mask_of
+from shared_map.importers.raster_files import mask_of
 from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
 from shared_map.terrain.places import MapFrame
 from swarm.config.ground import CostConfig, ZoneConfig
@@ -20,7 +20,7 @@ from swarm.places import corners_of, extent_of
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
-    from shared_map.importers.zones.zone_files import Burnt, FileFacts
+    from shared_map.importers.zone_files import Burnt, FileFacts
 
 PREFERRED_FACTOR = np.float32(0.5)
 ROUGH_FACTOR = np.float32(2.0)
@@ -181,7 +181,7 @@ class _Painter:
     def read(self, zone: ZoneConfig, where: str) -> _Painted:
         """What a zone covers."""
         if zone.file is not None:
-            from shared_map.importers.zones.zone_files import burn_zone
+            from shared_map.importers.zone_files import burn_zone
 
             burnt = burn_zone(zone, self._grid, f"{where} {zone.called!r}")
             cells = int((~np.isnan(burnt.values[1])).sum()) + int(burnt.lethal[1].sum())

@@ -39,7 +39,6 @@ class FileKind(Enum):
     ARRAYS = ("terrain", 12 * MAX_CELLS, TerrainError)
     IMAGE = ("image", 8 * MAX_CELLS, TerrainError)
     VIRTUAL_RASTER = ("raster", 4 << 20, TerrainError)
-    FIELD = ("field", 9 * MAX_CELLS, TerrainError)
     VECTORS = ("zone", 1 << 30, TerrainError)
     VECTOR_TEXT = ("zone", 256 << 20, TerrainError)
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)

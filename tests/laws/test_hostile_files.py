@@ -21,8 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from shared_map.importers.grids.array_files import read_npy
-from shared_map.importers.photos.labels import read_labels
+from shared_map.importers.labels import read_labels
 from shared_map.importers.sources import load_source
 from shared_map.keeper.export import from_json
 from swarm.config.ground import TerrainConfig
@@ -265,7 +264,6 @@ def _seeds() -> dict[str, bytes]:
         "a.toml": b'seed = 3\n[terrain]\nsource = "synthetic"\nrows = 60\n[[targets]]\nstart = [3, 4]\n',
         "labels.toml": b'[[labels]]\nclass = "water"\npolygon_m = [[0, 0], [40, 0], [40, 40]]\n'
         b'[[labels]]\nclass = "grass"\npoints_m = [[55, 55]]\n',
-        "a.npy": npy((4, 4), "<f4", bytes(64)),
         "a.json": json.dumps(
             {"format": "swarm-map/1", "terrain": "t", "grid": {"rows": 9, "cols": 9, "resolution_m": 1.0},
              "sets": [{"author": "a.1", "group": "all", "tile": 0, "epoch": 1, "seq": 16,
@@ -283,8 +281,6 @@ def _read(path: Path) -> None:
             load_scenario(path)
         case "labels.toml":
             read_labels(path, GridSpec(8, 8, 10.0))
-        case "a.npy":
-            read_npy(path, FileKind.FIELD)
         case "a.json":
             from_json(path.read_bytes())
         case "a.pgm":

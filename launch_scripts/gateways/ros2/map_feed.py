@@ -17,7 +17,7 @@ from shared_map.cost_map import CostMap
 from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
-from shared_map.terrain.prepared import load_prepared, read_meta
+from shared_map.terrain.store import load_prepared, read_meta
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.errors import SwarmError, TerrainError

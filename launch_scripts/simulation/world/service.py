@@ -9,7 +9,7 @@ from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEn
 from launch_scripts.simulation.world.rovers import Rovers
 from launch_scripts.simulation.world.targets import Action, Captured, Publish, TargetWorld
 from launch_scripts.simulation.world.telling import Telling
-from shared_map.terrain.prepared import load_homes
+from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S

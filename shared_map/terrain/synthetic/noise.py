@@ -94,16 +94,6 @@ def mountain_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: flo
     return _octaves(_GradientLattice.drawn, 0.45, rng, rows, cols, coarsest, ridged)
 
 
-def fractal(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
-    """`fractal_noise` as one array, float32 (rows, cols)."""
-    return fractal_noise(rng, rows, cols, coarsest, ridged).whole()
-
-
-def mountains(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
-    """`mountain_noise` as one array, float32 (rows, cols)."""
-    return mountain_noise(rng, rows, cols, coarsest, ridged).whole()
-
-
 def _octaves(
     drawn: Callable[[np.random.Generator, int, int, float], Lattice],
     decay: float,

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.row_bands import in_bands
-from shared_map.terrain.synthetic.noise import fractal
+from shared_map.terrain.synthetic.noise import fractal_noise
+from shared_map.terrain.synthetic.ways import Ways
 
 FORD_EVERY, FORD_LENGTH = 64, 4
 """Cells along a river from one shallow place to the next, and how long it is: a river never cuts a map in two."""
@@ -57,26 +58,24 @@ def carve(elevation_m: Floats, count: int, resolution_m: float, seed: int) -> tu
 
 def _courses(elevation_m: Floats, count: int, rng: np.random.Generator) -> list[Course]:
     """Cells of each river from its spring down: the lowest way between two opposite borders, with bends."""
-    from skimage.graph import MCP_Geometric
-
     stride = 1
     while elevation_m.size // stride**2 > _COARSE_CELLS:
         stride *= 2
     coarse = elevation_m[::stride, ::stride]
     rows, cols = coarse.shape
     spread = max(float(coarse.max() - coarse.min()), 1e-3)
-    bends = fractal(rng, rows, cols, max(min(rows, cols) / 8, 4.0))
+    bends = fractal_noise(rng, rows, cols, max(min(rows, cols) / 8, 4.0)).whole()
     price = ((coarse - coarse.min()) / spread * 6) ** 2 + 0.5 + (2.5 * (bends + 0.8)) ** 2
     courses = []
     for number in range(count):
         upright = number % 2 == 0
         # A penalty near the borders that it runs along: rivers would follow the border otherwise.
         off = np.linspace(-1.0, 1.0, cols)[None, :] if upright else np.linspace(-1.0, 1.0, rows)[:, None]
-        search = MCP_Geometric(price + 12.0 * off**4, fully_connected=True)
         begin = _lowest(coarse[0], rng) if upright else _lowest(coarse[:, 0], rng)
-        reached, _ = search.find_costs([(0, begin) if upright else (begin, 0)])
-        end = (rows - 1, int(np.argmin(reached[-1]))) if upright else (int(np.argmin(reached[:, -1])), cols - 1)
-        at_row, at_col = np.array(search.traceback(end)).T
+        ways = Ways(price + 12.0 * off**4, (0, begin) if upright else (begin, 0))
+        far = ways.cost[-1] if upright else ways.cost[:, -1]
+        end = int(np.argmin(far))
+        at_row, at_col = ways.to((rows - 1, end) if upright else (end, cols - 1))
         price[at_row, at_col] *= 0.3
         course = _finer(at_row, at_col, stride, elevation_m.shape)
         if elevation_m[course[0][0], course[1][0]] < elevation_m[course[0][-1], course[1][-1]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from shared_map.arrays import Bools, Floats
+from shared_map.terrain.start_cells import largest_part
+from shared_map.terrain.synthetic.ways import Ways
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -36,8 +38,6 @@ def lay_roads(pace: Floats, count: int, grid: GridSpec, seed: int) -> Bools:
     TerrainError
         If no two places are connected.
     """
-    from skimage.graph import MCP_Geometric
-
     stride = 1
     while grid.cells // stride**2 > _COARSE_CELLS:
         stride *= 2
@@ -49,16 +49,11 @@ def lay_roads(pace: Floats, count: int, grid: GridSpec, seed: int) -> Bools:
     for number in range(1, len(places)):
         here, settled = places[number], places[:number]
         ends = sorted(settled, key=lambda p: (p[0] - here[0]) ** 2 + (p[1] - here[1]) ** 2)
-        wanted = ends[: 1 if number % 4 else None]
-        if number % 4 == 0:
-            wanted = [ends[int(rng.integers(len(ends) // 2, len(ends)))]]
-        search = MCP_Geometric(price, fully_connected=True)
-        search.find_costs([here], wanted)
-        try:
-            cells = search.traceback(wanted[0])
-        except ValueError:  # no way between the two
+        wanted = ends[0 if number % 4 else int(rng.integers(len(ends) // 2, len(ends)))]
+        ways = Ways(price, here)
+        if np.isinf(ways.cost[wanted]):
             continue
-        rows, cols = np.array(cells).T
+        rows, cols = ways.to(wanted)
         laid[rows, cols] = True
         price[rows, cols] = road_price
     if not laid.any():
@@ -84,7 +79,7 @@ def _places(price: Floats, count: int, rng: np.random.Generator) -> list[tuple[i
     passable = price[np.isfinite(price)]
     if passable.size == 0:
         return []
-    candidates = np.flatnonzero((price <= np.quantile(passable, 0.3)) & _largest_part(np.isfinite(price)))
+    candidates = np.flatnonzero((price <= np.quantile(passable, 0.3)) & largest_part(np.isfinite(price)))
     if len(candidates) == 0:
         return []
     apart = 0.5 * np.sqrt(rows * cols / count)
@@ -98,16 +93,6 @@ def _places(price: Floats, count: int, rng: np.random.Generator) -> list[tuple[i
             if len(places) == count:
                 break
     return places
-
-
-def _largest_part(passable: Bools) -> Bools:
-    """Only places that can reach each other get roads."""
-    from scipy import ndimage
-
-    labels, _ = ndimage.label(passable)
-    sizes = np.bincount(labels.reshape(-1))
-    sizes[0] = 0
-    return np.asarray(labels == np.argmax(sizes), np.bool_)
 
 
 def _drawn(laid: Bools, stride: int, pace: Floats) -> Bools:

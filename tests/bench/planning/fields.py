@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
 from launch_scripts.simulation.world.walks import TrueTerrain
-from shared_map.importers.grids.array_files import read_npy
-from swarm.config.input_files import FileKind
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 
@@ -101,7 +99,7 @@ def from_file(path: Path) -> Pace:
         case ".npy":
             pace = _read_npy(path)
         case ".map":
-            from shared_map.importers.grids.plain_files import read_map
+            from shared_map.importers.plain_grids import read_map
 
             factor = read_map(path).factor
             assert factor is not None, "a .map has no heights"
@@ -116,7 +114,10 @@ def from_file(path: Path) -> Pace:
 
 
 def _read_npy(path: Path) -> NDArray[np.floating[Any]]:
-    pace = read_npy(path, FileKind.FIELD)
+    try:
+        pace: NDArray[np.floating[Any]] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        raise TerrainError(f"field {path} is no .npy array: {error}") from error
     if pace.ndim != 2 or not pace.size or pace.dtype.kind not in "fiu":
         raise TerrainError(
             f"field {path} has shape {pace.shape} of {pace.dtype}; expected rows x cols of paces in s/m"

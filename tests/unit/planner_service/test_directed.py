@@ -12,9 +12,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from planner_service.target_tree import TargetTree
-from shared_map.terrain.prepared import load_prepared, save_prepared
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.synthetic.noise import mountains
+from shared_map.terrain.store import load_prepared, save_prepared
+from shared_map.terrain.synthetic.noise import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.ground import CostConfig, TerrainConfig
@@ -122,7 +122,7 @@ def test_a_step_beside_a_void_is_level():
 
 def test_one_step_and_many_steps_read_the_same_table():
     rng = np.random.default_rng(4)
-    climb = climb_on(mountains(rng, 30, 40, 10.0) * 60, "tobler")
+    climb = climb_on(mountain_noise(rng, 30, 40, 10.0).whole() * 60, "tobler")
     pairs = [(c, n) for c in range(0, 1200, 7) for _, n in climb.grid.neighbours(c)]
     tails, heads = np.array(pairs).T
     alone = np.array([climb.of_step(a, b) for a, b in pairs])
@@ -137,7 +137,7 @@ def test_one_step_and_many_steps_read_the_same_table():
 def test_costs_equal_an_independent_dijkstra(seed, rule):
     rng = np.random.default_rng([seed, 1])
     rows, cols = (int(n) for n in rng.integers(4, 60, 2))
-    climb = climb_on(mountains(rng, rows, cols, 12.0) * np.float32(rng.choice([0, 20, 200])), rule)
+    climb = climb_on(mountain_noise(rng, rows, cols, 12.0).whole() * np.float32(rng.choice([0, 20, 200])), rule)
     pace = rough(rng, rows, cols, float(rng.choice([0.1, 1.0, 3.0])), float(rng.choice([0.0, 0.3])))
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     octile, corners, four = bool(seed & 1), bool(seed & 2), seed % 5 == 4
@@ -156,7 +156,9 @@ def test_costs_equal_an_independent_dijkstra(seed, rule):
 @pytest.mark.parametrize("seed", range(6))
 def test_routes_end_at_the_target_over_passable_cells_and_cost_what_they_say(seed):
     rng = np.random.default_rng([seed, 2])
-    climb = climb_on(mountains(rng, 40, 50, 12.0) * 150, "tobler" if seed & 1 else "energy", max_slope_deg=75)
+    climb = climb_on(
+        mountain_noise(rng, 40, 50, 12.0).whole() * 150, "tobler" if seed & 1 else "energy", max_slope_deg=75
+    )
     pace = rough(rng, 40, 50)
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
@@ -214,7 +216,7 @@ def test_a_ridge_is_crossed_where_it_is_low_only_if_the_climb_is_worth_the_detou
 
 def test_after_marks_the_tree_is_one_grown_from_scratch_and_still_exact():
     rng = np.random.default_rng(3)
-    climb = climb_on(mountains(rng, 40, 40, 12.0) * 100)
+    climb = climb_on(mountain_noise(rng, 40, 40, 12.0).whole() * 100)
     pace = rough(rng, 40, 40, 0.5, 0.1)
     pace[20, 20] = 0.1
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
@@ -230,7 +232,7 @@ def test_after_marks_the_tree_is_one_grown_from_scratch_and_still_exact():
 
 def test_a_tree_grown_by_a_worker_is_the_same():
     rng = np.random.default_rng(5)
-    climb = climb_on(mountains(rng, 40, 40, 12.0) * 100)
+    climb = climb_on(mountain_noise(rng, 40, 40, 12.0).whole() * 100)
     pace = rough(rng, 40, 40, 0.5, 0.0)
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
     tree.update(pace, 820, [], 0)

@@ -10,7 +10,7 @@ import pytest
 
 from shared_map.arrays import CellsOf, open_array, private_copy, save_array
 from shared_map.cost_map import CostMap
-from shared_map.terrain.prepared import load_prepared, save_prepared
+from shared_map.terrain.store import load_prepared, save_prepared
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.wire.messages.map_data import MarkKind
 

@@ -12,18 +12,24 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.draw import line
 
-from shared_map.arrays import Bytes
-from shared_map.importers.photos.classify import by_rules, confusion, held_out, learnt
-from shared_map.importers.photos.labels import Labels, read_labels
-from shared_map.importers.photos.photo_features import box_sum
-from shared_map.importers.sources import Source, load_source
+from shared_map.arrays import Bytes, Floats
+from shared_map.importers.classify import class_readings, confusion, held_out, learnt
+from shared_map.importers.labels import Labels, read_labels
+from shared_map.importers.photo_rules import box_sum
+from shared_map.importers.source import Source
+from shared_map.importers.sources import load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import counted, looked_up
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
-from shared_map.terrain.synthetic.noise import fractal
+from shared_map.terrain.synthetic.noise import fractal_noise
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
+
+
+def by_rules(photo: Bytes, elevation_m: Floats | None, resolution_m: float) -> Bytes:
+    return class_readings(photo, elevation_m, resolution_m).classes
+
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "dem"
 LABELS = Path(__file__).parent / "davosdorf_labels.toml"
@@ -147,7 +153,7 @@ def shaded(photo: NDArray[np.uint8], where: NDArray[np.bool_], dark: float, tint
 def test_shadows_of_clouds_do_not_become_water(dark: float, tint: float) -> None:
     elevation_m, classes = landscape(300, 400, 20.0, 300.0, seed=4)
     photo = paint_photo(elevation_m, classes, 20.0, seed=4)
-    clouds = fractal(np.random.default_rng(7), 300, 400, 60.0)
+    clouds = fractal_noise(np.random.default_rng(7), 300, 400, 60.0).whole()
     shadow = clouds > np.quantile(clouds, 0.8)
     found = by_rules(shaded(photo, shadow, dark, tint), elevation_m, 20.0)
     assert (found == TerrainClass.WATER).sum() < 0.01 * shadow.sum()

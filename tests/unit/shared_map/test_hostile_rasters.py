@@ -12,9 +12,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from shared_map.importers.rasters.rasters import read_elevation
-from shared_map.importers.water.level_ground import level_ground
-from shared_map.importers.water.voids import undeclared_voids
+from shared_map.importers.level_ground import level_ground
+from shared_map.importers.sources import load_source
+from shared_map.importers.voids import undeclared_voids
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
@@ -43,7 +43,7 @@ def test_a_zip_with_damaged_bytes_is_refused_in_one_sentence(tmp_path: Path, met
     whole[40:140] = bytes(7 * n % 256 for n in range(100))
     path.write_bytes(bytes(whole))
     with pytest.raises(TerrainError, match=r"dem\.zip") as refused:
-        read_elevation(path, TerrainConfig(source=str(path)))
+        load_source(TerrainConfig(source=str(path)), 1)
     assert "\n" not in str(refused.value)
 
 
@@ -53,9 +53,9 @@ def test_a_vrt_names_ordinary_files_only(tmp_path: Path, name: str) -> None:
     path = tmp_path / "dem.vrt"
     path.write_text(VRT.format(name), encoding="utf-8")
     with pytest.raises(TerrainError, match="expected a file that lies on this machine"):
-        read_elevation(path, TerrainConfig(source=str(path)))
+        load_source(TerrainConfig(source=str(path)), 1)
     path.write_text(VRT.format(written(tmp_path / "dem.tif").name), encoding="utf-8")
-    assert np.array_equal(read_elevation(path, TerrainConfig(source=str(path))).elevation_m, HEIGHTS)
+    assert np.array_equal(load_source(TerrainConfig(source=str(path)), 1).elevation_m, HEIGHTS)
 
 
 def test_a_file_of_several_variables_is_refused_with_their_names(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_a_file_of_several_variables_is_refused_with_their_names(tmp_path: Path)
         for name in ("height", "snow"):
             file.createVariable(name, "f4", ("y", "x"))[:] = HEIGHTS
     with pytest.raises(TerrainError, match=r"several rasters .*height.*snow"):
-        read_elevation(path, TerrainConfig(source=str(path)))
+        load_source(TerrainConfig(source=str(path)), 1)
 
 
 def test_a_slope_too_gentle_to_see_between_two_cells_is_no_lake() -> None:
@@ -98,22 +98,22 @@ def test_a_file_of_one_code_only_has_no_heights() -> None:
 
 def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
     path = written(tmp_path / "fiji.tif", crs="EPSG:3832", where=(3_339_000.0, -1_800_000.0))
-    raster = read_elevation(path, TerrainConfig(source=str(path)))
+    raster = load_source(TerrainConfig(source=str(path)), 1)
     assert raster.grid.rows in range(37, 42)
     assert raster.grid.cols in range(37, 42)
     path = written(tmp_path / "edge.tif", crs="EPSG:3857", where=(20_037_000.0, -1_800_000.0))
     with pytest.raises(TerrainError, match="beyond the edge of EPSG:3857"):
-        read_elevation(path, TerrainConfig(source=str(path)))
+        load_source(TerrainConfig(source=str(path)), 1)
 
 
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
+    from shared_map.importers import level_ground as module
     from shared_map.importers.sources import _looked_at
-    from shared_map.importers.water import level_ground as module
 
     monkeypatch.setattr(module, "MOST_SAMPLED", 2000)
     heights = np.add.outer(np.arange(101) * 2.0, np.arange(83) * 1.0).astype(np.float32) + 50
     heights[20:60, 20:60] = 40
-    _, level, _ = _looked_at(heights, 1.0, TerrainConfig(source="dem.asc"))
+    _, level, _ = _looked_at(heights, TerrainConfig(source="dem.asc"))
     assert level.shape == heights.shape
     assert (level != (heights == 40)).mean() < 0.03
 
@@ -124,21 +124,21 @@ def test_a_vrt_that_paints_the_same_pixels_many_times_is_refused(tmp_path: Path)
     source = "<SimpleSource>" + rest[: rest.index("</VRTRasterBand>")].format("dem.tif")
     path = tmp_path / "dem.vrt"
     path.write_text(head + source * 30 + rest[rest.index("</VRTRasterBand>") :], encoding="utf-8")
-    assert np.array_equal(read_elevation(path, TerrainConfig(source=str(path))).elevation_m, HEIGHTS)
+    assert np.array_equal(load_source(TerrainConfig(source=str(path)), 1).elevation_m, HEIGHTS)
     other = tmp_path / "other.vrt"
     other.write_text(VRT.format("dem.vrt"), encoding="utf-8")
-    assert np.array_equal(read_elevation(other, TerrainConfig(source=str(other))).elevation_m, HEIGHTS)
+    assert np.array_equal(load_source(TerrainConfig(source=str(other)), 1).elevation_m, HEIGHTS)
     path.write_text(head + source * 40 + rest[rest.index("</VRTRasterBand>") :], encoding="utf-8")
     for file in (path, other):
         with pytest.raises(TerrainError, match="paints its pixels 40 times over"):
-            read_elevation(file, TerrainConfig(source=str(file)))
+            load_source(TerrainConfig(source=str(file)), 1)
 
 
 def test_a_vrt_that_names_itself_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "dem.vrt"
     path.write_text(VRT.format("dem.vrt"), encoding="utf-8")
     with pytest.raises(TerrainError, match="more than 4 deep"):
-        read_elevation(path, TerrainConfig(source=str(path)))
+        load_source(TerrainConfig(source=str(path)), 1)
 
 
 def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
@@ -149,12 +149,12 @@ def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
         file.write(
             np.add.outer(np.arange(256.0), np.arange(256.0)).astype(np.float32)[None], window=((0, 256), (256, 512))
         )
-    found = read_elevation(path, TerrainConfig(source=str(path))).elevation_m
+    found = load_source(TerrainConfig(source=str(path)), 1).elevation_m
     assert np.isnan(found).mean() == 0.75
     assert found[0, 256:].tolist() == list(range(256))
     path.write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(TerrainError, match="is truncated"):
-        read_elevation(path, TerrainConfig(source=str(path)))
+        load_source(TerrainConfig(source=str(path)), 1)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, met
     path = written(tmp_path / "dem.tif")
     with rasterio.open(path, "r+") as file:
         file.units = (unit,)
-    raster = read_elevation(path, TerrainConfig(source=str(path)))
+    raster = load_source(TerrainConfig(source=str(path)), 1)
     np.testing.assert_allclose(raster.elevation_m, HEIGHTS * metres, rtol=1e-6)
     assert not any("unknown" in note for note in raster.notes)
 
@@ -191,10 +191,10 @@ def test_a_setting_that_contradicts_the_file_is_said_aloud(tmp_path: Path) -> No
     path = written(tmp_path / "dem.tif")
     said = "terrain.crs = 'EPSG:32633' counts, though the file says EPSG:32632: every place follows from it"
     notes = {
-        crs: read_elevation(path, TerrainConfig(source=str(path), crs=crs)).notes
+        crs: load_source(TerrainConfig(source=str(path), crs=crs), 1).notes
         for crs in (None, "EPSG:32632", "EPSG:32633")
     }
     assert {crs for crs, told in notes.items() if said in told} == {"EPSG:32633"}
     bare = written(tmp_path / "bare.tif", crs=None)
-    told = read_elevation(bare, TerrainConfig(source=str(bare), crs="EPSG:32633")).notes
+    told = load_source(TerrainConfig(source=str(bare), crs="EPSG:32633"), 1).notes
     assert not any("counts" in note for note in told)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from support.effort import few
 
-from shared_map.importers.water import level_patches as module
-from shared_map.importers.water.level_patches import level_patches
+from shared_map.importers import level_patches as module
+from shared_map.importers.level_patches import level_patches
 
 EIGHT = np.ones((3, 3), np.int8)
 

@@ -14,7 +14,7 @@ from rasterio.transform import Affine, from_origin
 from rasterio.warp import transform as to_crs
 from support.zone_shapes import UTM, feature, geojson, middles, painted, written
 
-from shared_map.importers.zones.zone_outlines import outlines_of
+from shared_map.importers.vector_shapes import outlines_of
 from shared_map.terrain.layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
@@ -191,7 +191,7 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
         painted([ZoneConfig(kind="factor", file=bad)])
     far = raster(tmp_path / "d.tif", values, from_origin(0, 0, 10.0, 10.0), UTM.crs)
     with pytest.raises(
-        TerrainError, match="does not touch the terrain: it reaches from 0, -200 to 250, 0, the terrain"
+        TerrainError, match=r"does not overlap the terrain: it covers x 0\.\.250, y -200\.\.0, the terrain"
     ):
         painted([ZoneConfig(kind="factor", file=far)])
     with pytest.raises(TerrainError, match="is a raster, which goes with kind pace or factor, found 'road'"):

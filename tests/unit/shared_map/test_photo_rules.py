@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.importers.ground_cover import classified
-from shared_map.importers.photos import photo_features
-from shared_map.importers.photos.classify import class_readings
-from shared_map.importers.photos.photo_features import Features
-from shared_map.importers.photos.photo_roads import line_strength
-from shared_map.importers.photos.photo_rules import CLASS_OF_READINGS, EXPOSURES, ground_readings
-from shared_map.importers.source import Source
+from shared_map.importers import photo_rules
+from shared_map.importers.classify import class_readings
+from shared_map.importers.photo_roads import line_strength
+from shared_map.importers.photo_rules import CLASS_OF_READINGS, EXPOSURES, Features, ground_readings
+from shared_map.importers.source import Source, classified
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig
@@ -70,7 +68,7 @@ def as_read(f: Features, gain: float, warm: float) -> Bytes:
 
 def test_rules_in_place_say_what_rules_written_one_by_one_say() -> None:
     for photo, elevation_m in photos():
-        for _, f in photo_features.tiles(photo, elevation_m, 15.0, 0, 70):
+        for _, f in photo_rules.tiles(photo, elevation_m, 15.0, 0, 70):
             plain = as_read(f, 1.0, 1.0)
             expected = np.choose(plain, [BIT.get(kind, np.uint8(0)) for kind in TerrainClass]).astype(np.uint8)
             sand = (plain == TerrainClass.SNOW) & (f.grade < np.float32(0.1)) & (f.texture > 8)
@@ -115,7 +113,7 @@ def test_lines_are_as_strong_as_one_by_one() -> None:
 def test_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     for photo, elevation_m in photos():
         expected = class_readings(photo, elevation_m, 15.0)
-        monkeypatch.setattr(photo_features, "TILE_COLS", 37)
+        monkeypatch.setattr(photo_rules, "TILE_COLS", 37)
         found = class_readings(photo, elevation_m, 15.0)
         monkeypatch.undo()
         np.testing.assert_array_equal(found.classes, expected.classes)
@@ -159,7 +157,7 @@ def test_an_import_hands_on_what_its_photo_may_show() -> None:
     photo += np.random.default_rng(1).integers(0, 5, photo.shape).astype(np.uint8)  # no drawn map
     level = np.zeros((40, 60), np.float32)
     source = Source(GridSpec(40, 60, 10.0), level, np.zeros((40, 60), np.uint8), photo=photo)
-    found = classified(replace(source), TerrainConfig(), 1, lambda what, share: None)
+    found = classified(replace(source), TerrainConfig(), lambda what, share: None)
     assert found.readings is not None
     assert (found.readings[5:35, 5:25] == BIT[TerrainClass.GRASS] | BIT[TerrainClass.FOREST]).mean() > 0.9
     assert not found.readings[5:35, 35:].any()

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared_map.importers.grids.plain_files import read_pgm
-from shared_map.importers.sources import Source, load_source
+from shared_map.importers.plain_grids import read_pgm
+from shared_map.importers.source import Source
+from shared_map.importers.sources import load_source
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
@@ -40,9 +41,10 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
         (ASC.replace("ncols 3", "ncols 2.5"), "its header says ncols 2.5; expected a whole number"),
         (ASC.replace("ncols 3", "ncols nan"), "its header says ncols nan; expected a finite number"),
         (ASC.replace("cellsize 50", "cellsize inf"), "its header says cellsize inf; expected a finite number"),
-        (ASC.replace("1 2 3", "1 2"), r"ragged: line 7 has 2 heights, its header says 3"),
-        (ASC.replace("4 -9999 6\n", ""), "has 1 rows of heights; its header says 2"),
-        (ASC.replace("4 -9999 6", "4 x 6"), "line 8"),
+        (ASC.replace("1 2 3", "1 2"), "has 5 heights; its header says 2 rows of 3"),
+        (ASC.replace("4 -9999 6\n", ""), "has 3 heights; its header says 2 rows of 3"),
+        (ASC.replace("4 -9999 6", "4 x 6"), "line 8: found 'x'; its header says 2 rows of 3 numbers"),
+        (ASC + "7 8 9\n", "line 9: found '7'; its header says 2 rows of 3 numbers"),
         (ASC.replace("ncols 3\n", ""), "lacks ncols"),
         (ASC.replace("cellsize 50", "cellsize 0"), "must be positive"),
         (ASC.replace("ncols 3", "ncols 300000").replace("nrows 2", "nrows 300000"), "300000 x 300000"),
@@ -51,7 +53,7 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
             ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47"),
             "looks like degrees",
         ),
-        (b"\xff\xfe\x00", "is not text: line 1 is not ASCII"),
+        (b"\xff\xfe\x00", "no ESRI ASCII grid"),
         ("", "no ESRI ASCII grid"),
     ],
 )
@@ -182,12 +184,12 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("yaml", "image", "words"),
     [
-        (YAML, b"P6 1 1 255\n\0\0\0", "no PGM: it begins with b'P6'"),
-        (YAML, b"P5 100 100 255\n\0\0", "truncated: 2 pixels; its header says 100 x 100"),
-        (YAML, b"P5 99999 99999 255\n\0", "header says 99999 x 99999"),
-        (YAML, b"P5 a b 255\n\0", "width, height and brightest"),
+        (YAML, b"P6 1 1 255\n\0\0\0", "no PGM: it is in colour"),
+        (YAML, b"P5 100 100 255\n\0\0", "is truncated"),
+        (YAML, b"P5 99999 99999 255\n\0", "its header says more pixels than are read"),
+        (YAML, b"P5 a b 255\n\0", "no PGM: invalid literal"),
         (YAML, b"P2 2 1 255\n1 x\n", "no PGM"),
-        (YAML, b"P5 2 1 0\n\0\0", "brightest value is 0"),
+        (YAML, b"P5 2 1 0\n\0\0", "maxval must be greater than 0"),
         (YAML.replace("resolution: 0.05\n", ""), b"P5 1 1 255\n\0", "resolution is missing"),
         (YAML.replace("0.05", "wide"), b"P5 1 1 255\n\0", "wide"),
         (YAML.replace("0.0]", "0.7]"), b"P5 1 1 255\n\0", "turned by 0.7 rad"),

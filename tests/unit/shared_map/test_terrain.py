@@ -13,7 +13,7 @@ import pytest
 from scipy import ndimage
 
 from shared_map.terrain.layers import TerrainClass
-from shared_map.terrain.prepared import (
+from shared_map.terrain.store import (
     load_prepared,
     load_prepared_truth,
     load_terrain,
@@ -126,7 +126,7 @@ def test_agents_that_load_a_prepared_terrain_import_nothing_slow(tmp_path: Path)
     prepare(tmp_path, SMALL)
     slow = ("numba", "rasterio", "skimage", "sklearn", "matplotlib", "scipy")
     code = (
-        "import sys; from pathlib import Path; from shared_map.terrain.prepared import load_prepared;"
+        "import sys; from pathlib import Path; from shared_map.terrain.store import load_prepared;"
         "import shared_map.cost_map;"
         f"assert load_prepared(Path({str(tmp_path)!r}));"
         f"found = [m for m in {slow!r} if m in sys.modules]; assert not found, found"

@@ -13,7 +13,7 @@ from rasterio.transform import from_origin
 from support.effort import few
 from support.height_models import load, written
 
-from shared_map.importers.grids.text_grids import read_text_grid
+from shared_map.importers.text_grids import read_text_grid
 from swarm.errors import TerrainError
 
 ROWS, COLS, STEP = 12, 9, 25.0
@@ -133,7 +133,7 @@ def test_empty_fields_and_nan_are_voids(tmp_path: Path) -> None:
         ("# nothing\n\n", "holds no numbers"),
         ("a,b,c\n1,2,3\n", "line 1: 'a,b,c' are no numbers, and name no x, y, z"),
         ("x,y,z\n1,2,3\n2,x,3\n", "line 3: 'x' is no number"),
-        ("x,y,z\n1,2,3\n2,3\n", "line 3: 2 numbers; expected x, y and z"),
+        ("x,y,z\n1,2,3\n2,3\n", "line 3: invalid column index 2; expected x, y and z"),
         ("1,2,3,4\n1,2,3\n", "is ragged: line 2 has 3 heights, others 4"),
         ("0,0,1\n10,0,2\n0,10,3\n10,10,4\n10,10,5\n", "two heights at x 10, y 10"),
         ("0,0,1\n10,0,2\n23,0,3\n0,10,3\n", "on no regular grid: x has gaps from 10 to 13"),
@@ -163,8 +163,8 @@ def test_what_is_no_text_or_has_no_lines_is_refused(tmp_path: Path) -> None:
 
 
 def test_many_points_are_read_twice_instead_of_being_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_map.importers.grids.text_grids._MOST_KEPT", 10)
-    monkeypatch.setattr("shared_map.importers.grids.text_grids._CHUNK_BYTES", 300)
+    monkeypatch.setattr("shared_map.importers.text_grids._MOST_KEPT", 10)
+    monkeypatch.setattr("shared_map.importers.text_grids._CHUNK_BYTES", 300)
     plain = read_text_grid(wrote(tmp_path / "a.csv", text_of(POINTS, ",", "x,y,z")))
     np.testing.assert_array_equal(plain.heights, GROUND)
     with pytest.raises(TerrainError, match="line 110: 'what' is no number"):

@@ -1,1 +1,0 @@
-"""Land cover: codes and what they mean."""

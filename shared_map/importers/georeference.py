@@ -1,0 +1,436 @@
+"""Where a raster lies: its coordinate system, the square metric north-up grid of a terrain, and the way onto it.
+
+rasterio is imported where it is used: agents never need it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.errors import TerrainError
+from swarm.grid import MAX_CELLS, GridSpec
+
+_SHOWN = ("lat_0", "lat_ts", "lon_0", "zone")
+MAX_SPAN_DEG = 12.0
+"""Beyond this, a local projection stretches by more than half a percent at its borders."""
+MOST_STRETCH = 0.02
+"""Mercator's metres, and those of maps in equal degrees, are true on one line only."""
+_LIKE_WGS84 = (4326, 4258, 4269)
+"""Degrees within a metre of WGS 84's. Those of other datums PROJ has to move, for which it needs the datum."""
+_EARTH_M = 6_371_000.0
+HIGHEST_DEG = 85.0
+"""Degrees nearer to a pole than this are not put on metres."""
+
+
+def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
+    """Metres in one degree of latitude and of longitude on WGS 84, to the millimetre."""
+    phi = math.radians(latitude_deg)
+    lat = 111132.954 - 559.822 * math.cos(2 * phi) + 1.175 * math.cos(4 * phi)
+    lon = 111412.84 * math.cos(phi) - 93.5 * math.cos(3 * phi)
+    return round(lat, 3), round(lon, 3)
+
+
+def equidistant(latitude_deg: float, longitude_deg: float) -> str:
+    """A system in metres with `metres_per_degree` of a latitude; x is 0 at a longitude, y at the equator.
+
+    PROJ's equidistant cylindrical projection knows spheres only. On that of WGS 84's equator its y is 0.3 % too
+    long: metres of the ellipsoid taken for such y lie kilometres off. So it gets the sphere that is as curved as
+    the ellipsoid is there.
+    """
+    per_lat, per_lon = metres_per_degree(latitude_deg)
+    # The standard parallel at which a degree of longitude on this sphere is as long as on the ellipsoid.
+    parallel = math.degrees(math.acos(min(per_lon / per_lat, 1.0)))
+    radius = per_lat * 180 / math.pi
+    return f"+proj=eqc +lat_ts={parallel:.9f} +lon_0={longitude_deg:.9f} +R={radius:.4f} +units=m +no_defs"
+
+
+def system_named(text: str, what: str) -> Any:
+    """rasterio's CRS of a text. Raises TerrainError, which `what` begins, if it is none."""
+    import rasterio
+    from rasterio.errors import CRSError
+
+    try:
+        with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
+            return rasterio.CRS.from_user_input(text)
+    except (CRSError, ValueError) as error:
+        raise TerrainError(f"{what} {text!r} is no coordinate system; write EPSG:32632 or alike") from error
+
+
+def crs_of(found: Any, given: str | None, what: str) -> Any:
+    """The coordinate system that the scenario names for a file (`given`), else the file's own (`found`).
+
+    Raises TerrainError if `given` is not one, or if there is neither; `what` names the file.
+    """
+    if given is not None:
+        return system_named(given, "terrain.crs")
+    if not found:
+        raise TerrainError(
+            f"{what} does not say in which coordinate system it is; set terrain.crs, for example 'EPSG:32632'"
+        )
+    return found
+
+
+def overruled(found: Any, given: str | None) -> tuple[str, ...]:
+    """A note where `terrain.crs` (`given`) contradicts what the file itself says (`found`)."""
+    if given is None or not found or not (found.is_geographic or found.is_projected):
+        return ()
+    import rasterio
+
+    counts = rasterio.CRS.from_user_input(given)
+    if counts == found:
+        return ()
+    return (f"terrain.crs = {given!r} counts, though the file says {crs_name(found)}: every place follows from it",)
+
+
+def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) -> Any:
+    """The same system if its metres are true within `MOST_STRETCH`, else a local one: equidistant cylindrical while
+    its scale is right within 1 % (no voids at the corners), transverse Mercator beyond.
+
+    `lon_deg`, `lat_deg` are the middle of the terrain; `lat_span_deg` is its extent from south to north.
+    """
+    import rasterio
+
+    if is_local(crs):
+        return crs
+    local = rasterio.CRS.from_proj4(
+        f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
+    )
+    if crs.is_projected and abs(_scale(crs, local) - 1.0) < MOST_STRETCH:
+        _, metres = crs.linear_units_factor
+        if abs(metres - 1.0) < 1e-9:
+            return crs
+    stretch = math.radians(lat_span_deg / 2) * abs(math.tan(math.radians(lat_deg)))
+    if crs.is_geographic and stretch < 0.01:
+        if crs.to_epsg() in _LIKE_WGS84:
+            return rasterio.CRS.from_proj4(equidistant(lat_deg, lon_deg))
+        text = f"+proj=eqc +lat_ts={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
+        return rasterio.CRS.from_proj4(text)
+    return local
+
+
+def _scale(crs: Any, local: Any) -> float:
+    """What a true metre is in a system, in the direction in which it is furthest from one.
+
+    local  a system that is true around its origin
+    """
+    from rasterio.warp import transform as to_crs
+
+    xs, ys = to_crs(local, crs, [0.0, 1000.0, 0.0], [0.0, 0.0, 1000.0])
+    sides = [math.hypot(xs[n] - xs[0], ys[n] - ys[0]) / 1000.0 for n in (1, 2)]
+    return max(sides, key=lambda side: abs(math.log(side)) if 0 < side < math.inf else math.inf)
+
+
+def is_local(crs: Any) -> bool:
+    """Whether a system is metres from anywhere, as surveys of sites and arenas use."""
+    if crs.is_geographic or crs.is_projected:
+        return False
+    known = crs.to_dict(projjson=True)
+    axes = known.get("coordinate_system", {}).get("axis", [])
+    return (
+        known.get("type") == "EngineeringCRS" and bool(axes) and all(axis.get("unit") == "metre" for axis in axes)
+    )
+
+
+def degrees_of(crs: Any) -> Any:
+    """Latitude and longitude on the body on which a system lies: WGS 84 on the Earth."""
+    import rasterio
+
+    return rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
+
+
+def _shape_of(crs: Any) -> str:
+    """The body that a system lies on, for PROJ: the Earth, or the ellipsoid of another planet or moon."""
+    ellipsoid = _ellipsoid_of(crs.to_dict(projjson=True)) or {}
+    radius_m = _metres(ellipsoid.get("radius", ellipsoid.get("semi_major_axis")))
+    if radius_m is None or abs(radius_m - _EARTH_M) < 0.01 * _EARTH_M:
+        return "+datum=WGS84"
+    polar_m = _metres(ellipsoid.get("semi_minor_axis"))
+    flat = ellipsoid.get("inverse_flattening", 0.0)
+    if polar_m is None:
+        polar_m = radius_m * (1 - 1 / flat) if flat else radius_m
+    return f"+a={radius_m!r} +b={polar_m!r}"
+
+
+def _ellipsoid_of(node: Any) -> Any:
+    """The first ellipsoid in PROJ's description of a system."""
+    children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    if isinstance(node, dict) and "ellipsoid" in node:
+        return node["ellipsoid"]
+    return next((found for child in children if (found := _ellipsoid_of(child)) is not None), None)
+
+
+def _metres(value: Any) -> float | None:
+    """A length of PROJ's: a number, or a number with a unit that is no metre."""
+    if isinstance(value, dict):
+        unit = value.get("unit")
+        factor = unit.get("conversion_factor", 1.0) if isinstance(unit, dict) else 1.0
+        return float(value["value"]) * float(factor)
+    return None if value is None else float(value)
+
+
+def crs_name(crs: Any) -> str:
+    """Of a rasterio CRS, for people: EPSG:32632, or +proj=..., or the beginning of what it is."""
+    text = str(crs.to_string())
+    if not text.startswith("EPSG:") and crs.to_epsg() is None:
+        known = crs.to_dict()
+        if known.get("proj"):
+            text = " ".join(f"+{key}={known[key]}" for key in ("proj", *_SHOWN) if known.get(key))
+    return text if len(text) < 60 else text[:57] + "..."
+
+
+def _placed(transform: Any, at_row: NDArray[Any], at_col: NDArray[Any]) -> tuple[list[float], list[float]]:
+    xs = transform.a * at_col + transform.b * at_row + transform.c
+    ys = transform.d * at_col + transform.e * at_row + transform.f
+    return [float(x) for x in xs], [float(y) for y in ys]
+
+
+def _border(transform: Any, rows: int, cols: int) -> tuple[list[float], list[float]]:
+    """Points all around a raster, in its own coordinates."""
+    along = np.linspace(0.0, 1.0, 21)
+    zero, one = np.zeros(21), np.ones(21)
+    at_col = np.concatenate([along, one, along, zero]) * cols
+    at_row = np.concatenate([zero, along, one, along]) * rows
+    return _placed(transform, at_row, at_col)
+
+
+def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what: str) -> tuple[float, ...]:
+    """(west, south, east, north) of a raster of rows x cols, in units of the system `target`.
+
+    Raises TerrainError if `crs` is not defined everywhere on its border.
+    """
+    from rasterio.warp import transform as to_crs
+
+    xs, ys = _border(transform, rows, cols)
+    if target != crs:
+        xs, ys = to_crs(crs, target, xs, ys)
+    if not np.isfinite([xs, ys]).all():
+        raise TerrainError(f"{what} reaches where its coordinate system {crs_name(crs)} is not defined; crop it")
+    return min(xs), min(ys), max(xs), max(ys)
+
+
+def _around_180(transform: Any, rows: int, cols: int, crs: Any, degrees: Any, what: str) -> tuple[float, float]:
+    """(west, east) of a raster of metres with 180 degrees counted on from there: 179 to 181, not -180 to 180.
+
+    Raises TerrainError if it reaches beyond the edge of its system's map, where a place has other metres.
+    """
+    from rasterio.warp import transform as to_crs
+
+    xs, ys = _border(transform, rows, cols)
+    found = to_crs(crs, degrees, xs, ys)
+    back = to_crs(degrees, crs, found[0], found[1])
+    if not np.allclose(back[0], xs, rtol=0, atol=abs(transform.a) + abs(transform.b)):
+        raise TerrainError(
+            f"{what} reaches across 180 degrees, beyond the edge of {crs_name(crs)}; gdalwarp -t_srs EPSG:3832"
+            " brings it onto one map"
+        )
+    lon = np.asarray(found[0]) % 360
+    return float(lon.min()), float(lon.max())
+
+
+def _pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float]:
+    """Width and height in metres of the pixel in the middle."""
+    from rasterio.warp import transform as to_crs
+
+    at_row, at_col = np.array([0.0, 0.0, 1.0]) + rows / 2, np.array([0.0, 1.0, 0.0]) + cols / 2
+    xs, ys = _placed(transform, at_row, at_col)
+    if target is not None and target != crs:
+        xs, ys = to_crs(crs, target, xs, ys)
+    return math.hypot(xs[1] - xs[0], ys[1] - ys[0]), math.hypot(xs[2] - xs[0], ys[2] - ys[0])
+
+
+def plan_grid(
+    transform: Any, rows: int, cols: int, crs: Any, resolution_m: float | None, what: str
+) -> tuple[GridSpec, Any, list[str]]:
+    """The grid for a raster: metric, north-up, with square cells.
+
+    Parameters
+    ----------
+    transform, rows, cols, crs
+        Of the raster, as rasterio gives them.
+    resolution_m : float or None
+        Side of a cell; None keeps that of the raster.
+    what : str
+        Names the raster in errors.
+
+    Returns
+    -------
+    grid : GridSpec
+    target : rasterio.CRS or None
+        What to warp to; None if the raster has that grid already.
+    notes : list of str
+        What is done, for people.
+
+    Raises
+    ------
+    TerrainError
+        If the georeference is damaged, has neither metres nor degrees, is too near a pole or too wide for one flat
+        grid; if no cell fits, or more than `MAX_CELLS` do.
+    """
+    if transform.determinant == 0 or not np.isfinite(list(transform)[:6]).all():
+        raise TerrainError(
+            f"{what} has pixels without a size ({tuple(transform)[:6]}); its georeference is damaged"
+        )
+    if not crs.is_geographic and not crs.is_projected and not is_local(crs):
+        raise TerrainError(
+            f"{what} is in a coordinate system without metres or degrees ({crs_name(crs)});"
+            " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
+        )
+    degrees = crs if is_local(crs) else degrees_of(crs)
+    west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
+    if not is_local(crs) and east - west > 180 and not crs.is_geographic:
+        west, east = _around_180(transform, rows, cols, crs, degrees, what)
+    if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
+        raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
+    if crs.is_geographic and not abs(south + north) / 2 < HIGHEST_DEG:
+        raise TerrainError(
+            f"{what} lies around latitude {(south + north) / 2:.4g}, where degrees of longitude have no width;"
+            " reproject it to a polar system (gdalwarp -t_srs EPSG:3413, in the south EPSG:3031)"
+        )
+    target = metric_crs(crs, (west + east) / 2, (south + north) / 2, north - south)
+    if (
+        target != crs
+        and max(north - south, (east - west) * math.cos(math.radians((south + north) / 2))) > MAX_SPAN_DEG
+    ):
+        raise TerrainError(
+            f"{what} spans {north - south:.4g} x {east - west:.4g} degrees: no flat grid is true over more than"
+            f" {MAX_SPAN_DEG:g}; crop it, or reproject it to metres yourself"
+        )
+    width, height = _pixel_m(transform, rows, cols, crs, target)
+    notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {crs_name(crs)}"]
+    north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
+    if not north_up:
+        notes.append("the file is rotated or upside down; resampled north-up, so that its corners may be voids")
+    # Where no cell would move by more than half of one, a resampling would only blur.
+    off = max(abs((resolution_m or width) - width), abs((resolution_m or width) - height)) * max(rows, cols)
+    if target == crs and north_up and off <= width / 2:
+        check_size(rows, cols, what)
+        grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))
+        return grid, None, notes
+    resolution = resolution_m or float(f"{math.sqrt(width * height):.4g}")
+    west, south, east, north = bounds_in(transform, rows, cols, crs, target, what)
+    high, wide = int((north - south) / resolution + 1e-6), int((east - west) / resolution + 1e-6)
+    if high < 1 or wide < 1:
+        raise TerrainError(
+            f"{what} is {north - south:.3g} m x {east - west:.3g} m: no cell of {resolution:g} m fits"
+        )
+    check_size(high, wide, what)
+    notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {crs_name(target)}")
+    return GridSpec(high, wide, resolution, west, north, _system(target)), target, notes
+
+
+def _system(crs: Any) -> str:
+    return "local" if is_local(crs) else str(crs.to_string())
+
+
+def check_size(rows: int, cols: int, what: str) -> None:
+    """Raises TerrainError if there are more than `MAX_CELLS` cells."""
+    if rows * cols > MAX_CELLS:
+        at_least = math.sqrt(rows * cols / MAX_CELLS)
+        raise TerrainError(
+            f"{what} would be {rows} x {cols} cells, more than {MAX_CELLS}: crop it, or set a terrain.resolution_m"
+            f" that is at least {at_least:.1f} times coarser"
+        )
+
+
+# --- onto the grid ------------------------------------------------------------------------------------------
+
+
+def transform_of(grid: GridSpec, row0: int = 0) -> Any:
+    """The affine transform from (col, row) of a grid, counted from a row on, to metres."""
+    from rasterio.transform import from_origin
+
+    north = grid.north_m - row0 * grid.resolution_m
+    return from_origin(grid.west_m, north, grid.resolution_m, grid.resolution_m)
+
+
+def grows(dataset: Any, transform: Any, crs: Any, grid: GridSpec, target: Any) -> bool:
+    """True if the grid is at least half as coarse again as the file: then its cells are averaged or counted."""
+    width, height = _pixel_m(transform, dataset.height, dataset.width, crs, target)
+    return grid.resolution_m >= 1.5 * max(width, height)
+
+
+def warped(
+    source: Any, onto: NDArray[Any], grid: GridSpec, crs: Any, target: Any, how: str, row0: int = 0, **given: Any
+) -> NDArray[Any]:
+    """Brings a raster onto rows of a grid, in place.
+
+    Parameters
+    ----------
+    source : rasterio.Band or array (rows, cols)
+        An array needs its `src_transform`.
+    onto : array (rows, grid.cols)
+        Cells that the source does not reach become `dst_nodata`, or stay as they are.
+    crs, target : rasterio.CRS
+        Of the source and of the grid.
+    how : str
+        The name of one of rasterio's resamplings.
+    row0 : int
+        Row of the grid that is the first of `onto`.
+    **given
+        For `rasterio.warp.reproject`.
+    """
+    from rasterio.warp import Resampling, reproject
+
+    place = {"src_crs": crs, "dst_crs": target, "dst_transform": transform_of(grid, row0)}
+    reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=os.cpu_count() or 1)
+    return onto
+
+
+def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str) -> tuple[Any, Any, float]:
+    """How a file comes onto the terrain's grid.
+
+    Returns
+    -------
+    crs, target : rasterio.CRS or None
+        Of the file and of the grid; None, None if its pixels are the terrain's cells.
+    share : float
+        Share of the terrain within the file's frame.
+
+    Raises TerrainError if one of the two has no place on Earth and they differ in size, the file does not say in
+    which system it is (nor does `given`), or does not overlap the terrain.
+    """
+    import rasterio
+
+    same_shape = (dataset.height, dataset.width) == (grid.rows, grid.cols)
+    if not (dataset.crs or not dataset.transform.is_identity) or grid.crs == "local":
+        if not same_shape:
+            raise TerrainError(
+                f"{what} has {dataset.height} x {dataset.width} pixels and no place in common with the terrain of"
+                f" {grid.rows} x {grid.cols} cells; georeference both, or make them the same size"
+            )
+        return None, None, 1.0
+    crs = crs_of(dataset.crs, given if not dataset.crs else None, what)
+    target = rasterio.CRS.from_user_input(grid.crs)
+    share = overlap(dataset, crs, target, grid, what)
+    if crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3):
+        return None, None, share
+    return crs, target, share
+
+
+def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+    """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+    except (RasterioError, CPLE_BaseError) as error:
+        names = crs_name(crs), crs_name(target)
+        raise TerrainError(
+            f"{what} is in {names[0]}, from which no way leads to the terrain's {names[1]}"
+        ) from error
+    grid_east = grid.west_m + grid.cols * grid.resolution_m
+    grid_south = grid.north_m - grid.rows * grid.resolution_m
+    wide = min(east, grid_east) - max(west, grid.west_m)
+    high = min(north, grid.north_m) - max(south, grid_south)
+    if wide <= 0 or high <= 0:
+        raise TerrainError(
+            f"{what} does not overlap the terrain: it covers x {west:.7g}..{east:.7g}, y {south:.7g}..{north:.7g},"
+            f" the terrain x {grid.west_m:.7g}..{grid_east:.7g}, y {grid_south:.7g}..{grid.north_m:.7g}"
+        )
+    return wide * high / (grid.rows * grid.cols * grid.resolution_m**2)

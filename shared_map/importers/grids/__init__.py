@@ -1,1 +1,0 @@
-"""Heights in plain text, tables and arrays."""

@@ -1,0 +1,266 @@
+"""Water and undeclared voids in a height model, found in the file's own cells: after resampling no lake is level.
+
+Height models are levelled on lakes, reservoirs, wide rivers and the sea. Without a photo nothing else tells that
+one cannot drive there, and a level plain is the cheapest ground of all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools, Floats
+from shared_map.importers.level_patches import Patches, level_patches
+from shared_map.importers.voids import HIGHEST_M, undeclared_voids, without
+from shared_map.terrain.row_bands import bands, looked_up
+from swarm.config.ground import TerrainConfig
+
+MOST_SAMPLED = 1 << 24
+"""Cells of a file in which level ground is looked for, and in rasters voids: of larger ones in every second, ..."""
+_SAME_M = 0.005
+"""Levelled water differs by rounding, or by what a resampling before ours left."""
+_STILL_M = 0.02
+"""From its highest to its lowest cell, a patch of still water differs by no more. Where every step is too small to
+see, a gentle slope is no lake: its far end is at another height."""
+_COARSE_M = 0.25
+"""In whole metres gentle ground is level, too."""
+_LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 16, 40
+_MOST_LOWER = 0.25
+"""Water has a shore, above it but for an outlet. Level ground beside much lower ground is the top of something, or
+a part of a rounded slope. The next step of a river that is levelled in steps does not count as lower ground."""
+_LEAST_SHORE = 0.2
+"""So much of its border is at another height than the patch, as far as one can see."""
+_MOST_BESIDE = 0.7
+"""Terraces and the steps of a staircase have other level ground along all of their border."""
+_MOST_TERRACES = 0.4
+"""A plain whose heights are rounded is a stair of wide steps. Water has at most so much of its shore beside another
+wide step; a river that is levelled in steps has its ends only."""
+_LEAST_STEEP = 0.1
+"""Of the shore of a lake, somewhere, so much rises by more than one rounding from a cell to the next."""
+_SEA_M = 0.5
+"""Level ground at the border so near to zero is the sea, however gentle the coast is."""
+_LEAST_RIPPLES, _RING_CELLS, _SUNK_M = 0.1, 3, 2.0
+"""A cubic filter undershoots at a shore. Where so much of it is such a ripple, what is lower than the lake, down to
+this, is the lake's as well, so far around it."""
+_BLOCK_CELLS = 4
+_ROUGH_M, _BLOCK_SAME_M, _BLOCK_STILL_M, _LEAST_BLOCKS = 0.3, 0.06, 0.1, 6
+_AROUND_BLOCKS = 5
+_NOISY = 0.28
+"""Water that a laser measured is rough by a decimetre or two, and level in the mean of 4 x 4 cells. From cell to
+cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
+_BLOCK_ROWS = 32
+_TOLD_SHARE = 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class LevelGround:
+    """Level patches with their shores, in a file's own cells.
+
+    mask       bool (rows, cols)
+    patches    (height in m, cells) of each, the largest first
+    uncertain  share of the cells that is as level and as low, but among other level ground, as rounding makes it
+    """
+
+    mask: Bools
+    patches: tuple[tuple[float, int], ...]
+    uncertain: float = 0.0
+
+
+def level_ground(elevation_m: Floats) -> LevelGround:
+    """The patches that are exactly level and lie no higher than what surrounds them: still water, as a rule.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        As in the file. NaN is a void.
+
+    Returns
+    -------
+    LevelGround
+        Of patches that a rounding of heights does not explain.
+    """
+    with np.errstate(invalid="ignore"):
+        known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
+    if not known.all():
+        elevation_m = np.where(known, elevation_m, np.float32(np.nan))
+    elevation_m = np.ascontiguousarray(elevation_m)
+    del known
+    step_m = _step_m(elevation_m)
+    coarse = step_m >= _COARSE_M
+    found = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE, step_m)
+    water, unsure = _judged(found, _STILL_M)
+    mask = looked_up(water, found.labels)
+    rippled = water & (found.ripple > _LEAST_RIPPLES * found.differ)
+    if rippled.any():
+        _add_ripples(elevation_m, found, rippled, mask)
+    numbers = np.flatnonzero(water)
+    patches = [(float(found.height_m[n]), int(found.cells[n])) for n in numbers.tolist()]
+    uncertain = float(found.cells[unsure].sum() / elevation_m.size)
+    del found
+    if step_m < _ROUGH_M / _BLOCK_CELLS:
+        patches += _rough_water(elevation_m, mask)
+    patches.sort(key=lambda patch: -patch[1])
+    return LevelGround(mask, tuple(patches), uncertain)
+
+
+def _judged(found: Patches, still_m: float) -> tuple[Bools, Bools]:
+    """Of each patch: (whether it is water, whether nobody can know)."""
+    still = found.spread_m <= np.float32(still_m)
+    # Without any shore to see, it is a floor, or a part of a slope.
+    shore = (found.differ > _LEAST_SHORE * found.edge) & (found.lower <= _MOST_LOWER * found.differ)
+    outlet = found.lower + found.below <= _MOST_LOWER * found.differ
+    stair = found.beside > _MOST_BESIDE * found.differ
+    level = still & shore & (outlet | ~stair)
+    level[0] = False
+    sea = found.border & (np.abs(found.height_m) <= _SEA_M)
+    plain = found.terrace > _MOST_TERRACES * found.differ
+    plain |= found.steep <= _LEAST_STEEP * found.differ
+    unsure = level & ~sea & plain
+    return level & ~unsure, unsure
+
+
+def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
+    """Add to a mask of level ground what is level but for the roughness of its survey; (height, cells) of each."""
+    from scipy import ndimage
+
+    side = _BLOCK_CELLS
+    rows, cols = (length // side for length in elevation_m.shape)
+    if rows < 1 or cols < 1:
+        return []
+    mean_m = np.empty((rows, cols), np.float32)
+    rough, noisy = np.empty((rows, cols), np.bool_), np.zeros((rows, cols), np.bool_)
+    for row0, row1 in bands(rows, _BLOCK_ROWS):
+        part = elevation_m[row0 * side : row1 * side, : cols * side].reshape(row1 - row0, side, cols * side)
+        mean_m[row0:row1] = _of_columns(np.add, part.sum(axis=1)) / np.float32(side * side)
+        range_m = _of_columns(np.maximum, part.max(axis=1)) - _of_columns(np.minimum, part.min(axis=1))
+        with np.errstate(invalid="ignore"):
+            rough[row0:row1] = ~(range_m <= np.float32(_ROUGH_M))
+        row, col = np.nonzero(~rough[row0:row1])
+        blocks = part.reshape(row1 - row0, side, cols, side)[row, :, col, :]
+        steps_m = sum(np.abs(np.diff(blocks, axis=axis)).mean(axis=(1, 2)) for axis in (1, 2))
+        noisy[row + row0, col] = steps_m > np.float32(2 * _NOISY) * range_m[row, col]
+    # A rough block can be a shore, but no part of a patch.
+    still_m = np.where(rough, np.float32(np.nan), mean_m)
+    found = level_patches(still_m, _BLOCK_SAME_M, _LEAST_BLOCKS, 0.0, mean_m)
+    water, _ = _judged(found, _BLOCK_STILL_M)
+    water &= 2 * np.bincount(found.labels[noisy], minlength=water.size) > found.cells
+    if not water.any():
+        return []
+    lakes = np.where(water[found.labels], found.labels, 0)
+    wide = ndimage.maximum_filter(lakes, _AROUND_BLOCKS)
+    # What is left beyond whole blocks is as the last one.
+    lakes, wide = (np.pad(each, ((0, 1), (0, 1)), "edge") for each in (lakes, wide))
+    height_m = _means_of(mean_m, found)
+    before, taken = np.zeros(water.size, np.int64), np.zeros(water.size, np.int64)
+    rough_m = np.zeros(water.size, np.float32)
+
+    def of_band(blocks: NDArray[np.int32], row0: int, row1: int) -> tuple[NDArray[np.int32], Floats, Bools]:
+        part, known = elevation_m[row0 * side : row1 * side], mask[row0 * side : row1 * side]
+        of_cell = blocks[row0:row1].repeat(side, axis=0)[: part.shape[0]].repeat(side, axis=1)[:, : part.shape[1]]
+        return of_cell, np.abs(part - height_m[of_cell]), known
+
+    for row0, row1 in bands(rows, _BLOCK_ROWS):
+        of_cell, off_m, known = of_band(lakes, row0, row1)
+        before += np.bincount(of_cell[known], minlength=water.size)
+        taken += np.bincount(of_cell.reshape(-1), minlength=water.size)
+        np.maximum.at(rough_m, of_cell, off_m)
+    # What is exactly level has been found, with its shore to the cell.
+    water &= 2 * before < taken
+    rough_m[~water] = -1
+    for row0, row1 in bands(rows + 1, _BLOCK_ROWS):
+        of_cell, off_m, known = of_band(wide, row0, row1)
+        with np.errstate(invalid="ignore"):
+            known |= off_m <= rough_m[of_cell]
+    return [(float(height_m[n]), int(taken[n])) for n in np.flatnonzero(water).tolist()]
+
+
+def _of_columns(ufunc: np.ufunc, values: Floats) -> Floats:
+    """Every `_BLOCK_CELLS` columns made one."""
+    found = values[:, ::_BLOCK_CELLS]
+    for n in range(1, _BLOCK_CELLS):
+        found = ufunc(found, values[:, n::_BLOCK_CELLS])
+    return found
+
+
+def _means_of(mean_m: Floats, found: Patches) -> Floats:
+    total = np.bincount(found.labels.reshape(-1), np.nan_to_num(mean_m).reshape(-1), len(found.cells))
+    means: Floats = (total / np.maximum(found.cells, 1)).astype(np.float32)
+    means[0] = np.nan
+    return means
+
+
+def _add_ripples(elevation_m: Floats, found: Patches, rippled: Bools, mask: Bools) -> None:
+    """Add to a mask of lakes what lies lower right beside them."""
+    from scipy import ndimage
+
+    ring = _RING_CELLS
+    for row0, row1 in bands(elevation_m.shape[0]):
+        above, below = max(row0 - ring, 0), min(row1 + ring, elevation_m.shape[0])
+        lakes = found.labels[above:below]
+        lakes = np.where(rippled[lakes], lakes, 0)
+        if not lakes.any():
+            continue
+        near = ndimage.maximum_filter(lakes, 2 * ring + 1)[row0 - above : row1 - above]
+        above_m = elevation_m[row0:row1] - found.height_m[near]
+        with np.errstate(invalid="ignore"):
+            mask[row0:row1] |= (above_m <= _SAME_M) & (above_m >= -_SUNK_M)
+
+
+def looked_at(
+    stored: Floats, config: TerrainConfig, scale: float = 1.0, offset: float = 0.0
+) -> tuple[tuple[float, ...], Bools, list[str]]:
+    """(values that stand for no height, bool (rows, cols) of what is level, what people should know of both).
+
+    Parameters
+    ----------
+    stored : float32 (rows, cols)
+        As in the file; `scale` and `offset` make metres of it. Of a large one only some cells are looked at for
+        what is level.
+    """
+    unknown = undeclared_voids(without(stored, config.nodata_values), scale, offset)
+    voids = (*config.nodata_values, *unknown)
+    rows, cols = stored.shape
+    every = math.ceil(math.sqrt(max(stored.size / MOST_SAMPLED, 1.0)))
+    some_m = without(stored[::every, ::every], voids) * np.float32(scale) + np.float32(offset)
+    found = level_ground(some_m)
+    level = found.mask.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :cols]
+    return voids, level, [*notes_of_voids(unknown), *notes_of_level(found, config)]
+
+
+def notes_of_voids(voids: Sequence[float]) -> Iterator[str]:
+    """What people should know of undeclared voids."""
+    for code in voids:
+        yield (
+            f"{code:g} is taken for no height: nothing else is near it, though the file does not declare it"
+            " (terrain.nodata_values says so for good)"
+        )
+
+
+def notes_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
+    """What people should know of level ground."""
+    if found.patches:
+        (height_m, cells), many = found.patches[0], len(found.patches)
+        taken = f"is taken for {config.level_is}, as terrain.level_is says"
+        if config.level_is == "water":
+            taken = "is taken for water where no photo shows it; of dry ground say terrain.level_is = 'ground'"
+        yield (
+            f"level ground: {found.mask.mean():.1%} of the file in {many} patch{'es' * (many > 1)}, the largest"
+            f" {cells} cells at {height_m:g} m, {taken}"
+        )
+    if found.uncertain > _TOLD_SHARE:
+        yield (
+            f"level ground: {found.uncertain:.1%} of the file is low and level among steps of the heights, which"
+            " are rounded, and is taken for ground; of water say terrain.water_below_m"
+        )
+
+
+def _step_m(elevation_m: Floats) -> float:
+    """The smallest difference between neighbours that differ, of some rows."""
+    some = elevation_m[:: max(elevation_m.shape[0] // 64, 1)]
+    steps = np.abs(np.diff(some.astype(np.float64), axis=1))
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    return float(np.quantile(steps, 0.01)) if steps.size else 0.0

@@ -1,0 +1,234 @@
+"""A colour photo from a file, brought onto the grid of the elevation; and whether it is a true-colour photo at all:
+rules that know what grass looks like know nothing of other images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools, Bytes
+from shared_map.importers.georeference import grows, place_on, warped
+from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
+from shared_map.terrain.row_bands import Progress, bands, no_progress
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+MOST_SIDE = 1024
+_DARK = 30
+_LEGEND_COLOURS, _LEGEND_SAME = 64, 0.6
+_RED_OVER_GREEN, _LIKE_BLUE, _FALSE_SHARE = 1.4, 0.15, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo on the terrain's grid.
+
+    rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
+    seen   bool (rows, cols): where it shows anything
+    notes  what was done to it, for people
+    drawn  that its own pixels are those of a drawn map, for people; None if they may be a photo's
+    """
+
+    rgb: Bytes
+    seen: Bools
+    notes: tuple[str, ...]
+    drawn: str | None = None
+
+
+def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Progress = no_progress) -> Photo:
+    """The photo on the terrain's grid.
+
+    Parameters
+    ----------
+    path : Path
+        Whatever rasterio reads. What is not in bytes is stretched from its 2nd to its 98th percentile.
+    grid : GridSpec
+        Of the terrain.
+    given_crs : str or None
+        Coordinate system of a photo that has a place but does not name its system.
+    progress : callable
+        Told what is done and how much of it.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read or names no coordinate system, if it does not overlap the terrain or shows
+        nothing of it, or if one of the two has no place on earth and they differ in size.
+    """
+    what = f"photo {path}"
+    with opened(path, "photo") as dataset:
+        crs, target, share = place_on(dataset, grid, given_crs, what)
+        notes = []
+        if grid.crs != "local" and (dataset.crs or not dataset.transform.is_identity):
+            notes.append(f"photo: {dataset.height} x {dataset.width} pixels, covers {share:.1%} of the terrain")
+        return _read(dataset, _Onto(dataset, grid, crs, target), notes, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class _Onto:
+    """A photo's way onto rows of the terrain's grid; `target` is None where its pixels are the terrain's cells."""
+
+    dataset: Any
+    grid: GridSpec
+    crs: Any
+    target: Any
+
+    def band(self, index: int, row0: int, row1: int) -> NDArray[Any]:
+        """Rows of a band, 0 beyond the photo. Palettes and transparency are not interpolated."""
+        import rasterio
+        from rasterio.enums import ColorInterp
+        from rasterio.windows import Window
+
+        dataset, grid, target = self.dataset, self.grid, self.target
+        if target is None:
+            return np.asarray(dataset.read(index, window=Window(0, row0, dataset.width, row1 - row0)))
+        how = "average" if grows(dataset, dataset.transform, self.crs, grid, target) else "bilinear"
+        if dataset.colorinterp[index - 1] in (ColorInterp.palette, ColorInterp.alpha):
+            how = "nearest"
+        rows = np.zeros((row1 - row0, grid.cols), dataset.dtypes[index - 1])
+        return warped(rasterio.band(dataset, index), rows, grid, self.crs, target, how, row0)
+
+    def frame(self, row0: int, row1: int) -> Bools:
+        """Which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
+        from rasterio.transform import Affine
+
+        if self.target is None:
+            return np.ones((row1 - row0, self.grid.cols), np.bool_)
+        ones = np.ones((min(self.dataset.height, 64), min(self.dataset.width, 64)), np.uint8)
+        wide, high = self.dataset.width / ones.shape[1], self.dataset.height / ones.shape[0]
+        coarse = self.dataset.transform @ Affine.scale(wide, high)
+        inside = np.zeros((row1 - row0, self.grid.cols), np.uint8)
+        return warped(ones, inside, self.grid, self.crs, self.target, "nearest", row0, src_transform=coarse) > 0
+
+
+def _read(dataset: Any, onto: _Onto, notes: list[str], progress: Progress) -> Photo:
+    from rasterio.enums import ColorInterp
+
+    grid = onto.grid
+    indexes, palette = _colour_bands(dataset)
+    meanings = list(dataset.colorinterp)
+    alpha = meanings.index(ColorInterp.alpha) + 1 if ColorInterp.alpha in meanings else None
+    low, high = _stretch(dataset, indexes, notes)
+    if len(indexes) == 1 and palette is None:
+        notes.append("the photo is grey: without colour, what covers the ground is a guess")
+    rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
+    seen = np.empty((grid.rows, grid.cols), np.bool_)
+    for row0, row1 in bands(grid.rows, READ_ROWS):
+        raw = [onto.band(index, row0, row1) for index in indexes]
+        inside = onto.frame(row0, row1)
+        if raw[0].dtype.kind == "f":
+            inside &= ~np.any([np.isnan(values) for values in raw], axis=0)
+        if dataset.nodata is not None:
+            inside &= ~np.all([values == dataset.nodata for values in raw], axis=0)
+        if alpha is not None:
+            inside &= onto.band(alpha, row0, row1) > 0
+        seen[row0:row1] = inside
+        for channel in range(3):
+            values = raw[channel % len(raw)]
+            if palette is not None:
+                values = palette[np.minimum(values.astype(np.intp), 255), channel]
+            elif high > low:
+                scaled = (values.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
+                values = np.clip(np.nan_to_num(scaled), 0, 255)
+            rgb[row0:row1, :, channel] = np.where(inside, values, 0)
+        progress("reading photo", row1 / grid.rows)
+    if not seen.any():
+        raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
+    if not seen.all():
+        notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
+    return Photo(rgb, seen, tuple(notes), _why_drawn(dataset, indexes, palette))
+
+
+def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | None) -> str | None:
+    """Looked for in the file's own pixels, in its middle."""
+    if len(indexes) == 1 and palette is None:
+        return None
+    if any(dataset.dtypes[index - 1] != "uint8" for index in indexes):
+        return None
+    window = middle_of(dataset, MOST_SIDE)
+    stored = dataset.read(indexes, window=window)
+    rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
+    return why_drawn(rgb, dataset.dataset_mask(window=window) > 0)
+
+
+def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
+    """Which bands are red, green and blue; one grey band stands for all three; a palette is looked up."""
+    from rasterio.enums import ColorInterp
+
+    meanings = list(dataset.colorinterp)
+    wanted = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+    if all(colour in meanings for colour in wanted):
+        return [meanings.index(colour) + 1 for colour in wanted], None
+    if meanings[0] == ColorInterp.palette:
+        table = np.zeros((256, 3), np.uint8)
+        for value, colour in dataset.colormap(1).items():
+            table[value] = colour[:3]
+        return [1], table
+    return ([1, 2, 3] if dataset.count >= 3 else [1]), None
+
+
+def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float, float]:
+    """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes."""
+    if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
+        return 0.0, 0.0
+    every = -(-max(dataset.height, dataset.width) // 512)
+    sample = thinned(dataset.read, dataset, indexes, every).astype(np.float64)
+    sample = sample[np.isfinite(sample) & (sample != (0 if dataset.nodata is None else dataset.nodata))]
+    if sample.size == 0:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(sample, (2, 98)))
+    notes.append(f"photo stretched from {low:.4g}..{high:.4g} to bytes")
+    return low, max(high, low + 1e-9)
+
+
+# --- true colour or not -------------------------------------------------------------------------------------
+
+
+def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
+    """What an image is instead of a true-colour photo, for people; None if it may be one.
+
+    Parameters
+    ----------
+    rgb : uint8 (rows, cols, 3), red, green, blue
+    seen : bool (rows, cols)
+        Where it shows anything.
+
+    Returns
+    -------
+    str or None
+        A map with a legend has few colours, in areas. Where near infrared is shown as red, plants are red, with as
+        much green as blue; the reds of true ground have more green than blue.
+    """
+    drawn = why_drawn(rgb, seen)
+    if drawn is not None:
+        return drawn
+    stride = max(-(-max(seen.shape) // MOST_SIDE), 1)
+    some, shown = rgb[::stride, ::stride].astype(np.int32), seen[::stride, ::stride]
+    red, green, blue = some[..., 0], some[..., 1], some[..., 2]
+    lit = shown & (red + green + blue > _DARK)
+    false = (red > _RED_OVER_GREEN * green) & (np.abs(green - blue) < _LIKE_BLUE * red) & lit
+    share = false.sum() / max(int(lit.sum()), 1)
+    if share > _FALSE_SHARE:
+        return f"in false colour: {share:.0%} of it is as red as plants are where near infrared is shown as red"
+    return None
+
+
+def why_drawn(rgb: Bytes, seen: Bools) -> str | None:
+    """That an image is a drawn map, for people; None if it may be a photo. Arguments as of `why_not_true_colour`.
+
+    Pixels must be the file's own, or copies of them: between two colours of a legend an interpolation makes others.
+    """
+    stride = max(-(-max(seen.shape) // MOST_SIDE), 1)
+    rows, cols = min(seen.shape[0], MOST_SIDE), min(seen.shape[1], MOST_SIDE)
+    middle = rgb[:rows, :cols] if stride == 1 else rgb[(len(rgb) - rows) // 2 :, (rgb.shape[1] - cols) // 2 :]
+    middle = middle[:rows, :cols]
+    same = (middle[1:, 1:] == middle[:-1, 1:]).all(axis=2) & (middle[1:, 1:] == middle[1:, :-1]).all(axis=2)
+    some, shown = rgb[::stride, ::stride].astype(np.int32), seen[::stride, ::stride]
+    colours = np.unique((some[..., 0] << 16 | some[..., 1] << 8 | some[..., 2])[shown]).size
+    if 1 < colours <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
+        return f"a drawn map: it has {colours} colours, in areas"
+    return None

@@ -1,1 +1,0 @@
-"""What a photo shows: classes of ground, and roads."""

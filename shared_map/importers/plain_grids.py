@@ -1,0 +1,402 @@
+"""Grids in plain formats: ESRI ASCII, NumPy's .npz, MovingAI .map, ROS map_server's YAML with its image.
+
+numpy, PyYAML and Pillow read them. What a header promises is checked against the file's length and the largest grid
+before memory is taken.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+import warnings
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bytes, Floats
+from shared_map.importers.raster_files import BAD_ARCHIVE
+from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
+from swarm.errors import TerrainError
+from swarm.grid import MAX_CELLS
+
+_NPZ_ARRAYS = ("elevation", "photo", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
+_HEADER_BYTES = 4096
+_MOST_TABLE_BYTES = 1 << 20
+"""Of an archive's table of contents."""
+_SHOWN_MEMBERS = 10
+_ASC_HEADER_LINES = 32
+SCALE_FACTOR = 9.0
+"""ROS `scale` mode: pace grows by up to this many times between free and occupied."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlainGrid:
+    """What a plain file says.
+
+    heights      float32 (rows, cols) in the file's unit, NaN is a void; None for a map without heights
+    factor       float32 (rows, cols), pace relative to open ground; inf is lethal, NaN unknown; None if all is open
+    step         width and height of a cell, in metres, or in degrees if `degrees`; (0, 0) if the file does not say
+    west, north  outer corner of cell (0, 0), in the same unit
+    photo        uint8 (rows, cols, 3), red, green, blue
+    notes        what was found, for people
+    """
+
+    heights: Floats | None
+    factor: Floats | None
+    step: tuple[float, float]
+    west: float = 0.0
+    north: float = 0.0
+    degrees: bool = False
+    photo: Bytes | None = None
+    notes: tuple[str, ...] = ()
+
+
+def check_cells(rows: int, cols: int, path: Path) -> None:
+    """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
+    if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
+        raise TerrainError(f"terrain {path}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
+
+
+# --- ESRI ASCII ---------------------------------------------------------------------------------------------
+
+
+def read_asc(path: Path) -> PlainGrid:
+    """ESRI ASCII grid: header lines, then heights row by row from the north, however they are broken into lines.
+
+    The header says `ncols`, `nrows`, `cellsize`, `xllcorner` or `xllcenter`, `yllcorner` or `yllcenter`, and
+    `nodata_value`, -9999 unless given. Metres and degrees look alike in it: `degrees` is False.
+
+    GDAL's driver is not used: it takes what is no number for 0.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, or its heights are not what its header says.
+    """
+    check_bytes(path, FileKind.TEXT_GRID)
+    with path.open("rb") as file:
+        header = _asc_header(file, path)
+        rows, cols, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
+        check_cells(rows, cols, path)
+        if not step > 0:
+            raise TerrainError(f"terrain {path}: cellsize is {step:g}; it must be positive")
+        try:
+            heights = np.fromfile(file, np.float32, rows * cols, sep=" ")
+        except ValueError:  # the file is left where numpy found what is no number
+            heights = np.zeros(0, np.float32)
+        at, rest = file.tell(), file.read(200).split()
+        if rest:
+            file.seek(0)
+            line = 1 + sum(part.count(b"\n") for part in _parts(file, at))
+            found = rest[0][:40].decode("ascii", "replace")
+            raise TerrainError(
+                f"terrain {path}, line {line}: found {found!r}; its header says {rows} rows of {cols} numbers"
+            )
+    if heights.size < rows * cols:
+        raise TerrainError(f"terrain {path} has {heights.size} heights; its header says {rows} rows of {cols}")
+    heights[heights == np.float32(header.get("nodata_value", -9999.0))] = np.nan
+    half = step / 2
+    west = header["xllcorner"] if "xllcorner" in header else header.get("xllcenter", half) - half
+    south = header["yllcorner"] if "yllcorner" in header else header.get("yllcenter", half) - half
+    return PlainGrid(heights.reshape(rows, cols), None, (step, step), west, south + rows * step)
+
+
+def _parts(file: IO[bytes], length: int) -> Iterator[bytes]:
+    """The first bytes of a file, some at a time."""
+    while length > 0 and (part := file.read(min(length, 1 << 20))):
+        length -= len(part)
+        yield part
+
+
+def _asc_header(file: IO[bytes], path: Path) -> dict[str, float]:
+    """Key -> number of the lines that begin with a word; the file is left at its first height."""
+    header: dict[str, float] = {}
+    for number in range(1, _ASC_HEADER_LINES):
+        begin = file.tell()
+        words = file.readline(_HEADER_BYTES).decode("ascii", "replace").split()
+        if len(words) != 2 or not words[0][0].isalpha() or words[0].lower() == "nan":
+            file.seek(begin)
+            break
+        key = words[0].lower()
+        try:
+            header[key] = float(words[1])
+        except ValueError as error:
+            raise TerrainError(f"terrain {path}, line {number}: {words[1][:40]!r} is no number") from error
+        if key != "nodata_value" and not math.isfinite(header[key]):
+            raise TerrainError(f"terrain {path}: its header says {key} {header[key]:g}; expected a finite number")
+        if key in ("ncols", "nrows") and header[key] % 1:
+            raise TerrainError(f"terrain {path}: its header says {key} {header[key]:g}; expected a whole number")
+    missing = [key for key in ("ncols", "nrows", "cellsize") if key not in header]
+    if missing:
+        raise TerrainError(f"terrain {path} is no ESRI ASCII grid: its header lacks {', '.join(missing)}")
+    return header
+
+
+# --- numpy's archives ---------------------------------------------------------------------------------------
+
+
+def read_npz(path: Path) -> PlainGrid:
+    """Arrays in an archive of NumPy's.
+
+    elevation           (rows, cols), numbers; row 0 is in the north
+    resolution_m        side of a cell, or
+    dx, dy, xmin, ymin  in degrees, as in matplotlib's samples; `ymin` is the north latitude
+    photo               uint8 (rows, cols, 3), optional
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, its arrays would unpack to more than the file may have, or are not as above.
+    """
+    arrays, held = _members(path)
+    heights = arrays.get("elevation")
+    if heights is None or heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
+        raise TerrainError(f"terrain {path} has no two-dimensional `elevation` of numbers; it has {held}")
+    check_cells(heights.shape[0], heights.shape[1], path)
+    photo = arrays.get("photo")
+    if photo is not None and (photo.shape != (*heights.shape, 3) or photo.dtype != np.uint8):
+        raise TerrainError(f"terrain {path}: photo is {photo.shape} {photo.dtype}, not {(*heights.shape, 3)} uint8")
+    heights = heights.astype(np.float32)
+    try:
+        numbers = {name: float(array) for name, array in arrays.items() if name not in ("elevation", "photo")}
+    except TypeError as error:
+        raise TerrainError(f"terrain {path}: its cell size is no single number: {error}") from error
+    for name in {"resolution_m", "dx", "dy"} & numbers.keys():
+        check_step(numbers[name], path)
+    if "resolution_m" in numbers:
+        return PlainGrid(heights, None, (numbers["resolution_m"],) * 2, photo=photo)
+    if {"dx", "dy", "xmin", "ymin"} <= numbers.keys():
+        # matplotlib's jacksboro file calls the northern latitude ymin and the southern one ymax.
+        north = max(numbers["ymin"], numbers.get("ymax", -math.inf))
+        steps = (numbers["dx"], numbers["dy"])
+        return PlainGrid(heights, None, steps, numbers["xmin"], north, degrees=True, photo=photo)
+    return PlainGrid(heights, None, (0.0, 0.0), photo=photo)
+
+
+def check_step(step: float, path: Path) -> None:
+    """Raises TerrainError unless a cell has a size."""
+    if not 0 < step < 1e7:
+        raise TerrainError(f"terrain {path}: the size of a cell is {step:g}; it must be positive")
+
+
+def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    """The arrays of `_NPZ_ARRAYS` in an .npz, and what it holds, for people. Others are never unpacked."""
+    kind = FileKind.ARRAYS
+    check_bytes(path, kind)
+    try:
+        with _ShortReads(path) as file, zipfile.ZipFile(file) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            wanted = {name: members[name] for name in _NPZ_ARRAYS if name in members}
+            total = sum(info.file_size for info in wanted.values())
+            if total > kind.most_bytes:
+                most = size(kind.most_bytes)
+                raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
+            shown = [
+                f"{name[:40]} {_shape_of(archive, info)}" for name, info in sorted(members.items())[:_SHOWN_MEMBERS]
+            ]
+            arrays = {name: _array(archive, info) for name, info in wanted.items()}
+            return arrays, ", ".join(shown) or "nothing"
+    except OSError as error:
+        raise kind.unreadable(path, error) from error
+    except BAD_ARCHIVE as error:
+        raise TerrainError(f"terrain {path} is truncated or no .npz of numbers: {error}") from error
+
+
+class _ShortReads(io.FileIO):
+    """A file of which nobody reads much at once, so that an archive's table of contents is bounded, too."""
+
+    def read(self, count: int | None = -1) -> bytes:
+        """Raises BadZipFile where more than `_MOST_TABLE_BYTES` are asked for."""
+        if count is not None and count > _MOST_TABLE_BYTES:
+            raise zipfile.BadZipFile(f"its table of contents has {size(count)}")
+        return super().read(-1 if count is None else count) or b""
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """(shape, type) of an array of numpy's, of which the header is read. Raises ValueError."""
+    try:
+        first = np.lib.format.read_magic(file) == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file, max_header_size=_HEADER_BYTES)
+    except BAD_ARCHIVE:
+        raise
+    except Exception as error:  # of damaged headers numpy raises whatever their evaluation runs into
+        raise ValueError("its header is none of numpy's") from error
+    return shape, dtype
+
+
+def _shape_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> str:
+    try:
+        with archive.open(info) as file:
+            return str(_header(file)[0])
+    except BAD_ARCHIVE:
+        return "of no numbers"
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    """A member, whose header is looked at before memory is taken. Raises ValueError, or what zipfile raises."""
+    with archive.open(info) as file:
+        shape, dtype = _header(file)
+        head = file.tell()
+    if dtype.kind not in "iufb" or dtype.itemsize > 8:
+        raise ValueError(f"it holds {str(dtype)[:40]!r}; expected numbers of at most 8 bytes")
+    cells = math.prod(shape)
+    if cells > 3 * MAX_CELLS:
+        raise ValueError(f"its header says {' x '.join(map(str, shape))}; at most {MAX_CELLS} cells are read")
+    if head + cells * dtype.itemsize != info.file_size:
+        promised, has = size(cells * dtype.itemsize), size(max(info.file_size - head, 0))
+        raise ValueError(f"its header promises {promised} of numbers, and it has {has}")
+    with archive.open(info) as file:
+        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_HEADER_BYTES)
+        file.read(1)  # at its end the checksum is compared
+    return array
+
+
+# --- maps without heights -----------------------------------------------------------------------------------
+
+
+def read_map(path: Path) -> PlainGrid:
+    """MovingAI grid map: `.` `G` `S` can be driven, `@` `O` `T` `W` cannot. Its `factor` is 1 or inf.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, its rows are not what its header says, or a letter is unknown.
+    """
+    lines = read_lines(path, FileKind.TEXT_GRID)
+    words = [line[:200].split() for line in itertools.islice(lines, 4)]
+    try:
+        ((_, kind), *_, (marker,)) = words
+        header = {line[0]: line[-1] for line in words}
+        rows, cols = int(header["height"]), int(header["width"])
+        if marker != "map":
+            raise ValueError(marker)
+    except (ValueError, KeyError) as error:
+        raise TerrainError(
+            f"terrain {path} is no MovingAI map: it must begin with type, height, width, map"
+        ) from error
+    check_cells(rows, cols, path)
+    letters = np.full(256, np.nan, np.float32)
+    letters[list(b".GS")], letters[list(b"@OTW")] = 1.0, np.inf
+    factor = np.empty((rows, cols), np.float32)
+    row = 0
+    for line in lines:
+        if row == rows or not line.strip():
+            if line.strip():
+                raise TerrainError(f"terrain {path} has more rows than its header says, {rows}")
+            continue
+        if len(line) != cols:
+            raise TerrainError(f"terrain {path}, line {row + 5}: {len(line)} cells; its header says {cols}")
+        factor[row] = letters[np.frombuffer(line.encode("ascii"), np.uint8)]
+        if np.isnan(factor[row]).any():
+            col = int(np.isnan(factor[row]).argmax())
+            raise TerrainError(f"terrain {path}, line {row + 5}, column {col + 1}: {line[col]!r} is no ground")
+        row += 1
+    if row < rows:
+        raise TerrainError(f"terrain {path} has {row} rows; its header says {rows}")
+    return PlainGrid(None, factor, (0.0, 0.0), notes=(f"MovingAI map of type {kind}",))
+
+
+def read_ros(path: Path) -> PlainGrid:
+    """ROS map_server: a yaml that names a PGM image, its resolution, origin and thresholds.
+
+    Its `factor` is 1 on free, inf on occupied cells. Between the thresholds it is NaN in the mode `trinary`, and
+    rises from 1 to 1 + `SCALE_FACTOR` in the modes `scale` and `raw`; in `raw`, values above 100 are NaN.
+
+    Raises
+    ------
+    TerrainError
+        If a file cannot be read, a key is missing or out of range, or the origin is turned.
+    """
+    values = _yaml(path)
+    try:
+        image = path.parent / str(values["image"])
+        resolution_m, occupied, free = (
+            float(values[key]) for key in ("resolution", "occupied_thresh", "free_thresh")
+        )
+        west, south, *turned = map(float, values["origin"])
+        mode = str(values.get("mode", "trinary")).lower()
+        negate = bool(int(values.get("negate", 0)))
+    except KeyError as error:
+        raise TerrainError(f"terrain {path} is no ROS map: {error.args[0]} is missing") from error
+    except (ValueError, TypeError, OverflowError) as error:
+        raise TerrainError(f"terrain {path}: {str(error)[:200]}") from error
+    check_step(resolution_m, path)
+    if mode not in ("trinary", "scale", "raw"):
+        raise TerrainError(f"terrain {path}: mode is {mode[:40]!r}; trinary, scale and raw are known")
+    if turned and abs(turned[0]) > 1e-9:
+        raise TerrainError(
+            f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image and set it to 0"
+        )
+    if not 0 <= free <= occupied <= 1:
+        raise TerrainError(
+            f"terrain {path}: thresholds free {free:g}, occupied {occupied:g}: 0 <= free <= occupied <= 1"
+        )
+    if not image.is_file():
+        raise TerrainError(f"terrain {path} names the image {values['image']}, but there is no file {image}")
+    pixels, brightest = read_pgm(image)
+    if negate:
+        pixels = brightest - pixels
+    factor = np.full(pixels.shape, np.nan, np.float32)
+    known = pixels <= (100 if mode == "raw" else brightest)
+    taken = pixels / np.float32(100) if mode == "raw" else np.float32(1) - pixels / np.float32(brightest)
+    factor[known & (taken < free)] = 1.0
+    if mode != "trinary":
+        between = known & (taken >= free) & (taken <= occupied)
+        share = (taken[between] - np.float32(free)) / np.float32(max(occupied - free, 1e-6))
+        factor[between] = np.float32(1) + np.float32(SCALE_FACTOR) * share
+    factor[known & (taken > occupied)] = np.inf
+    north = south + pixels.shape[0] * resolution_m
+    notes = (f"ROS map, mode {mode}, {np.isnan(factor).mean():.1%} unknown",)
+    return PlainGrid(None, factor, (resolution_m, resolution_m), west, north, notes=notes)
+
+
+def _yaml(path: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        values = yaml.safe_load(read_text(path, FileKind.ROS_MAP))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "context_mark", None) or getattr(error, "problem_mark", None)
+        where = "" if mark is None else f", line {mark.line + 1}"
+        why = str(getattr(error, "problem", None) or error).splitlines()[0][:200]
+        raise TerrainError(f"terrain {path}{where}: no YAML: {why}") from error
+    if not isinstance(values, dict):
+        raise TerrainError(f"terrain {path} is no ROS map: it has no lines of key: value")
+    return values
+
+
+def read_pgm(path: Path) -> tuple[NDArray[np.int32], int]:
+    """A P2 or P5 image, comments and 16 bits included.
+
+    Returns
+    -------
+    pixels : int32 (rows, cols)
+        Row 0 is on top.
+    brightest : int
+        The value that stands for white, 255 or 65535, whatever the file says: pixels are in proportion.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, is no PGM, or is shorter than its header says.
+    """
+    from PIL import Image
+
+    check_bytes(path, FileKind.IMAGE)
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM",)) as image:
+            if image.mode not in ("L", "I", "I;16"):
+                raise TerrainError(f"image {path} is no PGM: it is in colour; convert it (magick map.png map.pgm)")
+            check_cells(image.height, image.width, path)
+            return np.asarray(image, np.int32), 255 if image.mode == "L" else 65535
+    except Image.DecompressionBombError as error:
+        raise TerrainError(f"image {path}: its header says more pixels than are read: {error}") from error
+    except (OSError, ValueError, OverflowError, SyntaxError) as error:
+        raise TerrainError(f"image {path} is truncated or no PGM: {str(error)[:200]}") from error

@@ -1,0 +1,344 @@
+"""A raster that is named as a terrain: what it holds, and its heights brought onto one square metric grid.
+
+Its numbers may be heights, codes of land cover, or colours that stand for heights. rasterio is imported where it is
+used: agents never need it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared_map.arrays import Bools, Floats
+from shared_map.importers.cover_codes import TABLES, legend_of, some
+from shared_map.importers.cover_meaning import (
+    evidence_of,
+    meaning_of,
+    recognise,
+    sampled_codes,
+    sampled_colours,
+)
+from shared_map.importers.encoded_heights import TITLES, Encoding, encodings_of, heights_decoded
+from shared_map.importers.georeference import crs_of, grows, overruled, plan_grid, warped
+from shared_map.importers.land_cover import read_cover
+from shared_map.importers.level_ground import MOST_SAMPLED, looked_at
+from shared_map.importers.metric_grids import nearest
+from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
+from shared_map.importers.source import Source
+from shared_map.importers.voids import without
+from shared_map.terrain.row_bands import Progress, bands
+from swarm.config.ground import TerrainConfig
+from swarm.errors import TerrainError
+from swarm.grid import MAX_CELLS, GridSpec
+
+_UNITS_M = {
+    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us survey feet", "survey foot", "survey feet", "us foot"), 1200 / 3937),
+    **dict.fromkeys(("us feet", "us ft", "ftus", "ft us", "foot us", "usft"), 1200 / 3937),
+    **dict.fromkeys(("fathom", "fathoms"), 1.8288),
+    **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
+    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
+    **dict.fromkeys(("km", "kilometre", "kilometer"), 1000.0),
+    **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
+}
+"""What a file may call the unit of its heights, in metres. Written as `_plain_unit` leaves it."""
+_METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
+"""Where an image without a place lies."""
+_HALF_WORLD_M = math.pi * 6_378_137.0
+"""Half of the side of the web's map, EPSG:3857."""
+_DEEPEST_ZOOM = 24
+_MOST_CODES, _LEAST_CODES = 256, 3
+_LOOK_CELLS = 128
+
+
+def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    """What a raster gives: heights, or the classes of a land-cover map on level ground.
+
+    Raises TerrainError if it cannot be read, may be one or the other, or does not fit a grid (see `plan_grid`).
+    """
+    with opened(path, "terrain") as dataset:
+        holds = contents_of(dataset, f"terrain {path}", config)
+        place = _place_of(dataset, path, config, holds)
+        if holds.is_cover:
+            return _level_cover(dataset, place, path, config, progress)
+        if holds.encoding is None:
+            return _heights(dataset, place, path, config, progress)
+        known = f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}"
+        with heights_decoded(dataset, holds.encoding, path, place.crs, place.transform) as (decoded, told):
+            place = _Place(place.crs, place.transform, (known, *place.notes, *told))
+            return _heights(decoded, place, path, config, progress)
+
+
+def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    grid, _, notes = plan_grid(
+        place.transform, dataset.height, dataset.width, place.crs, config.resolution_m, f"terrain {path}"
+    )
+    cover = read_cover(path, grid, config, progress)
+    level = np.zeros((grid.rows, grid.cols), np.float32)
+    alone = "there are no heights: the land cover lies on level ground, and slopes cost nothing"
+    told = (str(path), *place.notes, *notes, *cover.notes, alone)
+    return Source(grid, level, cover.classes, factor=cover.factor, notes=told)
+
+
+# --- what it holds ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a raster holds.
+
+    is_cover  codes of land cover, or a drawing of them
+    encoding  how heights are stored as colours; None where numbers are heights
+    how       how that is known, for people; empty where it goes without saying
+    """
+
+    is_cover: bool = False
+    encoding: Encoding | None = None
+    how: str = ""
+
+
+def contents_of(dataset: Any, what: str, config: TerrainConfig) -> Contents:
+    """What a raster holds, by what the scenario says, else by its content.
+
+    Raises TerrainError that names the setting which answers, if it may be one or the other.
+    """
+    said = config.elevation_encoding
+    if said is not None:
+        how = f"as terrain.elevation_encoding = {said!r} says"
+        return Contents() if said == "metres" else Contents(encoding=said, how=how)
+    if config.cover is None and (config.cover_codes is not None or config.cover_classes):
+        return Contents(is_cover=True)
+    return _of_colours(dataset, what) if dataset.count >= 3 else _of_numbers(dataset, what, config)
+
+
+def _of_colours(dataset: Any, what: str) -> Contents:
+    fitting = encodings_of(dataset)
+    if len(fitting) == 1:
+        return Contents(encoding=fitting[0], how="as only so its colours are heights of a landscape")
+    settings = " or ".join(f"terrain.elevation_encoding = {encoding!r}" for encoding in TITLES)
+    if fitting:
+        raise TerrainError(f"{what} may be heights of Terrain-RGB or of Terrarium; set {settings}")
+    if legend_of(sampled_colours(dataset), what) is not None:
+        return Contents(is_cover=True)
+    raise TerrainError(
+        f"{what} has {dataset.count} bands: a photo? Name it in terrain.photo; of heights stored as colours"
+        f" say {settings}"
+    )
+
+
+def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
+    from rasterio.enums import ColorInterp
+
+    has_palette = dataset.colorinterp[0] == ColorInterp.palette
+    if np.dtype(dataset.dtypes[0]).kind not in "iu":
+        return Contents()
+    # A first look at the middle of a file: most height models are ruled out by it.
+    window = middle_of(dataset, _LOOK_CELLS)
+    values = dataset.read(1, window=window)[dataset.read_masks(1, window=window) > 0]
+    gappy = {key: [*table.grounds, *table.nothing] for key, table in TABLES.items() if table.gappy}
+    if not has_palette and not any(np.isin(values, codes).all() for codes in gappy.values()):
+        return Contents()
+    sample = sampled_codes(dataset, what)
+    codes = np.unique(sample)
+    if not 0 < codes.size <= _MOST_CODES:
+        return Contents()
+    answers = (
+        "terrain.cover_codes = {} if it is land cover, terrain.elevation_encoding = 'metres' if it has heights"
+    )
+    if has_palette:
+        if meaning_of(dataset, what, config) is not None:
+            return Contents(is_cover=True)
+        raise TerrainError(
+            f"{what} has a palette, and its codes ({some(codes.tolist())}) are those of no built-in table; set "
+            + answers.format("a CSV file of code and class")
+        )
+    fits = [TABLES[key] for key, known in gappy.items() if np.isin(codes, known).all()]
+    if not fits:
+        return Contents()
+    found = evidence_of(dataset, sample)
+    if found.names or any(word in found.text for table in fits for word in table.words):
+        return Contents(is_cover=recognise(found, what) is not None)
+    if all(np.isin(codes, list(table.grounds)).sum() < _LEAST_CODES for table in fits):
+        return Contents()
+    titles = " and of ".join(table.title for table in fits)
+    raise TerrainError(
+        f"{what} holds nothing but {some(codes.tolist())}, codes of {titles}; set "
+        + answers.format(" or ".join(repr(table.key) for table in fits))
+    )
+
+
+# --- where it lies ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Coordinate system and affine transform of a raster, and what people should know of both."""
+
+    crs: Any
+    transform: Any
+    notes: tuple[str, ...] = ()
+
+
+def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) -> _Place:
+    """Where a raster lies.
+
+    An image without a place lies where its path says if that is the path of a tile of a web map, zoom/x/y.png. Else
+    it lies anywhere, in metres.
+    """
+    import rasterio
+    from rasterio.transform import from_origin
+
+    coded = holds.is_cover or holds.encoding is not None
+    has_place = bool(dataset.crs) or not dataset.transform.is_identity
+    if has_place or not (coded or path.suffix.lower() == ".png"):
+        crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
+        return _Place(crs, dataset.transform, overruled(dataset.crs, config.crs))
+    tile = re.search(r"(?:^|/)(\d{1,2})/(\d{1,8})/(\d{1,8})(?:@2x)?\.\w+$", path.as_posix())
+    if coded and tile is not None and dataset.height == dataset.width and config.crs is None:
+        zoom, col, row = (int(number) for number in tile.groups())
+        if zoom <= _DEEPEST_ZOOM and max(col, row) < 2**zoom:
+            side_m = 2 * _HALF_WORLD_M / 2**zoom
+            west, north = -_HALF_WORLD_M + col * side_m, _HALF_WORLD_M - row * side_m
+            step_m = side_m / dataset.width
+            said = f"placed by its path: tile x {col}, y {row} (from the north) of zoom {zoom} of the web's map"
+            return _Place(rasterio.CRS.from_epsg(3857), from_origin(west, north, step_m, step_m), (said,))
+    if config.resolution_m is None or not (coded or config.height_scale):
+        scale = "" if coded else " and terrain.height_scale (metres per grey level)"
+        raise TerrainError(
+            f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel){scale}"
+        )
+    anywhere = from_origin(0.0, 0.0, config.resolution_m, config.resolution_m)
+    return _Place(rasterio.CRS.from_wkt(_METRES), anywhere)
+
+
+# --- heights ------------------------------------------------------------------------------------------------
+
+
+def _heights(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    """Heights on a square metric grid, a band of rows at a time. Bilinear; averaged where cells grow by half or
+    more."""
+    if dataset.count >= 3:
+        raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
+    if np.dtype(dataset.dtypes[0]).kind not in "iuf":
+        raise TerrainError(f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
+    size = dataset.height, dataset.width
+    grid, target, notes = plan_grid(place.transform, *size, place.crs, config.resolution_m, f"terrain {path}")
+    factor, offset, told = _scale_of(dataset, place.crs, config)
+    if dataset.count == 2:
+        told.append("the file has two bands; heights are taken from the first")
+    voids, found, looks = looked_at(_sampled(dataset), config, factor, offset)
+    level = _level_on(dataset, found, place, grid, target)
+    elevation_m = np.empty((grid.rows, grid.cols), np.float32)
+    heights = _whole_without(dataset, voids, path) if voids and target is not None else None
+    for row0, row1 in bands(grid.rows, READ_ROWS):
+        band = elevation_m[row0:row1]
+        if target is None:
+            _read_straight(dataset, row0, row1, band, voids)
+        else:
+            _read_warped(dataset, heights, place, grid, target, row0, band)
+        if (factor, offset) != (1.0, 0.0):
+            band *= np.float32(factor)
+            band += np.float32(offset)
+        progress("reading heights", row1 / grid.rows)
+    classes = np.zeros(elevation_m.shape, np.uint8)
+    return Source(grid, elevation_m, classes, level=level, notes=(str(path), *place.notes, *notes, *told, *looks))
+
+
+def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:
+    """(factor, offset) that make metres of what is stored, and what people should know of them."""
+    notes = []
+    factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    if (factor, offset) != (1.0, 0.0):
+        notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
+    text = str(dataset.units[0] or "").lower()
+    # [m], US_survey_foot and ft (US) without their brackets and signs.
+    unit = " ".join("".join(sign if sign.isalnum() else " " for sign in text).split())
+    unit_m = _UNITS_M.get(unit, 1.0)
+    if unit_m != 1.0:
+        factor, offset = factor * unit_m, offset * unit_m
+        notes.append(f"heights are in {unit}, put into metres")
+    elif unit not in _UNITS_M and config.height_scale is None:
+        notes.append(f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale")
+    elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
+        name, metres = crs.linear_units_factor
+        notes.append(
+            f"distances are in {name}, and heights, of which the file says nothing, are taken for metres; if"
+            f" they are not, terrain.height_scale = {metres:.6g}"
+        )
+    scale = 1.0 if config.height_scale is None else config.height_scale
+    return factor * scale, offset * scale, notes
+
+
+def _sampled(dataset: Any) -> Floats:
+    """The first band, or of a large one so many of its cells as fit, float32, as stored; NaN where no height is
+    declared."""
+    every = math.ceil(math.sqrt(max(dataset.height * dataset.width / MOST_SAMPLED, 1.0)))
+    sample: Floats = thinned(dataset.read, dataset, 1, every).astype(np.float32)
+    known = thinned(dataset.read_masks, dataset, 1, every) > 0
+    sample[~(known & np.isfinite(sample))] = np.nan
+    return sample
+
+
+def _whole_without(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
+    """The whole first band, float32, as stored, NaN where there is no height. GDAL warps one value of no height
+    only; of a second one it would make slopes."""
+    if dataset.height * dataset.width > MAX_CELLS:
+        raise TerrainError(
+            f"terrain {path} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too"
+            " large to mend here: gdal_calc or gdal_edit.py -a_nodata does it"
+        )
+    heights: Floats = dataset.read(1).astype(np.float32)
+    heights[dataset.read_masks(1) == 0] = np.nan
+    return without(heights, voids)
+
+
+def _level_on(dataset: Any, mask: Bools, place: _Place, grid: GridSpec, target: Any) -> Bools:
+    """A mask of a dataset's ground, of any number of cells, on the terrain's grid: the nearest cell counts."""
+    from rasterio.transform import Affine
+
+    rows, cols = mask.shape
+    if target is None:
+        return np.asarray(mask[nearest(mask, grid)], np.bool_)
+    placed = np.zeros((grid.rows, grid.cols), np.uint8)
+    stretched = place.transform @ Affine.scale(dataset.width / cols, dataset.height / rows)
+    source = mask.astype(np.uint8)
+    return warped(source, placed, grid, place.crs, target, "nearest", src_transform=stretched) > 0
+
+
+def _read_straight(dataset: Any, row0: int, row1: int, band: Floats, voids: Sequence[float]) -> None:
+    from rasterio.enums import MaskFlags
+    from rasterio.windows import Window
+
+    window = Window(0, row0, dataset.width, row1 - row0)
+    raw = dataset.read(1, window=window)
+    np.copyto(band, raw, casting="unsafe")
+    flags = dataset.mask_flag_enums[0]
+    if dataset.nodata is not None and MaskFlags.nodata in flags:
+        if not math.isnan(dataset.nodata):
+            band[raw == np.asarray(dataset.nodata).astype(raw.dtype)] = np.nan
+    elif MaskFlags.all_valid not in flags:
+        band[dataset.read_masks(1, window=window) == 0] = np.nan
+    if voids:
+        band[:] = without(band, voids)
+
+
+def _read_warped(
+    dataset: Any, heights: Floats | None, place: _Place, grid: GridSpec, target: Any, row0: int, band: Floats
+) -> None:
+    """heights  what to warp instead of the dataset's own, NaN where there is none"""
+    import rasterio
+
+    nodata = dataset.nodata
+    if heights is not None or (nodata is None and np.dtype(dataset.dtypes[0]).kind == "f"):
+        nodata = math.nan
+    source = rasterio.band(dataset, 1) if heights is None else heights
+    how = "average" if grows(dataset, place.transform, place.crs, grid, target) else "bilinear"
+    given = {"src_transform": None if heights is None else place.transform, "src_nodata": nodata}
+    warped(source, band, grid, place.crs, target, how, row0, **given, dst_nodata=math.nan)

@@ -1,1 +1,0 @@
-"""Rasters: opened, understood, and put on one square metric grid."""

@@ -1,0 +1,308 @@
+"""Heights as text: points x, y, z of a regular grid (.xyz, .csv), or rows of heights (.csv).
+
+GDAL's driver for such files is not used: it fills missing points with 0 where 0 is a height, too, and refuses
+points that do not come row by row.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Floats
+from shared_map.importers.plain_grids import PlainGrid, check_cells
+from swarm.config.input_files import MAX_LINE_BYTES, FileKind, check_bytes, size
+from swarm.errors import TerrainError
+from swarm.grid import MAX_CELLS
+
+_KIND = FileKind.POINTS
+_CHUNK_BYTES = 4 << 20
+_MOST_KEPT = 1 << 22
+"""Of more points than these the file is read twice, instead of being held."""
+_MOST_STEPS = 1 << 20
+"""More places along one axis are no grid."""
+_SAME = 1e-6
+"""Coordinates nearer to each other than this share of the whole extent are one."""
+_FURTHEST = 1e9
+_OFF_STEP = 0.05
+_LEAST_FILLED = 0.1
+_X = ("x", "lon", "long", "lng", "longitude", "easting", "east", "e")
+_Y = ("y", "lat", "latitude", "northing", "north", "n")
+_Z = ("z", "h", "height", "elevation", "elev", "alt", "altitude", "dem", "value")
+_DEGREES = ("lon", "long", "lng", "longitude", "lat", "latitude")
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a text is laid out.
+
+    delimiter      between numbers; None is any blank
+    decimal_comma  whether 1,5 is one number
+    trailing       whether each line ends with a delimiter
+    columns        of x, y and z; None for rows of heights
+    degrees        whether x and y are longitude and latitude
+    has_header     whether the first line names columns
+    """
+
+    delimiter: str | None
+    decimal_comma: bool
+    trailing: bool
+    columns: tuple[int, int, int] | None
+    degrees: bool
+    has_header: bool
+
+
+def read_text_grid(path: Path) -> PlainGrid:
+    """Heights of a text.
+
+    Parameters
+    ----------
+    path : Path
+        Numbers between commas, semicolons, tabs or blanks; a header may name x, y and z (or lon, lat ...). Points
+        may come in any order, and coordinates are those of the middles of cells. Without a header, three columns
+        (in .xyz: the first three) are x, y, z; any other number of columns are rows of heights, from the north.
+
+    Returns
+    -------
+    PlainGrid
+        Missing points and empty fields are NaN.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, a line holds what is no number, or the points lie on no regular grid.
+    """
+    check_bytes(path, _KIND)
+    layout = _layout(path)
+    return _rows_of_heights(path, layout) if layout.columns is None else _points(path, layout)
+
+
+# --- text to numbers ----------------------------------------------------------------------------------------
+
+
+def _layout(path: Path) -> _Layout:
+    lines = (line for _, text in _chunks(path) for line in text.splitlines() if line.strip() and line[0] != "#")
+    first = next(lines, None)
+    if first is None:
+        raise TerrainError(f"terrain {path} holds no numbers")
+    has_header = any(char.isalpha() for char in first.lower().replace("nan", "").replace("e", ""))
+    data = next(lines, "") if has_header else first
+    blanks = data.split()
+    decimal_comma = len(blanks) > 1 and ";" not in data and all(re.fullmatch(r"[-+]?\d+(,\d+)?", b) for b in blanks)
+    decimal_comma &= "," in data
+    delimiter = next((each for each in ";\t," if each in data), None)
+    if decimal_comma:
+        delimiter = None
+    elif delimiter == ";":
+        decimal_comma = "," in data
+    trailing = delimiter is not None and data.rstrip(" \r").endswith(delimiter)
+    header = [word.strip(" \"'\r").lower() for word in (first.strip("#").split(delimiter))]
+    if has_header:
+        found = [next((header.index(name) for name in names if name in header), None) for names in (_X, _Y, _Z)]
+        x, y, z = found
+        if x is None or y is None or z is None:
+            raise TerrainError(
+                f"terrain {path}, line 1: {first[:60]!r} are no numbers, and name no x, y, z or lon, lat, z"
+            )
+        degrees = header[x] in _DEGREES and header[y] in _DEGREES
+        return _Layout(delimiter, decimal_comma, trailing, (x, y, z), degrees, True)
+    count = len(data.split(delimiter)) - trailing
+    is_points = count == 3 or (path.suffix.lower() == ".xyz" and count > 3)
+    if path.suffix.lower() == ".xyz" and count < 3:
+        raise TerrainError(f"terrain {path}: its first line has {count} numbers; expected x, y and z")
+    return _Layout(delimiter, decimal_comma, trailing, (0, 1, 2) if is_points else None, False, False)
+
+
+def _chunks(path: Path) -> Iterator[tuple[int, str]]:
+    """(number of the first line, whole lines) of a text, piece by piece."""
+    number, rest = 1, b""
+    try:
+        with path.open("rb") as file:
+            while piece := file.read(_CHUNK_BYTES):
+                lines, newline, rest = (rest + piece).replace(b"\r\n", b"\n").rpartition(b"\n")
+                if len(rest) > MAX_LINE_BYTES:
+                    raise _KIND.refusal(path, f"a line is longer than {size(MAX_LINE_BYTES)}")
+                if newline:
+                    yield number, _text(lines, path)
+                    number += lines.count(b"\n") + 1
+            if rest:
+                yield number, _text(rest, path)
+    except OSError as error:
+        raise _KIND.unreadable(path, error) from error
+
+
+def _text(data: bytes, path: Path) -> str:
+    try:
+        return data.removeprefix(b"\xef\xbb\xbf").replace(b"\r", b"\n").decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise TerrainError(f"terrain {path} is not text: {error.reason}") from error
+
+
+def _numbers(path: Path, layout: _Layout) -> Iterator[Points]:
+    """float64 (lines, columns) of the text, piece by piece."""
+
+    def numbers_of(lines: list[str]) -> Points:
+        return np.loadtxt(
+            lines, np.float64, delimiter=layout.delimiter, usecols=layout.columns, ndmin=2, comments=None
+        )
+
+    for first, text in _chunks(path):
+        lines = {
+            number: line
+            for number, line in enumerate(_plain(text, layout).split("\n"), first)
+            if line and not line.startswith("#") and not (layout.has_header and number == 1)
+        }
+        if not lines:
+            continue
+        try:
+            yield numbers_of(list(lines.values()))
+        except (ValueError, IndexError, OverflowError) as error:
+            expected = "heights" if layout.columns is None else "x, y and z"
+            raise _bad_line(path, lines, numbers_of, expected) from error
+
+
+def _bad_line(
+    path: Path, lines: dict[int, str], numbers_of: Callable[[list[str]], Points], expected: str
+) -> TerrainError:
+    """The error that names the first line that is not as the others, in numpy's words."""
+    wanted: int | None = None
+    for number, line in lines.items():
+        try:
+            found = numbers_of([line]).shape[1]
+        except (ValueError, IndexError, OverflowError) as error:
+            why = re.sub(r"could not convert string (.*) to float64", r"\1 is no number", str(error))
+            why = re.split(r" at row|: row", why)[0][:120]
+            return TerrainError(f"terrain {path}, line {number}: {why}; expected {expected}")
+        if wanted is not None and found != wanted:
+            return TerrainError(f"terrain {path} is ragged: line {number} has {found} heights, others {wanted}")
+        wanted = found
+    return TerrainError(f"terrain {path} holds what are no numbers")
+
+
+def _plain(text: str, layout: _Layout) -> str:
+    """The text with points in its numbers and "nan" in its empty fields."""
+    text = "\n".join(map(str.strip, text.split("\n"))) if layout.delimiter != "\t" else text
+    if layout.decimal_comma:
+        text = text.replace(",", ".")
+    mark = layout.delimiter
+    if mark is None:
+        return text
+    if layout.trailing:
+        text = f"{text}\n".replace(f"{mark}\n", "\n")
+    while f"{mark}{mark}" in text:
+        text = text.replace(f"{mark}{mark}", f"{mark}nan{mark}")
+    return re.sub(f"(?m)^{mark}", f"nan{mark}", re.sub(f"(?m){mark}$", f"{mark}nan", text))
+
+
+def _heights(numbers: Points) -> Floats:
+    """What is too large for float32 becomes infinite, which is a void."""
+    with np.errstate(over="ignore"):
+        return numbers.astype(np.float32)
+
+
+# --- rows of heights ----------------------------------------------------------------------------------------
+
+
+def _rows_of_heights(path: Path, layout: _Layout) -> PlainGrid:
+    parts: list[Floats] = []
+    cells = 0
+    for part in _numbers(path, layout):
+        if parts and part.shape[1] != parts[0].shape[1]:
+            raise TerrainError(
+                f"terrain {path} is ragged: it has lines of {parts[0].shape[1]} and of {part.shape[1]} heights"
+            )
+        cells += part.size
+        if cells > MAX_CELLS:
+            raise TerrainError(f"terrain {path} has more than {MAX_CELLS} heights; crop it")
+        parts.append(_heights(part))
+    heights = np.concatenate(parts)
+    note = f"{heights.shape[0]} lines of {heights.shape[1]} heights, the first taken for the north"
+    return PlainGrid(heights, None, (0.0, 0.0), notes=(note,))
+
+
+# --- points -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Middles of cells along x or y: the first, the last, how far apart, how many."""
+
+    first: float
+    last: float
+    step: float
+    count: int
+
+
+def _points(path: Path, layout: _Layout) -> PlainGrid:
+    xs = ys = np.zeros(0)
+    kept: list[Points] | None = []
+    total = 0
+    for part in _numbers(path, layout):
+        xs, ys = (np.unique(np.concatenate((known, part[:, n]))) for n, known in ((0, xs), (1, ys)))
+        if not ((np.abs(xs) <= _FURTHEST).all() and (np.abs(ys) <= _FURTHEST).all()):
+            raise TerrainError(f"terrain {path}: a point has no x or no y, or one beyond {_FURTHEST:g}")
+        total += len(part)
+        if max(len(xs), len(ys)) > _MOST_STEPS:
+            raise _irregular(path, f"x and y have more than {_MOST_STEPS} different values")
+        if kept is not None:
+            kept.append(part)
+        if total > _MOST_KEPT:
+            kept = None
+    across, down = _axis(xs, "x", path), _axis(ys, "y", path)
+    cells = down.count * across.count
+    if total < _LEAST_FILLED * cells:
+        raise _irregular(
+            path, f"{total} points are {total / cells:.1%} of a grid of {across.step:g} x {down.step:g}"
+        )
+    check_cells(down.count, across.count, path)
+    heights = np.full(cells, np.nan, np.float32)
+    for part in _numbers(path, layout) if kept is None else kept:
+        col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
+        row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
+        at, z = row * across.count + col, _heights(part[:, 2])
+        before = heights[at]
+        heights[at] = z
+        other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))
+        if other.any():
+            x, y, height_m = part[int(other.argmax())]
+            raise TerrainError(f"terrain {path}: two heights at x {x:g}, y {y:g}, of which one is {height_m:g}")
+    missing = int(np.isnan(heights).sum())
+    notes = [f"{total} points x, y, z, {across.step:g} x {down.step:g} apart, the middles of cells"]
+    if missing:
+        notes.append(f"{missing} points of the grid ({missing / cells:.1%}) are missing or have no height: voids")
+    return PlainGrid(
+        heights.reshape(down.count, across.count),
+        None,
+        (across.step, down.step),
+        across.first - across.step / 2,
+        down.last + down.step / 2,
+        degrees=layout.degrees,
+        notes=tuple(notes),
+    )
+
+
+def _axis(values: NDArray[np.float64], name: str, path: Path) -> _Axis:
+    """The even steps that the different values along an axis lie on. Raises TerrainError if they lie on none."""
+    span = float(values[-1] - values[0]) if len(values) else 0.0
+    apart = values[np.concatenate(([True], np.diff(values) > _SAME * span))]
+    gaps = np.diff(apart)
+    if span <= 0 or not len(gaps):
+        raise TerrainError(f"terrain {path}: all points have the same {name}; a grid has at least two of each")
+    # Printed coordinates are rounded: the step is the whole extent over the number of steps, not the smallest gap.
+    step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+    at = np.concatenate(([0], np.cumsum(np.rint(gaps / step))))
+    step = float(apart[-1] - apart[0]) / float(at[-1])
+    if np.abs(apart - apart[0] - at * step).max() > _OFF_STEP * step:
+        raise _irregular(path, f"{name} has gaps from {gaps.min():g} to {gaps.max():g}, of no common step")
+    return _Axis(float(apart[0]), float(apart[-1]), step, int(at[-1]) + 1)
+
+
+def _irregular(path: Path, why: str) -> TerrainError:
+    return TerrainError(f"terrain {path}: its points lie on no regular grid: {why}; gdal_grid makes one of them")

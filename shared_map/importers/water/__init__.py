@@ -1,1 +1,0 @@
-"""Level ground, water and voids, found before any resampling."""

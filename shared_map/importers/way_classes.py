@@ -1,0 +1,111 @@
+"""What OpenStreetMap's tags say of roads and water: classes with widths and factors, bridges, tunnels."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from swarm.config.ground import WayConfig
+
+Kind = Literal["road", "water"]
+MOST_WIDTH_M = 10_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A class of roads or water.
+
+    width_m  of its lines, in metres; areas have their own
+    factor   of a road relative to the road pace, of water to the ground; None is lethal
+    """
+
+    width_m: float
+    factor: float | None
+
+
+def _built_in() -> dict[Kind, dict[str, Way]]:
+    tables = tomllib.loads((Path(__file__).parent / "tables" / "ways.toml").read_text(encoding="utf-8"))
+    kinds: tuple[Kind, ...] = ("road", "water")
+    return {
+        kind: {
+            name: Way(width_m, None if factor == "lethal" else factor)
+            for name, (width_m, factor) in tables[kind].items()
+        }
+        for kind in kinds
+    }
+
+
+BUILT_IN: Mapping[Kind, Mapping[str, Way]] = _built_in()
+COLUMNS: Mapping[Kind, tuple[str, ...]] = {
+    "road": ("highway", "fclass"),
+    "water": ("waterway", "natural", "landuse", "fclass"),
+}
+"""Where the class stands: OSM's own keys, and the one of extracts as Shapefiles."""
+TAGS = ("bridge", "tunnel", "width", "est_width", "area")
+PACKED = ("other_tags", "tags")
+"""Columns that hold further tags: as GDAL writes them, or JSON."""
+
+_VARIANT = re.compile(r"(_link|_grade[1-5])$")
+_NO = ("no", "0", "f", "false")
+_NOT_A_BRIDGE = (*_NO, "aqueduct")
+_PAIR = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
+_WIDTH = re.compile(r"\s*(\d{1,5}(?:[.,]\d{1,9})?)\s*(m|metres|meters)?\s*")
+
+
+def unpacked(row: Mapping[str, str]) -> dict[str, str]:
+    """Tags of a feature: its columns, and what is packed into one. A column of its own counts more."""
+    tags: dict[str, str] = {}
+    packed = row.get("tags")
+    if packed is not None and packed.startswith("{"):
+        try:
+            known = json.loads(packed)
+        except (ValueError, RecursionError):
+            known = {}
+        tags |= {str(key): str(value) for key, value in known.items() if isinstance(value, str | int | float)}
+    tags |= dict(_PAIR.findall(row.get("other_tags", "")))
+    return tags | {key: value for key, value in row.items() if key not in PACKED}
+
+
+def class_of(kind: Kind, tags: Mapping[str, str], attribute: str | None) -> str | None:
+    """The class of a feature; None if it says none."""
+    for column in (attribute,) if attribute is not None else COLUMNS[kind]:
+        found = tags.get(column)
+        if found is not None and not (column in ("natural", "landuse") and found not in BUILT_IN["water"]):
+            return found
+    return None
+
+
+def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | None:
+    """What a class is worth, by the user's table, then by the built-in one of a kind; None if it is left out."""
+    known = None if kind is None else BUILT_IN[kind].get(_VARIANT.sub("", name))
+    given = own.get(name)
+    if given is None:
+        return known
+    if given.factor == "ignored":
+        return None
+    width_m = given.width_m if given.width_m is not None else known.width_m if known is not None else 0.0
+    return Way(width_m, None if given.factor == "lethal" else given.factor)
+
+
+def width_of(tags: Mapping[str, str]) -> float | None:
+    """The width in metres that a feature has of its own."""
+    for key in ("width", "est_width"):
+        match = _WIDTH.fullmatch(tags.get(key, ""))
+        if match is not None:
+            width_m = float(match[1].replace(",", "."))
+            return width_m if 0 < width_m <= MOST_WIDTH_M else None
+    return None
+
+
+def is_bridge(tags: Mapping[str, str]) -> bool:
+    return tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
+
+
+def is_tunnel(tags: Mapping[str, str]) -> bool:
+    """Whether it runs below the ground: a map of one level has no place for it."""
+    return tags.get("tunnel", "no").lower() not in _NO

@@ -1,0 +1,279 @@
+"""Zones that a file draws: which of its features count, what they are worth, and the cells that they cover."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared_map.arrays import Bools, Floats
+from shared_map.importers.burn import Drawing, burn, burn_mask
+from shared_map.importers.raster_files import is_raster
+from shared_map.importers.vector_files import (
+    Features,
+    Layer,
+    columns_of,
+    is_vector,
+    number,
+    open_layer,
+    read_features,
+)
+from shared_map.importers.vector_shapes import Placing, Shapes
+from shared_map.importers.way_classes import (
+    COLUMNS,
+    PACKED,
+    TAGS,
+    Kind,
+    Way,
+    class_of,
+    is_bridge,
+    is_tunnel,
+    unpacked,
+    way_of,
+    width_of,
+)
+from swarm.config.ground import ZoneConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec, Window
+
+_WIDEST_M = 1000.0
+"""Lines that run so far outside the terrain are of no use to it."""
+_NAMED = 5
+_LEAST, _MOST = 1e-6, 1e6
+"""Factors and paces that a file may say."""
+
+
+@dataclass
+class FileFacts:
+    """What became of a file's features, for people.
+
+    features  in the layer; used on the terrain; outside of it
+    skipped   why some were left out -> how many
+    named     such features, by reason, the first ones
+    bridges   how many ways are bridges
+    """
+
+    file: str
+    layer: str
+    crs: str
+    features: int = 0
+    used: int = 0
+    outside: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    named: dict[str, list[str]] = field(default_factory=dict)
+    mended: list[str] = field(default_factory=list)
+    bridges: int = 0
+    classes: Counter[str] = field(default_factory=Counter)
+
+    def skip(self, why: str, id: str | None = None) -> None:
+        self.skipped[why] += 1
+        if id is not None and len(names := self.named.setdefault(why, [])) < _NAMED:
+            names.append(id)
+
+
+@dataclass(frozen=True, eq=False)
+class Burnt:
+    """Cells of a zone's file. Each part has a window of its own.
+
+    values   float32; the factor or pace of each cell, of roads relative to the road pace; NaN where there is none
+    lethal   where nothing drives; of water, unless there is a bridge
+    bridges  of roads: the cells of bridges
+    """
+
+    facts: FileFacts
+    values: tuple[Window, Floats]
+    lethal: tuple[Window, Bools]
+    bridges: tuple[Window, Bools]
+
+
+def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
+    """The cells of a zone that a file draws. Raises TerrainError with one sentence, which `where` begins."""
+    assert zone.file is not None
+    path = Path(zone.file)
+    what = f"{where} {path}"
+    if not path.exists():
+        raise TerrainError(f"{what} does not exist")
+    if not is_vector(path) and is_raster(path):
+        return _friction(zone, path, grid, where)
+    if any(importlib.util.find_spec(name) is None for name in ("pyogrio", "shapely")):
+        raise TerrainError(
+            f"{what} cannot be read: pyogrio and shapely are missing; pip install 'terrain-swarm[vectors]'"
+        )
+    layer = open_layer(path, zone.layer, what)
+    facts = FileFacts(path.name, layer.name, zone.crs or layer.crs or "none", layer.features)
+    worth = _Worth(zone, layer, facts)
+    values, lethal, bridges = Drawing(False), Drawing(True), Drawing(False)
+    if layer.bounds is not None:
+        placing = Placing(grid, layer, zone.crs, zone.width_m or _WIDEST_M / 2)
+        facts.crs = placing.crs
+        read, used = 0, set()
+        for shift, box in placing.boxes(layer.bounds):
+            features = read_features(layer, box, worth.columns)
+            read += len(features.ids)
+            placed = placing.place(features, box, shift)
+            for shape, id, way, bridge in worth.of(features, placed):
+                used.add(id)
+                drawing, value = (lethal, 1.0) if way.factor is None else (values, way.factor)
+                drawing.add(shape, value, way.width_m / grid.resolution_m)
+                if bridge:
+                    bridges.add(shape, 1.0, way.width_m / grid.resolution_m)
+        facts.used, facts.outside = len(used), max(layer.features - read, 0)
+        worth.check_used()
+    burnt = burn(values, grid, what, least_wins=zone.kind == "road")
+    return Burnt(facts, burnt, burn_mask(lethal, grid, what), burn_mask(bridges, grid, what))
+
+
+class _Worth:
+    """What each feature of a zone is worth.
+
+    Raises TerrainError if the zone does not say how to tell.
+    """
+
+    def __init__(self, zone: ZoneConfig, layer: Layer, facts: FileFacts) -> None:
+        self._zone, self._layer, self._facts = zone, layer, facts
+        self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
+        self._by_class = bool(zone.classes) or (self._kind is not None and not self._is_plain())
+        self.columns = [*TAGS, *PACKED]
+        listed, name = self._listed(), zone.attribute
+        if name is not None:
+            if not {name, *PACKED} & set(layer.columns):
+                raise TerrainError(f"{layer.what} has no column {name!r}; it has {listed}")
+            self.columns.append(name)
+        elif self._kind is not None:
+            self.columns += COLUMNS[self._kind]
+        elif zone.classes:
+            raise TerrainError(f"{layer.what}: classes need an attribute; the columns are {listed}")
+        elif zone.kind in ("pace", "factor") and zone.value is None:
+            key = "factor" if zone.kind == "factor" else "pace_s_per_m"
+            raise TerrainError(
+                f"{layer.what}: set {key}, or attribute to the column that holds it; the columns are {listed}"
+            )
+        if zone.classes and zone.kind == "pace":
+            raise TerrainError(f"{layer.what}: classes have factors, which kind pace does not take")
+
+    def _is_plain(self) -> bool:
+        """True if each line is a road or a river of one width, as nothing tells of classes."""
+        zone, assumed = self._zone, COLUMNS[self._kind or "road"]
+        if zone.attribute is not None or {*assumed, *PACKED} & set(self._layer.columns):
+            return False
+        if zone.width_m is None and self._layer.features:
+            raise TerrainError(
+                f"{self._layer.what} has no column {' or '.join(assumed)} (it has {self._listed()}); set attribute"
+                " to the column with the classes, or width_m, which takes each feature for one of this width"
+            )
+        return True
+
+    def _listed(self) -> str:
+        columns = self._layer.columns
+        return (", ".join(columns[:20]) + (" ..." if len(columns) > 20 else "")) or "none"
+
+    def of(self, features: Features, placed: Shapes) -> Iterator[tuple[Any, str, Way, bool]]:
+        """Shapes of those features that count: (shape, id, width and factor, whether it is a bridge)."""
+        facts, zone = self._facts, self._zone
+        facts.mended += placed.mended
+        if placed.empty:
+            facts.skipped["without a shape"] += placed.empty
+        for id, why in placed.unusable.items():
+            if zone.kind in ("forbidden", "water"):
+                of = f"{self._layer.what}: feature {id} of a {zone.kind} zone"
+                raise TerrainError(f"{of} cannot be used: {why}; mend or remove it")
+            facts.skip(why, id)
+        rows = columns_of(features, self.columns)
+        ways = {}
+        for n in sorted(set(placed.of.tolist())):
+            tags = unpacked(rows[n])
+            way = self._way(tags, features.ids[n])
+            if way is not None:
+                bridge = self._kind == "road" and is_bridge(tags)
+                facts.bridges += bridge
+                ways[n] = way, bridge
+        for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
+            if n in ways:
+                yield shape, features.ids[n], *ways[n]
+
+    def _way(self, tags: dict[str, str], id: str) -> Way | None:
+        """Width and factor of a feature; None if it is left out, which the facts then tell."""
+        zone, kind = self._zone, self._kind
+        name = self._class_of(tags) if self._by_class else ""
+        if name is None:
+            self._facts.skip("without a class")
+            return None
+        if name:
+            way = way_of(kind, name, zone.classes)
+            if way is None:
+                self._facts.skip(f"of class {name[:40]}", id)
+        elif zone.kind in ("pace", "factor") and zone.attribute is not None:
+            way = self._stated(tags, id)
+        else:
+            way = Way(0.0, zone.value or 1.0)
+        if way is None:
+            return None
+        if kind is not None and is_tunnel(tags):
+            self._facts.skip("below the ground", id)
+            return None
+        if name:
+            self._facts.classes[name] += 1
+        closes = zone.kind == "forbidden" or (kind == "water" and not name)
+        return Way(width_of(tags) or zone.width_m or way.width_m, None if closes else way.factor)
+
+    def _class_of(self, tags: dict[str, str]) -> str | None:
+        attribute = self._zone.attribute
+        return tags.get(attribute or "") if self._kind is None else class_of(self._kind, tags, attribute)
+
+    def _stated(self, tags: dict[str, str], id: str) -> Way | None:
+        """The value that a feature's own attribute states."""
+        name, kind = self._zone.attribute or "", self._zone.kind
+        value = number(tags.get(name))
+        if value is None or not _LEAST <= value <= _MOST:
+            shown = tags.get(name, "nothing")[:40]
+            self._facts.skip(f"whose {name} is no {kind} of {_LEAST:g} to {_MOST:g}", f"{id} ({shown})")
+            return None
+        return Way(0.0, value)
+
+    def check_used(self) -> None:
+        """Raises TerrainError if features are on the terrain, and none counts for what they are."""
+        facts = self._facts
+        if facts.used or set(facts.skipped) <= {"without a shape"}:
+            return
+        reasons = ", ".join(f"{count} {why}" for why, count in facts.skipped.most_common(4))
+        raise TerrainError(
+            f"{self._layer.what}: none of its features on the terrain counts ({reasons}); set attribute and"
+            f" classes, the columns are {self._listed()}"
+        )
+
+
+# --- rasters of pace or factor ------------------------------------------------------------------------------
+
+
+def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt:
+    """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
+    from shared_map.importers.friction import values_on
+
+    what = f"{where} {path}"
+    if zone.kind not in ("pace", "factor"):
+        raise TerrainError(f"{what} is a raster, which goes with kind pace or factor, found {zone.kind!r}")
+    given = [key for key in ("layer", "attribute", "width_m", "classes", "value") if getattr(zone, key)]
+    if given:
+        raise TerrainError(f"{what} is a raster, which has no {given[0]}")
+    values, crs = values_on(path, grid, zone.crs, where)
+    lethal = values == np.inf
+    values[lethal] = np.nan
+    known = values[~np.isnan(values)]
+    if known.size and not _LEAST <= known.min() <= known.max() <= _MOST:
+        worst = known.min() if known.min() < _LEAST else known.max()
+        raise TerrainError(
+            f"{what} holds {worst:g}, expected a {zone.kind} of {_LEAST:g} to {_MOST:g}, or inf where nothing"
+            " drives; declare what stands for no value as nodata"
+        )
+    facts = FileFacts(path.name, "", crs, features=int(known.size + lethal.sum()))
+    facts.used = facts.features
+    if known.size + int(lethal.sum()) == 0:
+        raise TerrainError(f"{what} has no value on the terrain")
+    window, empty = grid.window, Window(0, 0, 0, 0)
+    nothing: Any = np.zeros((0, 0), np.bool_)
+    return Burnt(facts, (window, values), (window, lethal), (empty, nothing))

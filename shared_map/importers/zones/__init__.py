@@ -1,1 +1,0 @@
-"""Zones from vector files and from rasters of pace."""

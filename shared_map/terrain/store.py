@@ -1,0 +1,243 @@
+"""A terrain prepared in a folder: built once by the launcher, read by every process of a machine in a blink."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools, Floats, give_back_memory, open_array, save_array
+from shared_map.terrain.cache import fetch_kept, keep, kept_key
+from shared_map.terrain.row_bands import Progress, no_progress
+from shared_map.terrain.start_cells import homes_of
+from shared_map.terrain.step_climb import ENTRIES, Climb
+from shared_map.terrain.terrain import FORMAT, Terrain, build_terrain, build_truth
+from shared_map.terrain.wind import Wind
+from shared_map.terrain.zones import files_of_zone
+from swarm.config.input_files import FileKind, read_text
+from swarm.config.plugin_names import cost_layers_of
+from swarm.config.scenario import Scenario
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+from swarm.plugins.find import source_of
+from swarm.runtime.role import RoleSetup
+
+_META = "terrain.json"
+
+
+def scenario_key(scenario: Scenario) -> str:
+    """Fingerprint of all that a terrain is built from: a prepared one with another key is another terrain."""
+    parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
+    named = scenario.terrain
+    names = (named.source, named.photo, named.labels, named.cover, named.cover_codes)
+    files = [Path(name) for name in names if name]
+    files += [path for zone in (*scenario.cost.zones, *named.hidden.zones) for path in files_of_zone(zone)]
+    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in files if path.is_file()]
+    layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
+    payload = msgspec.json.encode([parts, stamps, layers], order="sorted")
+    return hashlib.blake2b(payload, digest_size=8).hexdigest()
+
+
+def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") -> None:
+    """Write a terrain and its truth where `load_prepared` finds them. The description is written last."""
+    arrays: dict[str, NDArray[Any]] = {
+        "elevation": terrain.elevation_m,
+        "photo": terrain.photo,
+        "classes": terrain.classes,
+        "truth": truth,
+        "homes": homes_of(terrain.pace_s_per_m, truth),
+    }
+    save_ground(folder / _META, terrain, arrays, {"key": key, "grid": msgspec.to_builtins(terrain.grid)})
+
+
+def save_ground(
+    meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[Any]], facts: Mapping[str, Any]
+) -> None:
+    """Leave the ground of a terrain, and other arrays, in the folder of a description, which is written last.
+    Raises TerrainError if that is not possible.
+
+    facts  what the description says beside what `read_ground` needs
+    """
+    every = {**arrays, "pace": terrain.pace_s_per_m}
+    if terrain.ground_s_per_m is not terrain.pace_s_per_m:
+        every["ground"] = terrain.ground_s_per_m
+    if terrain.climb is not None:
+        every["climb"] = terrain.climb.factors
+    meta = {
+        "format": FORMAT,
+        **facts,
+        "digest": terrain.digest,
+        "vehicle_radius_m": terrain.vehicle_radius_m,
+        "steepest": None if terrain.climb is None else terrain.climb.steepest,
+        "wind": None if terrain.climb is None or terrain.climb.wind is None else asdict(terrain.climb.wind),
+        "arrays": sorted(every),
+        "notes": list(terrain.notes),
+    }
+    folder = meta_file.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        meta_file.unlink(missing_ok=True)
+        for name, array in every.items():
+            save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
+        partial = meta_file.with_name(f"{meta_file.name}.part")
+        partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
+        partial.rename(meta_file)
+    except OSError as error:
+        raise TerrainError(
+            f"cannot write the prepared {meta_file.stem} to {folder}: {error.strerror or error}"
+        ) from error
+
+
+def read_ground(meta_file: Path, meta: Mapping[str, Any], grid: GridSpec, heights_m: Floats) -> dict[str, Any]:
+    """What `save_ground` left of the ground, as fields of a `Terrain`; arrays are mapped read-only.
+
+    heights_m  by which steps climb
+
+    Raises TerrainError if it is damaged.
+    """
+    folder = meta_file.parent
+    try:
+        digest, radius_m, notes = (
+            str(meta["digest"]),
+            float(meta["vehicle_radius_m"]),
+            tuple(map(str, meta["notes"])),
+        )
+        has_ground, steepest = "ground" in meta["arrays"], meta["steepest"]
+        wind = None if meta["wind"] is None else Wind(float(meta["wind"]["south"]), float(meta["wind"]["east"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise TerrainError(
+            f"prepared {meta_file.stem} {meta_file} is damaged ({error}); delete the folder"
+        ) from error
+    shape = (grid.rows, grid.cols)
+    pace = read_array(folder, "pace", shape, np.float32)
+    climb = None
+    if steepest is not None:
+        factors = read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
+        climb = Climb(grid, heights_m, factors, float(steepest), wind)
+    return {
+        "pace_s_per_m": pace,
+        "ground_s_per_m": read_array(folder, "ground", shape, np.float32) if has_ground else pace,
+        "digest": digest,
+        "vehicle_radius_m": radius_m,
+        "climb": climb,
+        "notes": notes,
+    }
+
+
+def load_prepared(folder: Path, key: str = "") -> Terrain | None:
+    """The terrain that `save_prepared` left, mapped read-only; None if there is none, or one of another key.
+
+    Raises TerrainError if it is damaged."""
+    meta = read_meta(folder / _META, key)
+    if meta is None:
+        return None
+    try:
+        grid = GridSpec(**meta["grid"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise TerrainError(f"prepared terrain {folder / _META} is damaged ({error}); delete the folder") from error
+    shape = (grid.rows, grid.cols)
+    elevation_m = read_array(folder, "elevation", shape, np.float32)
+    return Terrain(
+        grid=grid,
+        elevation_m=elevation_m,
+        photo=read_array(folder, "photo", (*shape, 3), np.uint8),
+        classes=read_array(folder, "classes", shape, np.uint8),
+        **read_ground(folder / _META, meta, grid, elevation_m),
+    )
+
+
+def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
+    """The truth beside a prepared terrain; None if there is none."""
+    meta = read_meta(folder / _META, key)
+    if meta is None:
+        return None
+    grid = GridSpec(**meta["grid"])
+    return read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
+
+
+def load_prepared_homes(folder: Path, key: str = "") -> Bools | None:
+    """`homes_of` a prepared terrain and its truth, mapped read-only; None if they are not there."""
+    meta = read_meta(folder / _META, key)
+    if meta is None or "homes" not in meta["arrays"]:
+        return None
+    grid = GridSpec(**meta["grid"])
+    return read_array(folder, "homes", (grid.rows, grid.cols), np.bool_)
+
+
+def read_meta(meta_file: Path, key: str) -> dict[str, Any] | None:
+    """A description that `save_ground` left; None if there is none, or one of another key. Raises TerrainError if
+    it is unreadable."""
+    try:
+        if not meta_file.exists():
+            return None
+        meta = json.loads(read_text(meta_file, FileKind.PREPARED))
+    except (TerrainError, ValueError, RecursionError) as error:
+        raise TerrainError(
+            f"prepared {meta_file.stem} {meta_file} is damaged ({error}); delete the folder"
+        ) from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT or (key and meta.get("key") != key):
+        return None
+    return meta
+
+
+def read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
+    """An array of a prepared folder, mapped read-only. Raises TerrainError if it is not as described."""
+    path = folder / f"{name}.npy"
+    try:
+        array = open_array(path)
+    except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
+        raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
+    if array.shape != tuple(shape) or array.dtype != dtype:
+        raise TerrainError(f"prepared terrain {path} is {array.shape} {array.dtype}, not as described; delete it")
+    return array
+
+
+def load_terrain(setup: RoleSetup) -> Terrain:
+    """The terrain of a run: prepared in its folder if it is there, else built."""
+    if setup.run_dir is not None:
+        terrain = load_prepared(setup.run_dir, scenario_key(setup.scenario))
+        if terrain is not None:
+            return terrain
+    return build_terrain(setup.scenario)
+
+
+def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
+    """The truth of a run, as `load_terrain`."""
+    if setup.run_dir is not None:
+        truth = load_prepared_truth(setup.run_dir, scenario_key(setup.scenario))
+        if truth is not None:
+            return truth
+    return build_truth(setup.scenario, terrain)
+
+
+def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
+    """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
+    if setup.run_dir is not None:
+        homes = load_prepared_homes(setup.run_dir, scenario_key(setup.scenario))
+        if homes is not None:
+            return homes
+    return homes_of(terrain.pace_s_per_m, truth)
+
+
+def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
+    """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
+    for the other processes. What is returned is mapped, as theirs."""
+    key, kept = scenario_key(scenario), kept_key(scenario)
+    if kept is None or not fetch_kept(kept, folder):
+        terrain = build_terrain(scenario, progress)
+        save_prepared(folder, terrain, build_truth(scenario, terrain), key)
+        del terrain
+        give_back_memory()
+        if kept is not None:
+            keep(kept, [folder / _META, *folder.glob("*.npy")])
+    mapped, truth = load_prepared(folder, key), load_prepared_truth(folder, key)
+    if mapped is None or truth is None:
+        raise TerrainError(f"the prepared terrain in {folder} has gone: it is another run's; start again")
+    return mapped, truth
