@@ -383,13 +383,13 @@ def classify(
 
 
 def _compare(terrain: Terrain, path: Path) -> None:
-    from shared_map.importers.classify import by_rules, confusion, held_out
+    from shared_map.importers.classify import class_readings, confusion, held_out
     from shared_map.importers.labels import read_labels
 
     labels = read_labels(path, terrain.grid)
     inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)
     labelled = labels.classes != TerrainClass.UNKNOWN
-    ruled = by_rules(*inputs)
+    ruled = class_readings(*inputs).classes
     _print_confusion("by rules", confusion(labels.classes[labelled], ruled[labelled]))
     _print_confusion("learnt, on polygons not seen", confusion(*held_out(*inputs, labels.classes, labels.groups)))
 
