@@ -1,1 +1,1 @@
-"""Adapters to other systems: ROS 2 and MAVLink."""
+"""Adapters to other systems, ROS 2 and MAVLink: each meets a running swarm by its client."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
@@ -235,17 +235,27 @@ class Gateway:
         taken, self._problems = self._problems, []
         return taken
 
-    def tick(self, now_ns: int, stamp_ns: int, swarm_now_ns: int, view: View, health: Health) -> list[Action]:
+    def tick(
+        self,
+        now_ns: int,
+        stamp_ns: int,
+        swarm_now_ns: int,
+        view: View,
+        health: Health,
+        robots: Collection[str] = (),
+    ) -> list[Action]:
         """Returns what is to be done now, in order.
 
         now_ns        by a clock that never leaps, by which all rates are kept
         stamp_ns      by the clock of this machine, since 1970, which stamps what ROS hears
         swarm_now_ns  by the swarm's clocks, by which marks expire
+        robots        vehicles which are not told, as they tell ROS themselves where they are
         """
         due = {name for name, at_ns in self._due_ns.items() if now_ns >= at_ns}
         if not due:
             return []
-        now = _Now(now_ns, stamp_ns, swarm_now_ns, view.vehicles, view.targets, health)
+        vehicles = {id: each for id, each in view.vehicles.items() if id not in robots}
+        now = _Now(now_ns, stamp_ns, swarm_now_ns, vehicles, view.targets, health)
         actions = [*self._begin(), *self._follow(now)]
         for id, points_m in view.take_routes().items():
             if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:

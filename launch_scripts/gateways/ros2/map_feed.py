@@ -6,7 +6,8 @@ else is unknown.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -143,29 +144,23 @@ def find_terrain(digest: str, folder: Path | None, runs: Path) -> Terrain | None
 
     Raises TerrainError if the folder that was named has none, or another.
     """
-    if folder is None:
-        return next((found for each in _newest_first(runs) if (found := _of_digest(each, digest))), None)
-    terrain = load_prepared(folder)
-    if terrain is None:
-        raise TerrainError(f"no prepared terrain in {folder}: expected the folder of a run, which holds {_META}")
-    if terrain.digest != digest:
-        raise TerrainError(f"{folder} holds terrain {terrain.digest}, and the run has {digest}")
-    return terrain
-
-
-def _of_digest(folder: Path, digest: str) -> Terrain | None:
-    """The terrain of a folder if it has this digest, and is whole."""
+    if folder is not None:
+        terrain = load_prepared(folder)
+        if terrain is None:
+            raise TerrainError(
+                f"no prepared terrain in {folder}: expected the folder of a run, which holds {_META}"
+            )
+        if terrain.digest != digest:
+            raise TerrainError(f"{folder} holds terrain {terrain.digest}, and the run has {digest}")
+        return terrain
     try:
-        meta = read_meta(folder / _META, "")
-        return load_prepared(folder) if meta is not None and meta.get("digest") == digest else None
-    except SwarmError:
-        return None  # another run's damage is no business of ours
-
-
-def _newest_first(runs: Path) -> Iterator[Path]:
-    try:
-        folders = [each for each in runs.iterdir() if not each.is_symlink() and (each / _META).is_file()]
-        folders.sort(key=lambda each: each.stat().st_mtime_ns, reverse=True)
+        metas = [each for each in runs.glob(f"*/{_META}") if not each.parent.is_symlink()]
+        metas.sort(key=lambda each: each.stat().st_mtime_ns, reverse=True)
     except OSError:
-        return
-    yield from folders[:_NEWEST]
+        return None
+    for meta in metas[:_NEWEST]:
+        with suppress(SwarmError):  # another run's damage is no business of ours
+            known = read_meta(meta, "")
+            if known is not None and known.get("digest") == digest and (found := load_prepared(meta.parent)):
+                return found
+    return None

@@ -163,22 +163,8 @@ class Attachment:
         return cls(sequence, stamp_ns, content[_ATTACHMENT.size :])
 
 
-@dataclass(frozen=True, slots=True)
-class SeenEndpoint:
-    """An endpoint of somebody's, as its token told it."""
-
-    domain: int
-    zid: str
-    kind: Kind
-    node: str
-    topic: str
-    type_name: str
-    type_hash: str
-    qos: str
-
-
-def read_token(key: str) -> SeenEndpoint | None:
-    """What the token of an endpoint tells; None of a node's. Raises ProtocolError of anything else."""
+def read_token(key: str) -> Endpoint | None:
+    """Returns somebody's endpoint, as its token tells it; None of a node's. Raises ProtocolError of anything else."""
     parts = key.split("/")
     if len(parts) >= _NODE_PARTS and parts[0] == TOKEN_SPACE and parts[5] == "NN":
         return None
@@ -189,19 +175,12 @@ def read_token(key: str) -> SeenEndpoint | None:
     if not key.isprintable():  # names go to logs and terminals, which they might steer
         raise ProtocolError(f"token {key[:200]!r} has signs that no name in ROS has")
     try:
-        domain, kind = int(parts[1]), Kind(parts[5])
+        domain, number, kind = int(parts[1]), int(parts[4]), Kind(parts[5])
     except ValueError as error:
         raise ProtocolError(f"token {key[:200]!r}: {error}") from error
-    return SeenEndpoint(
-        domain=domain,
-        zid=parts[2],
-        kind=kind,
-        node=parts[8],
-        topic=parts[9].replace("%", "/"),
-        type_name=type_name_of(parts[10]),
-        type_hash=parts[11],
-        qos=parts[12],
-    )
+    node = NodeName(domain, parts[2], parts[8], parts[7].replace("%", "/"))
+    topic, type_name = parts[9].replace("%", "/"), type_name_of(parts[10])
+    return Endpoint(node, number, kind, topic, type_name, parts[11], parts[12])
 
 
 # --- peers which will never meet us -------------------------------------------------------------------------------
@@ -230,7 +209,7 @@ class PeerWatch:
     def __init__(self) -> None:
         self._told: set[str] = set()
 
-    def sentence(self, seen: SeenEndpoint, ours: Iterable[Endpoint]) -> str | None:
+    def sentence(self, seen: Endpoint, ours: Iterable[Endpoint]) -> str | None:
         """What keeps a peer's endpoint from meeting one of ours of the same name; None if nothing does, or if it
         was told before."""
         said: str | None = None
@@ -243,17 +222,17 @@ class PeerWatch:
             said = said or why
         if said is None:
             return None
-        sentence = f"node {seen.node[:80]} {_DOES[seen.kind]} {seen.topic[:120]} {said}"
+        sentence = f"node {seen.node.name[:80]} {_DOES[seen.kind]} {seen.topic[:120]} {said}"
         if sentence in self._told or len(self._told) >= MOST_TOLD:
             return None
         self._told.add(sentence)
         return sentence
 
 
-def _why_not(seen: SeenEndpoint, mine: Endpoint) -> str | None:
+def _why_not(seen: Endpoint, mine: Endpoint) -> str | None:
     ours = mine.node.domain
-    if seen.domain != ours:
-        return f"in domain {seen.domain}, and this gateway is in domain {ours} (ROS_DOMAIN_ID, --domain)"
+    if seen.node.domain != ours:
+        return f"in domain {seen.node.domain}, and this gateway is in domain {ours} (ROS_DOMAIN_ID, --domain)"
     if seen.type_name != mine.type_name:
         return f"as {seen.type_name[:120]}, and here it is {mine.type_name}"
     if seen.type_hash == mine.type_hash:

@@ -18,7 +18,7 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, NodeName, Qos, SeenEndpoint, read_token
+from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, NodeName, Qos, read_token
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, REQUEST, RESPONSE, RosTypes
 from swarm.errors import BusError, ProtocolError
 
@@ -51,20 +51,17 @@ class Publisher:
 class Newest:
     """What came last on a topic and was not taken yet. Made by `Node.newest`.
 
-    heard  how many messages have come, taken or not
-    wake   called on Zenoh's thread with each; None at first
+    wake  called on Zenoh's thread with each; None at first
     """
 
     def __init__(self, node: Node, endpoint: Endpoint, most_bytes: int) -> None:
         self.endpoint = endpoint
-        self.heard = 0
         self.wake: Callable[[], None] | None = None
         self._node, self._most_bytes = node, most_bytes
         self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
 
     def keep(self, sample: zenoh.Sample) -> None:
         """On Zenoh's threads: keeps the bytes as they are."""
-        self.heard += 1
         self._waiting.append(sample)
         if self.wake is not None:
             self.wake()
@@ -194,7 +191,7 @@ class Node:
         self._declare(endpoint, made)
         return endpoint
 
-    def watch(self, domain: str, seen: Callable[[SeenEndpoint, bool], None]) -> None:
+    def watch(self, domain: str, seen: Callable[[Endpoint, bool], None]) -> None:
         """Tell of every endpoint of others that is there, comes (True) or goes (False): of a domain, or of "*"."""
 
         def take(sample: zenoh.Sample) -> None:
@@ -203,7 +200,7 @@ class Node:
             except ProtocolError as error:
                 self.dropped("tokens", error)
                 return
-            if endpoint is not None and endpoint.zid != self.name.zid:
+            if endpoint is not None and endpoint.node.zid != self.name.zid:
                 seen(endpoint, sample.kind == zenoh.SampleKind.PUT)
 
         # No `get` of tokens: beside a subscription it blocks for ever beyond 256 of them. History brings all.

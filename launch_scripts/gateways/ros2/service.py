@@ -21,21 +21,18 @@ from launch_scripts.gateways.ros2.gateway import (
     Put,
     Remove,
     ToWgs84,
-    View,
 )
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.incoming import TICK_S, Incoming
 from launch_scripts.gateways.ros2.map_feed import MapFeed, find_terrain
-from launch_scripts.gateways.ros2.rmw import PeerWatch, SeenEndpoint
+from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, RosSession, close_ros, open_ros
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client import Frame, Observer, Swarm, SwarmError, connect
-from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ConfigError
-from swarm.wire.messages.map_data import MarkSet
 
 log = logging.getLogger(__name__)
 
@@ -147,24 +144,6 @@ class Ros2Service:
         return frame.to_wgs84
 
 
-class _WithoutRobots:
-    """What an observer sees, without the robots of ROS: these tell ROS themselves where they are."""
-
-    def __init__(self, observer: Observer, incoming: Incoming) -> None:
-        self._observer, self._incoming = observer, incoming
-        self.take_routes: Callable[[], Mapping[str, list[tuple[float, float]]]] = observer.take_routes
-        self.take_mark_sets: Callable[[], list[MarkSet]] = observer.take_mark_sets
-
-    @property
-    def vehicles(self) -> Mapping[str, SeenVehicle]:
-        robots = self._incoming.robots
-        return {id: each for id, each in self._observer.vehicles.items() if id not in robots}
-
-    @property
-    def targets(self) -> Mapping[str, SeenTarget]:
-        return self._observer.targets
-
-
 class _Run:
     """One run's turns, on one thread.
 
@@ -182,13 +161,13 @@ class _Run:
         say: Say,
     ) -> None:
         self._node, self._swarm, self._gateway, self._incoming = node, swarm, gateway, incoming
-        self._view: View = observer if incoming is None else _WithoutRobots(observer, incoming)
+        self._observer = observer
         self._where, self._say = where, say
         self._up = dict.fromkeys(where, True)
         self._publishers: dict[Channel, Publisher] = {}
         self._counts: Counter[str] = Counter()
         self._watch = PeerWatch()
-        self._seen: deque[SeenEndpoint] = deque(maxlen=_MOST_SEEN)
+        self._seen: deque[Endpoint] = deque(maxlen=_MOST_SEEN)
 
     def go_on(self, stopping: Callable[[], bool]) -> None:
         """Forwards until another run is in the namespace, or until it is `stopping`."""
@@ -200,7 +179,9 @@ class _Run:
                 self._look("swarm", self._swarm.connected)
                 self._look("ROS", self._node.connected)
             now_ns, stamp_ns = time.monotonic_ns(), time.time_ns()
-            for action in self._gateway.tick(now_ns, stamp_ns, self._swarm.now_ns, self._view, self._health()):
+            robots = () if self._incoming is None else self._incoming.robots
+            swarm_now_ns, health = self._swarm.now_ns, self._health()
+            for action in self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, health, robots):
                 self._perform(action)
             self._tell_problems()
             due_s = (self._gateway.due_ns - time.monotonic_ns()) / 1e9

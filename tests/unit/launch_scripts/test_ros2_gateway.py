@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from launch_scripts.gateways.ros2.gateway import Channel, Declare, Gateway, Heal
 from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
 from launch_scripts.gateways.ros2.map_feed import MapFeed
 from launch_scripts.gateways.ros2.map_messages import corners, outline
-from launch_scripts.gateways.ros2.rmw import NO_HASH, Endpoint, Kind, NodeName, PeerWatch, Qos, SeenEndpoint
+from launch_scripts.gateways.ros2.rmw import NO_HASH, Endpoint, Kind, NodeName, PeerWatch, Qos
 from launch_scripts.gateways.ros2.ros_messages import (
     ODOMETRY,
     PATH,
@@ -416,10 +417,8 @@ HASH = TYPES.hash_of("nav_msgs/msg/OccupancyGrid")
 OURS = Endpoint(NODE, 4, Kind.PUBLISHER, "/map", "nav_msgs/msg/OccupancyGrid", HASH, Qos.LATCHED.value)
 
 
-def peer(**changes: Any) -> SeenEndpoint:
-    fields = {"domain": 0, "zid": "ab", "kind": Kind.SUBSCRIPTION, "node": "rviz", "topic": "/map"}
-    fields |= {"type_name": OURS.type_name, "type_hash": HASH, "qos": ""}
-    return SeenEndpoint(**fields | changes)
+def peer(domain: int = 0, **changes: Any) -> Endpoint:
+    return replace_fields(OURS, node=NodeName(domain, "ab", "rviz"), **{"kind": Kind.SUBSCRIPTION} | changes)
 
 
 @pytest.mark.parametrize(

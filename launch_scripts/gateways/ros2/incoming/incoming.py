@@ -12,7 +12,7 @@ from launch_scripts.gateways.ros2.incoming.place_routes import TRACKER, PlaceRou
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, closed_cells, corners_of
 from launch_scripts.gateways.ros2.incoming.robot import Robot
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
-from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, SeenEndpoint
+from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name
 from launch_scripts.gateways.ros2.ros_node import Node
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
@@ -64,7 +64,7 @@ class Incoming:
         self._robots: dict[str, Robot] = {}
         self._publishers: Counter[str] = Counter()
         """Topic of a robot -> how many publish it, as their tokens say."""
-        self._news: deque[tuple[SeenEndpoint, bool]] = deque(maxlen=_MOST_NEWS)
+        self._news: deque[tuple[Endpoint, bool]] = deque(maxlen=_MOST_NEWS)
         self._said: set[str] = set()
         """Robots that were said not to be taken in."""
         self._guests: list[Vehicle | Target] = []
@@ -142,9 +142,9 @@ class Incoming:
 
     # --- robots ---------------------------------------------------------------------------------------------------
 
-    def _hear(self, seen: SeenEndpoint, there: bool) -> None:
+    def _hear(self, seen: Endpoint, there: bool) -> None:
         """An endpoint of somebody has come or gone."""
-        if seen.kind is not Kind.PUBLISHER or seen.node == self._node.name.name:
+        if seen.kind is not Kind.PUBLISHER or seen.node.name == self._node.name.name:
             return  # a gateway like this one tells of vehicles that the swarm has already
         for robots in self._settings.robots:
             id = robots.robot_of(seen.topic)
