@@ -7,30 +7,23 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-import zenoh
-
-from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, Qos
+from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import Node
 from launch_scripts.gateways.ros2.ros_types import RosTypes
-from swarm.errors import ProtocolError
 
 
 class PeerNode(Node):
     """A node of ours as a peer."""
 
-    def subscribe(
-        self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT
-    ) -> Endpoint:
-        endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
+    def subscribe(self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT) -> None:
+        """Calls `hear` with each message, on Zenoh's thread."""
+        newest = self.newest(topic, type_name, qos)
 
-        def take(sample: zenoh.Sample) -> None:
-            try:
-                hear(self.types.unpack(sample.payload.to_bytes(), type_name))
-            except ProtocolError as error:
-                self.dropped(topic, error)
+        def wake() -> None:
+            if (message := newest.take()) is not None:
+                hear(message)
 
-        self._listen(endpoint, qos, take)
-        return endpoint
+        newest.wake = wake
 
 
 class FakeNewest:

@@ -164,7 +164,7 @@ class Attachment:
 
 
 def read_token(key: str) -> Endpoint | None:
-    """Returns somebody's endpoint, as its token tells it; None of a node's. Raises ProtocolError of anything else."""
+    """Returns the endpoint which a token tells of; None of a node's. Raises ProtocolError on anything else."""
     parts = key.split("/")
     if len(parts) >= _NODE_PARTS and parts[0] == TOKEN_SPACE and parts[5] == "NN":
         return None

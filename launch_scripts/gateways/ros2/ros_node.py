@@ -39,8 +39,7 @@ class Publisher:
 
     def put(self, message: Any) -> None:
         """Puts a message, or CDR that was made before. Raises BusError if Zenoh refuses it."""
-        packed = isinstance(message, bytes)
-        content = message if packed else self._types.pack(message, self.endpoint.type_name)
+        content = self._types.pack(message, self.endpoint.type_name)
         attachment = Attachment(next(self._sequence), time.time_ns(), self._gid)
         try:
             self._put(content, attachment=attachment.packed())
@@ -81,7 +80,7 @@ class Newest:
             return None
 
     def close(self) -> None:
-        """Hear no more."""
+        """Hears no more."""
         self._node.remove(self.endpoint)
 
 
@@ -131,37 +130,30 @@ class Node:
         return Publisher(self.types, endpoint, made.put)
 
     def newest(
-        self,
-        topic: str,
-        type_name: str,
-        qos: Qos = Qos.DEFAULT,
-        most_bytes: int = LARGEST_MESSAGE_BYTES,
+        self, topic: str, type_name: str, qos: Qos = Qos.DEFAULT, most_bytes: int = LARGEST_MESSAGE_BYTES
     ) -> Newest:
-        """Subscribe, and keep only what came last until it is taken: a flood costs no more than one message."""
+        """Subscribes, and keeps only what came last until it is taken: a flood costs no more than one message."""
         endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
         newest = Newest(self, endpoint, most_bytes)
-        self._listen(endpoint, qos, newest.keep)
-        return newest
-
-    def _listen(self, endpoint: Endpoint, qos: Qos, take: Callable[[zenoh.Sample], None]) -> None:
         made: Any
         # What this node puts itself is not for it: a topic may go both ways.
         if qos.latched:
             made = ext.declare_advanced_subscriber(
                 self._session,
                 endpoint.key,
-                take,
+                newest.keep,
                 allowed_origin=zenoh.Locality.REMOTE,
                 history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
                 recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 subscriber_detection=True,
             )
         else:
-            made = self._session.declare_subscriber(endpoint.key, take, allowed_origin=zenoh.Locality.REMOTE)
+            made = self._session.declare_subscriber(endpoint.key, newest.keep, allowed_origin=zenoh.Locality.REMOTE)
         self._declare(endpoint, made)
+        return newest
 
     def serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> Endpoint:
-        """Answer a service.
+        """Answers a service.
 
         `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is called once, then or
         later, on any thread, with a response or its CDR. A client of ROS waits for ever for what is never answered,
@@ -180,8 +172,7 @@ class Node:
 
             def reply(response: Any) -> None:
                 attachment = Attachment(asked.sequence, time.time_ns(), asked.gid).packed()
-                packed = isinstance(response, bytes)
-                content = response if packed else self.types.pack(response, type_name + RESPONSE)
+                content = self.types.pack(response, type_name + RESPONSE)
                 with query, suppress(zenoh.ZError):  # the session may be closed, or the link cut
                     query.reply(endpoint.key, content, attachment=attachment)
 
@@ -192,7 +183,7 @@ class Node:
         return endpoint
 
     def watch(self, domain: str, seen: Callable[[Endpoint, bool], None]) -> None:
-        """Tell of every endpoint of others that is there, comes (True) or goes (False): of a domain, or of "*"."""
+        """Tells of every endpoint of others that is there, comes (True) or goes (False): of a domain, or of "*"."""
 
         def take(sample: zenoh.Sample) -> None:
             try:
@@ -209,14 +200,14 @@ class Node:
         )
 
     def remove(self, endpoint: Endpoint) -> None:
-        """Take an endpoint back. What it has put last is not repeated to late readers any more."""
+        """Takes an endpoint back. What it has put last is not repeated to late readers any more."""
         with self._lock:
             declared = self._declared.pop(endpoint, [])
         for each in declared:
             each.undeclare()
 
     def close(self) -> None:
-        """Take back all, as `remove` does. The session stays open."""
+        """Takes back all, as `remove` does. The session stays open."""
         for endpoint in list(self._declared):
             self.remove(endpoint)
         for each in self._own:
@@ -230,10 +221,10 @@ class Node:
     def _declare(self, endpoint: Endpoint, made: Any) -> None:
         token = self._session.liveliness().declare_token(endpoint.token)
         with self._lock:
-            self._declared[endpoint] = [each for each in (token, made) if each is not None]
+            self._declared[endpoint] = [token, made]
 
     def dropped(self, topic: str, error: ProtocolError) -> None:
-        """Count what is none of its type."""
+        """Counts what is none of its type."""
         self.counts["dropped"] += 1
         log.debug("%s: %s", topic, error)
 

@@ -128,8 +128,8 @@ class RosTypes:
         )
 
     def pack(self, message: Any, name: str) -> bytes:
-        """CDR, little-endian, with its header of four bytes."""
-        return bytes(self._store.serialize_cdr(message, name))
+        """CDR, little-endian, with its header of four bytes. Bytes are CDR already."""
+        return message if isinstance(message, bytes) else bytes(self._store.serialize_cdr(message, name))
 
     def unpack(self, content: bytes, name: str) -> Any:
         """A message that somebody sent. Raises ProtocolError on what is none of this type."""
