@@ -169,7 +169,7 @@ def top(
     once     Show it once and end.
     as_json  Print one JSON object a second, or one with --once.
     """
-    from launch_scripts.commands.top_view import show_top
+    from launch_scripts.commands.status_view import show_top
 
     show_top(where.network(tls), where, each=each, once=once, as_json=as_json)
 

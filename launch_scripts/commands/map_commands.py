@@ -25,12 +25,11 @@ from shared_map.learning.learned import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.places import MapFrame
-from swarm.bus.bus import AskEnded, Replied
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import BusError, StoreError
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
-from swarm.runtime.inbox import Inbox
+from swarm.runtime.operator import replies_to
 from swarm.wire.messages.map_data import MarkSet, MarksRequest
 from swarm.wire.topics import MARKS
 
@@ -208,20 +207,15 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
     where  names the swarm in errors
     """
     beyond = beyond_tile(frame_of_run(bus, where).grid)
-    inbox = Inbox()
-    bus.ask(MARKS, MarksRequest(tiles=[beyond]), inbox.post, tag="learned", timeout_s=_TIMEOUT_S)
+    replies, failure = replies_to(bus, MARKS, MarksRequest(tiles=[beyond]), _TIMEOUT_S)
     found: dict[str, MarkSet] = {}
-    deadline_s = time.monotonic() + _TIMEOUT_S + 1.0
-    while time.monotonic() < deadline_s:
-        match inbox.take(0.1):
-            case Replied(message=MarkSet() as word) if word.tile == beyond:
-                held = found.get(word.author)
-                if held is None or supersedes(word, held):
-                    found[word.author] = word
-            case AskEnded(failure=failure):
-                if failure is not None and not found:
-                    raise BusError(f"nobody {where} says what was learned: {failure}")
-                break
+    for word in replies:
+        if isinstance(word, MarkSet) and word.tile == beyond:
+            held = found.get(word.author)
+            if held is None or supersedes(word, held):
+                found[word.author] = word
+    if failure is not None and not found:
+        raise BusError(f"nobody {where} says what was learned: {failure}")
     return [found[author] for author in sorted(found)]
 
 

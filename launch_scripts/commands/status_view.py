@@ -1,29 +1,51 @@
-"""What `swarm status` tells: a run as it is now, for whoever knows nothing of it and listens for a moment."""
+"""What `swarm status` and `swarm top` show of a run: a picture of the moment, and one that is drawn each second."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
-from launch_scripts.launcher.tables import columns, targets_table
+from launch_scripts.launcher.console import make_output_outlive_readers
+from launch_scripts.launcher.tables import columns, fitted, loads_table, targets_table
 from launch_scripts.observe import facts
 from launch_scripts.observe.counts import gaps_to
 from launch_scripts.observe.latest_state import LatestState
+from launch_scripts.observe.process_load import ProcessLoad, by_role
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
 from launch_scripts.observe.state import RunState, state_of
 from launch_scripts.plain_text import plain
+from launch_scripts.process_table import ROLES
 from shared_map.terrain.places import MapFrame
-from swarm.clock import NS_PER_S
+from swarm.bus.zenoh_bus import open_bus
+from swarm.clock import NS_PER_S, Clock, MonotonicClock
+from swarm.errors import BusError
 from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.versions import are_neighbours
 
-_SHOWN_ALARMS = 12
+if TYPE_CHECKING:
+    from swarm.config.scenario import NetworkConfig
+
+_SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
+"""Alarms of `status` and of `top`, whose table has to fit a terminal."""
+_EVERY_S = 1.0
+_FIRST_S = 2.2
+"""Until the first table: each process tells its figures once a second, and rates need two of them."""
+_ANSWER_WITHIN_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -55,43 +77,38 @@ def status_of(observer: OutsideObserver, now_ns: int) -> Status | None:
 
 def print_status(status: Status, console: Console) -> None:
     """For people."""
+
+    def say(line: str, style: str | None = None) -> None:
+        console.print(plain(line), style=style, highlight=False, soft_wrap=True)
+
     first, state, frame = status.members[0], status.state, status.frame
     if not first.run_id:
-        console.print("no run yet: only routers answer", highlight=False)
+        say("no run yet: only routers answer")
     else:
         time = facts.fact("elapsed_s")
-        head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
-        console.print(plain(head), highlight=False, soft_wrap=True)
-        console.print(f"{time.label} {time.shown(state)}", highlight=False)
+        say(f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells")
+        say(f"{time.label} {time.shown(state)}")
         if frame is not None and frame.grid.crs != "local":
-            console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
+            say(f"terrain: {extent_of(frame, 'latlon')}")
         for line in facts.lines(state):
-            console.print(line, highlight=False, soft_wrap=True)
+            say(line)
     console.print(_processes(status))
     if (spoken := _wire_versions(status)) is not None:
-        console.print(spoken, highlight=False, soft_wrap=True)
+        say(spoken)
     for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
-        console.print(line, style="yellow", highlight=False, soft_wrap=True)
+        say(line, "yellow")
     if state.targets:
         console.print(targets_table(state, len(state.targets)))
         console.print(_planning(state))
     for id, planner in sorted(status.latest.status.items()):
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
-            was = "was" if planner.tracker_lost else "is"
-            console.print(f"{id} {was} at {written(frame, cell)}", highlight=False, soft_wrap=True)
+            say(f"{id} {'was' if planner.tracker_lost else 'is'} at {written(frame, cell)}")
     for ordered in state.orders:
-        console.print(f"ordered: {ordered}", style="yellow", highlight=False, soft_wrap=True)
+        say(f"ordered: {ordered}", "yellow")
     for info in status.strangers:
-        text = (
-            f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}, "
-            f"wire version {info.wire_version}"
-        )
-        console.print(plain(text), style="yellow", highlight=False, soft_wrap=True)
-
-
-def _belongs(info: RunInfo, run: tuple[str, str], wire: int) -> bool:
-    return (info.run_id, info.terrain) == run and are_neighbours(info.wire_version, wire)
+        whose = f"answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}, wire version {info.wire_version}"
+        say(f"stranger {info.role}-{info.id} {whose}", "yellow")
 
 
 def _wire_versions(status: Status) -> str | None:
@@ -164,3 +181,106 @@ def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
     """Where the planner's target is; None if that is not known, or not on this terrain."""
     cell = planner.target_cell
     return cell if frame is not None and cell is not None and 0 <= cell < frame.grid.cells else None
+
+
+# --- drawn each second --------------------------------------------------------------------------------------------
+
+
+def show_top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_json: bool) -> None:
+    """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if nobody answers at the beginning."""
+    make_output_outlive_readers()
+    console = Console(highlight=False)
+    moving = console.is_terminal and not as_json and not once
+    with open_bus(network) as bus, _quietly(), _keys() if moving else contextlib.nullcontext():
+        clock, observer = MonotonicClock(), OutsideObserver(bus)
+        run, latest = _run_of(observer, clock, where)
+        due_s = time.monotonic() + _FIRST_S
+        with Live(console=console, auto_refresh=False) if moving else contextlib.nullcontext() as live:
+            while True:
+                observer.listen(clock, due_s - time.monotonic())
+                due_s = max(due_s + _EVERY_S, time.monotonic())
+                state, processes = state_of(latest, clock.now_ns()), latest.loads.lines(latest.up())
+                if as_json:
+                    print(json.dumps(top_fields(run, state, processes)), flush=True)
+                else:
+                    shown = table_of(run, state, processes, console, each=each)
+                    if live is None:
+                        console.print(shown)
+                    else:
+                        live.update(shown, refresh=True)
+                if once:
+                    return
+                if observer.over or all(role == "router" for role, _ in latest.up()):
+                    break
+                if moving and _asked_to_end():
+                    return
+    Console(stderr=as_json, highlight=False).print(f"run {run.run_id} is over, or cannot be reached")
+
+
+def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
+    """The run at an instant, at most 80 columns wide."""
+    load = loads_table(processes if each else by_role(processes, ROLES), each=each)
+    title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').shown(state)}", style="bold")
+    alarms = (Text(line, style="red") for line in facts.alarm_lines(state, _SHOWN_ON_TOP))
+    return fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)
+
+
+def top_fields(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> dict[str, Any]:
+    """The same for programs."""
+    told = [{name: _rounded(value) for name, value in asdict(each).items()} for each in processes]
+    return {"run_id": run.run_id, "scenario": run.scenario, **facts.for_report(state), "processes": told}
+
+
+def _rounded(value: Any) -> Any:
+    """A number with two digits of its fraction, if it has any."""
+    if not isinstance(value, float):
+        return value
+    return int(value) if value.is_integer() else round(value, 2)
+
+
+def _run_of(observer: OutsideObserver, clock: Clock, where: object) -> tuple[RunInfo, LatestState]:
+    """The run that is observed, and what is heard of it. Waits for one that is just starting."""
+    until_s = time.monotonic() + _ANSWER_WITHIN_S
+    while observer.run is None or observer.latest is None:
+        if observer.answered and (observer.latest is None or time.monotonic() > until_s):
+            who = "nobody answers" if observer.latest is None else "only routers answer"
+            raise BusError(f"{who} {where}: is the swarm running?")
+        observer.listen(clock, 0.1)
+    return observer.run, observer.latest
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Ctrl-C and SIGTERM end it without a word."""
+
+    def leave(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, leave)
+    with contextlib.suppress(KeyboardInterrupt):
+        yield
+
+
+@contextlib.contextmanager
+def _keys() -> Iterator[None]:
+    """Lets single keys be read, where there is a keyboard."""
+    if not sys.stdin.isatty():
+        yield
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _asked_to_end() -> bool:
+    """Whether `q` was pressed."""
+    if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    keys = os.read(sys.stdin.fileno(), 64)
+    return not keys or b"q" in keys.lower()

@@ -16,12 +16,11 @@ import typer
 from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, write_route
 from launch_scripts.observe.run_observer import frame_of_run
 from shared_map.terrain.places import MapFrame
-from swarm.bus.bus import AskEnded, Replied
 from swarm.config.classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
-from swarm.runtime.inbox import Inbox
+from swarm.runtime.operator import replies_to
 from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
@@ -103,23 +102,14 @@ def ask_planner(
 
 
 def _ask(bus: Bus, request: CostRequest | RouteRequest, target: str, where: object) -> RouteReply | CostReply:
-    inbox = Inbox()
-    reply: RouteReply | CostReply | None = None
-    failure: str | None = None
     topic = COST if isinstance(request, CostRequest) else ROUTE
-    until_s = time.monotonic() + _TIMEOUT_S + 2.0
-    bus.ask(topic, request, inbox.post, tag="route", timeout_s=_TIMEOUT_S, target=target)
-    while time.monotonic() < until_s:
-        match inbox.take(0.5):
-            case Replied(message=(RouteReply() | CostReply()) as found):
-                reply = found
-            case AskEnded(failure=failure):
-                break
-    if reply is None:
-        if failure is not None and failure != "timeout":
-            raise ConfigError(failure)
-        raise BusError(f"no planner of target {target!r} answers {where}")
-    return reply
+    replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target)
+    for reply in replies:
+        if isinstance(reply, RouteReply | CostReply):
+            return reply
+    if failure is not None and failure != "timeout":
+        raise ConfigError(failure)
+    raise BusError(f"no planner of target {target!r} answers {where}")
 
 
 def as_json(answer: Answer) -> str:

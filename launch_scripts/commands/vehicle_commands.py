@@ -16,14 +16,13 @@ from launch_scripts.commands.role_commands import Joins, Part, run_role
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson, GroupName, Tls
 from launch_scripts.observe.run_observer import ask_run
-from swarm.bus.bus import AskEnded, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.places import read_place
 from swarm.right_of_way.removal import say_gone
-from swarm.runtime.inbox import Inbox
+from swarm.runtime.operator import replies_to
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
 _WITHIN_S = 5.0
 """Longest wait until cells are free: wardens answer within a lease, which is shorter."""
-_AGAIN_S = 0.2
+_AGAIN_S, _ANSWERS_S = 0.2, 1.0
 app = family_app("Let vehicles join a running swarm and leave it; stop vehicles, and let them go again.")
 command(app)(stop)
 command(app)(go)
@@ -140,17 +139,15 @@ def _open(network: NetworkConfig, run_id: str) -> ZenohBus:
 
 def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
     """Asks until the cells of all that left are free, but not for ever."""
-    inbox = Inbox()
     until_s = time.monotonic() + _WITHIN_S
     said: Removed | None = None
     while time.monotonic() < until_s:
-        bus.ask(LEAVE, RemoveVehicles(vehicles=vehicles), inbox.post, tag="leave", timeout_s=1.0, agent=agent)
-        answered = False
-        while not isinstance(event := inbox.take(1.5), AskEnded | None):
-            if isinstance(event, Replied) and isinstance(event.message, Removed):
-                said, answered = event.message, True
-        if said is not None and not answered:
+        replies, _ = replies_to(bus, LEAVE, RemoveVehicles(vehicles=vehicles), _ANSWERS_S, agent=agent)
+        removed = [reply for reply in replies if isinstance(reply, Removed)]
+        if said is not None and not removed:
             return replace(said, held=0)  # an added agent ends once wardens know that its last vehicle has left
+        if removed:
+            said = removed[0]
         if said is not None and not said.held:
             return said
         time.sleep(_AGAIN_S)

@@ -24,6 +24,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
+from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import FLEET, FOLLOWED, LEAD, MARKS, NOTE, ORDERS, POSE, RUN, STATS, STATUS, Topic
@@ -261,18 +262,8 @@ class OutsideObserver(RunObserver):
 
 def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
     """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
-    inbox = Inbox()
-    bus.ask(RUN, Nothing(), inbox.post, tag=_RUN, timeout_s=timeout_s)
-    found: list[RunInfo] = []
-    deadline_s = time.monotonic() + timeout_s + 1.0
-    while time.monotonic() < deadline_s:
-        match inbox.take(0.1):
-            case Replied(message=RunInfo() as info):
-                if routers or info.run_id != NO_RUN:
-                    found.append(info)
-            case AskEnded():
-                break
-    return found
+    replies, _ = replies_to(bus, RUN, Nothing(), timeout_s)
+    return [each for each in replies if isinstance(each, RunInfo) and (routers or each.run_id != NO_RUN)]
 
 
 def frame_of_run(bus: Bus, where: object) -> MapFrame:

@@ -100,12 +100,12 @@ class Operator:
         if self._roster is None:  # before anybody is asked, so that no answer is of one whose end we missed
             self._roster = Roster()
             self._bus.watch_alive(self._hear_token)
-        found = self._ask(RUN, Nothing(), _FIND_S)[0]
+        found = replies_to(self._bus, RUN, Nothing(), _FIND_S)[0]
         return [each for each in found if isinstance(each, RunInfo) and each.run_id]
 
     def _keeper(self, members: list[RunInfo] | None = None) -> str:
         if members is None:
-            found = self._ask(RUN, Nothing(), _FIND_S, role="keeper")[0]
+            found = replies_to(self._bus, RUN, Nothing(), _FIND_S, role="keeper")[0]
             members = [each for each in found if isinstance(each, RunInfo)]
         keepers = sorted(each.id for each in members if each.role == "keeper")
         if not keepers:
@@ -118,7 +118,7 @@ class Operator:
         return reply
 
     def _order(self, topic: Topic, order: Message, keeper: str) -> Message:
-        replies, failure = self._ask(topic, order, _ORDER_S, keeper=keeper)
+        replies, failure = replies_to(self._bus, topic, order, _ORDER_S, keeper=keeper)
         if replies:
             return replies[0]
         if failure is not None and failure != "timeout":
@@ -164,18 +164,22 @@ class Operator:
             {f"{role}-{id}" for role, id in left} if up else set()
         )  # if all are gone, it is our link that is lost
 
-    def _ask(
-        self, topic: Topic, request: Message, timeout_s: float, **fields: str | int
-    ) -> tuple[list[Message], str | None]:
-        """(replies, why there are no more); ends with the last answer."""
-        inbox = Inbox()
-        found: list[Message] = []
-        self._bus.ask(topic, request, inbox.post, tag="order", timeout_s=timeout_s, **fields)
-        deadline_s = time.monotonic() + timeout_s + 1.0
-        while time.monotonic() < deadline_s:
-            match inbox.take(0.1):
-                case Replied(message=message):
-                    found.append(message)
-                case AskEnded(failure=failure):
-                    return found, failure
-        return found, "timeout"
+
+def replies_to(
+    bus: Bus, topic: Topic, request: Message, timeout_s: float, **fields: str | int
+) -> tuple[list[Message], str | None]:
+    """Asks, waits for all answers, and returns (replies, why there are no more).
+
+    fields  of the topic's key
+    """
+    inbox = Inbox()
+    found: list[Message] = []
+    bus.ask(topic, request, inbox.post, tag="replies", timeout_s=timeout_s, **fields)
+    deadline_s = time.monotonic() + timeout_s + 1.0
+    while time.monotonic() < deadline_s:
+        match inbox.take(0.1):
+            case Replied(message=message):
+                found.append(message)
+            case AskEnded(failure=failure):
+                return found, failure
+    return found, "timeout"

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from launch_scripts.commands.slope_tables import Curve, Shown
+from launch_scripts.commands.terrain_commands import Curve, Shown
 from swarm.errors import TerrainError
 
 _STEEPEST_PERCENT = 60

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from launch_scripts.commands.top_view import fields_of, table_of
+from launch_scripts.commands.status_view import table_of, top_fields
 from launch_scripts.launcher.tables import live_table
 from launch_scripts.observe.process_load import ProcessLoads, by_role
 from launch_scripts.observe.recorder import Recorder
@@ -115,6 +115,6 @@ def test_top_fits_80_columns_too_and_says_the_same_to_programs() -> None:
         assert max(map(len, shown)) <= 80
         assert all(label in "\n".join(shown) for label in ("CPU %", "memory", "late/s", "messages/s", "restarts"))
         assert each or len(shown) <= 24
-    fields = fields_of(run, state, lines)
+    fields = top_fields(run, state, lines)
     assert len(fields["processes"]) == len(lines)
     assert {line["cpu_percent"] for line in fields["processes"]} == {90.0}
