@@ -41,7 +41,7 @@ BENCHMARKS = {
     "paper": "bench.planning.strategies",
     "scale": "bench.planning.strategies",
     "gap": "bench.planning.strategies",
-    "certificates": "bench.planning.certificate_checks",
+    "certificates": "bench.planning.certificates",
     "pulled": "bench.planning.pulled",
     "air": "bench.planning.air",
     "terrain": "bench.terrain",
@@ -64,6 +64,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+FieldOption = Annotated[
+    str, typer.Option(help="terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces in s/m.")
+]
 Seed = Annotated[int, typer.Option(min=0, max=2**53, help="Seed of everything random.")]
 
 _MACHINE = ("cores", "machine", "python", "load")

@@ -21,8 +21,7 @@ from support.up_process import UpProcess
 from chaos.attacker import Attacker
 from chaos.fault_schedule import FAULTS, Fault, faults
 from chaos.hostile import KINDS, Hostile
-from chaos.recovery import Recovery
-from chaos.results import Ended, Outcome, Results, Sample, name_of
+from chaos.results import Ended, Outcome, Recovery, Results, Sample, name_of
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of

@@ -9,12 +9,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from bench.planning.fields import make_field
-from bench.planning.kernels import paces_of_any_ratio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
+from support.fields import make_field, paces_of_any_ratio
 from support.planner_strategies import RULES, STRATEGIES
 
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S

@@ -80,7 +80,7 @@ def test_no_ratio_of_paces_breaks_or_crawls(ratio: float) -> None:
 
 
 def test_large_fields_of_every_kind_equal_dijkstra() -> None:
-    from bench.planning.fields import make_field
+    from support.fields import make_field
 
     for name in ("terrain", "uniform", "maze"):
         pace = make_field(name, 300)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench.planning.fields import from_file
+from support.fields import from_file
 
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from support.benchmarks import begin, command
-from support.process_usage import cpu_s, eventually, in_session
+from support.process_usage import cpu_s, in_session
+from support.processes import eventually
 from support.up_process import UpProcess
 
 from launch_scripts.launcher.takeover import processes

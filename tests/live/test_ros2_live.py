@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from bench.wire.remote import Far
-from bench.wire.ros2 import swarm_peer
+from support.far_processes import Far
 from support.live_swarm import SWARM, LiveSwarm
+from support.made_up_swarm import swarm_peer
 from support.processes import eventually
 from support.ros_node import PeerNode
 from support.ros_peer import RosPeer, ros_router, write_definitions

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from bench.harness import Seed, benchmark, cpu_ms, track
+from bench.harness import Seed, benchmark, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.arrays import Floats
@@ -30,7 +30,6 @@ _EVERY = 2
 
 _ROOTS, _STARTS = 2, 150
 """Trees, and routes of each, that are held against the stack."""
-_REPEATS = 7
 
 
 @benchmark(fails=("clearance_broken",))
@@ -50,8 +49,8 @@ def air(
     ./launch_scripts/bench air
     ./launch_scripts/bench air --dem ridge.tif --grade 0.2
 
-    Costs of routes over those of the stack; the clearance along many; a tree beside scipy's and beside one of level
-    ground. The status is 1 where a flight comes nearer to the ground than its clearance.
+    Costs of routes over those of the stack, and the clearance along many. The status is 1 where a flight comes
+    nearer to the ground than its clearance.
     """
     terrain = build_terrain(Scenario(seed=seed, terrain=TerrainConfig(source=dem)))
     heights: Floats = terrain.elevation_m[: _EVERY * cells : _EVERY, : _EVERY * cells : _EVERY].copy()
@@ -69,7 +68,6 @@ def air(
         ]
     )
     seen, lowest_m = _clearance(grid, heights, flown, routes, rng)
-    tree, isotropic, error = _times(grid, flown, int(rng.choice(grid.cells)))
     return {
         "source": dem,
         "rows": grid.rows,
@@ -85,8 +83,6 @@ def air(
         "clearance_m": flight.clearance_m,
         "lowest_m": round(lowest_m, 4),
         "clearance_broken": int(lowest_m < flight.clearance_m),
-        "tree_over_isotropic": round(tree / isotropic, 2),
-        "worst_over_scipy": float(f"{error:.2e}"),
     }
 
 
@@ -176,35 +172,3 @@ def _clearance(
                 lowest_m = min(lowest_m, float((flown_m.astype(np.float64) - under).min()))
         seen += grid.cells
     return seen, lowest_m
-
-
-def _times(grid: GridSpec, flown: AirGround, root: int) -> tuple[float, float, float]:
-    """CPU of a tree over the surface and of one over level ground; and how far scipy's costs are off at worst."""
-    took: dict[bool, list[float]] = {True: [], False: []}
-    for _ in track(range(_REPEATS)):
-        for climbs in (True, False):
-            costs = CostGrid(grid, PlannerConfig(), flown.climb if climbs else None)
-            costs.load(flown.pace_s_per_m)
-            tree = CostToGoTree(costs)
-            tree.grow(root)
-            took[climbs].append(cpu_ms(tree.grow, root))
-    tree, costs = _grown(grid, flown, root)
-    ours = tree.cost_at(costs.pad_all(np.arange(grid.cells)))
-    heights = flown.height_m.astype(np.float64).ravel()
-    tails, heads, seconds = [], [], []
-    for south, east in _STEPS:
-        below, ahead = _neighbours(grid, south, east)
-        rise_m = heights[ahead] - heights[below]
-        length_m = grid.resolution_m * math.hypot(south, east)
-        rises = np.linspace(-flown.climb.steepest, flown.climb.steepest, len(flown.climb.factors))
-        factors = np.interp(rise_m / length_m, rises, flown.climb.factors.astype(np.float64))
-        tails.append(below)
-        heads.append(ahead)
-        seconds.append(length_m * flown.pace_s_per_m.ravel()[ahead].astype(np.float64) * factors)
-    graph = csr_array(
-        (np.concatenate(seconds), (np.concatenate(heads), np.concatenate(tails))), shape=(grid.cells,) * 2
-    )
-    exact = dijkstra(graph, directed=True, indices=np.asarray(root))
-    away = np.arange(grid.cells) != root
-    worst = float(np.abs(ours[away] / exact[away] - 1).max())
-    return float(np.median(took[True])), float(np.median(took[False])), worst

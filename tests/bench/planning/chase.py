@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 import psutil
 from numpy.typing import NDArray
+from support.fields import Field
+from support.route_oracle import drive
 
 from bench.harness import cpu_ms, track
-from bench.planning.fields import Field
-from bench.planning.route_oracle import drive
 from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWorld
 from planner_service.strategy import ROWS, STAGES
 from planner_service.target_tree import TargetTree

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from support.fields import Field, Pace, make_field, paces_of_any_ratio
 
-from bench.harness import Seed, benchmark, cpu_ms, track
-from bench.planning.fields import Field, FieldOption, Pace, make_field
+from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -172,33 +172,6 @@ def kernels(
         "repairs": repairs,
         "costs": _growths_of_any_ratio(bench.pace, max(repeats // 3, 1), seed),
     }
-
-
-def paces_of_any_ratio(pace: Pace, rng: np.random.Generator) -> Iterator[tuple[str, Pace]]:
-    """What is met on real maps, and what is made against a queue of buckets. Lethal cells stay so."""
-    rows, cols = pace.shape
-    usual = np.float32(np.median(pace[np.isfinite(pace)]))
-    middle = int(np.flatnonzero(np.isfinite(pace))[np.isfinite(pace).sum() // 3])
-    for name, value in (("one dear cell, x 1e5", 1e5), ("one cheap cell, x 1e-5", 1e-5)):
-        marked = pace.copy()
-        marked.flat[middle] = usual * np.float32(value)
-        yield name, marked
-    marked = pace.copy()
-    marked[rows // 2] = usual * np.float32(1e-3)
-    yield "a road, x 1e-3", marked
-    yield "one cell in 35, x 30,000", pace * np.where(rng.random(pace.shape) < 1 / 35, 30_000, 1).astype(np.float32)
-    for value in (1e-3, 1e-5):
-        yield (
-            f"the left half, x {value:g}",
-            pace * np.where(np.arange(cols) < cols // 2, value, 1).astype(np.float32),
-        )
-        yield (
-            f"every other cell, x {value:g}",
-            pace * np.where(rng.random(pace.shape) < 0.5, value, 1).astype(np.float32),
-        )
-    for ratio in (1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7):
-        random = (ratio ** rng.random(pace.shape)).astype(np.float32)
-        yield f"log-uniform, 1 to {ratio:g}", np.where(np.isfinite(pace), random, pace)
 
 
 def _growths_of_any_ratio(pace: Pace, repeats: int, seed: int) -> list[dict[str, Any]]:

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from support.fields import Field, make_field
 
-from bench.harness import Seed, benchmark, cpu_ms, track
-from bench.planning.fields import Field, FieldOption, make_field
+from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.pieces import PieceTree

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from support.fields import Pace, make_field
 
 from bench.harness import Seed, benchmark, cpu_ms
-from bench.planning.fields import Pace, make_field
 from planner_service.route_finder import PulledRoute, RouteFinder
 from swarm.errors import TerrainError
 from swarm.wire.routes import RouteStatus

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
+from support.fields import FIELDS, Field, make_field
 
-from bench.harness import Lines, Seed, benchmark, names_of, numbers_of, track
+from bench.harness import FieldOption, Lines, Seed, benchmark, names_of, numbers_of, track
 from bench.planning.chase import Plan, Tally, chase
-from bench.planning.fields import FIELDS, Field, FieldOption, make_field
 from launch_scripts.simulation.world.walks import FLEEING, STANDING
 from planner_service.kernel_build import load_all
 from planner_service.strategy import ROWS

@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from support.far_processes import Far
 from support.process_usage import cpu_s, in_session, machine_cpu_s, pss_bytes
 from support.up_process import UpProcess
 
@@ -16,7 +17,6 @@ from bench.harness import tell
 from bench.whole_swarm.route_client import raw_answerer, route_client
 from bench.whole_swarm.size import Size, scenario_text
 from bench.whole_swarm.stats_window import StatsSpan, StatsWindow, histogram, ticks
-from bench.wire.remote import Far
 from launch_scripts.launcher.takeover import processes
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import processes_of

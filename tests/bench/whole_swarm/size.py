@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import msgspec
 
@@ -19,55 +20,7 @@ _FEWEST_AGENTS, _MOST_AGENTS = 5, 40
 _MOST_VEHICLES = 100_000
 LEAST_SIDE, MOST_SIDE = 32, 16_384
 
-_SCENARIO = """
-name = "scale"
-seed = {seed}
-time_scale = {time_scale:g}             # with 2, 10 m/s on cells of 20 m: 1 cell a second on open ground
-
-[terrain]
-source = "synthetic"
-rows = {side}
-cols = {side}
-resolution_m = 20
-relief_m = 400
-roads = {roads}
-rivers = {rivers}
-
-[terrain.hidden]
-closed_roads = {closed_roads}
-rubble_fields = {rubble_fields}
-flooded_share = 0.005
-
-[cost]
-max_slope_deg = 25
-
-[[targets]]
-name = "t"
-count = {targets}
-walk = "waypoints"
-speed_m_per_s = 3
-
-[[groups]]
-name = "all"
-vehicles = {vehicles}
-start = "spread"
-
-[vehicles]
-per_agent = {per_agent}
-tick_hz = {tick_hz:g}
-sense_range_m = 100
-capture_range_m = 60
-route_cells = 64
-
-[planner]
-tick_hz = {planner_hz:g}
-cpu_budget = 0.05
-
-[map]
-interest = "near"
-interest_m = 1500
-plot_regions = {plot_regions}
-"""
+_SCENARIO = Path(__file__).with_name("scale.toml.in")
 _PLACES = """
 [network]
 listen = ["{endpoint}"]
@@ -162,7 +115,7 @@ def scenario_text(size: Size, endpoint: str | None = None) -> str:
     endpoint  of the router; the live view then takes free ports
     """
     lengths, areas = size.side / 512, (size.side / 512) ** 2
-    text = _SCENARIO.format(
+    text = _SCENARIO.read_text(encoding="utf-8").format(
         **msgspec.structs.asdict(size),
         planner_hz=size.tick_hz,
         roads=min(max(round(24 * lengths), 2), 200),

@@ -10,12 +10,13 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
+from support.far_processes import Far, asked
 
 from bench.harness import benchmark, names_of, track
 from bench.wire import codec
 from bench.wire.marks import late_join, latency, throughput
 from bench.wire.queries import positions, route_queries
-from bench.wire.remote import Far, asked, replica_cost
+from bench.wire.remote import replica_cost
 
 PARTS = ("latency", "throughput", "join", "route", "positions", "replica", "codec")
 _ROWS: tuple[tuple[str, str, str, float | None], ...] = (

@@ -8,19 +8,10 @@ from typing import Any
 
 import numpy as np
 import zenoh
+from support.far_processes import NAMESPACE, Far, asked
+from support.made_up_swarm import GRID, some_set
 
-from bench.wire.remote import (
-    GRID,
-    NAMESPACE,
-    RAW,
-    Far,
-    asked,
-    beside,
-    map_holder,
-    map_key,
-    map_peer,
-    some_set,
-)
+from bench.wire.remote import RAW, beside, map_holder, map_key, map_peer
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync

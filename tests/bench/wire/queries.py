@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import zenoh
+from support.far_processes import Far, asked
 
-from bench.wire.remote import RAW, Far, Parts, asked, beside, read_on_thread, run_service
+from bench.wire.remote import RAW, Parts, beside, read_on_thread, run_service
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus

@@ -3,25 +3,20 @@ ways."""
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from typing import Any
 
 import numpy as np
 import psutil
 import zenoh
 from numpy.typing import NDArray
+from support.made_up_swarm import GRID, some_set
 
-from launch_scripts.ports import free_ports
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_sets import packed
-from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
@@ -29,94 +24,20 @@ from swarm.bus.bus import Event
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import MapConfig, NetworkConfig
-from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import encode
-from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
-NAMESPACE = "bench"
 RAW = "raw/bench"
 """Keys of the raw measurements: as long and as many as ours, without subscribers of ours."""
-GRID = GridSpec(2048, 2048, 10.0)
-_READY_S = 60.0
-_END_S = 5.0
-
-
-def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
-    """A set of so many marks, spread over its tile."""
-    cells = np.arange(marks, dtype=np.uint16) * (1024 // max(marks, 16))
-    kinds = (np.arange(marks) % 2).astype(np.uint8)
-    paces = np.where(kinds == MarkKind.PACE, np.float32(0.25), np.float32(0))
-    return mark_set(author, "all", tile, 1, seq, Statements(cells, kinds, paces, np.full(marks, seq + 1, np.int64)))
 
 
 def map_key(tile: int, author: str) -> str:
     """Key of a set, below the namespace."""
     return f"marks/{GRID.region_of_tile(tile)}/{tile}/{author}"
-
-
-class Far:
-    """Processes beside this one, on one router. They end with the context.
-
-    network  whose router runs already; by default one is started
-    """
-
-    def __init__(self, network: NetworkConfig | None = None) -> None:
-        self._starts_router = network is None
-        self.network = network or _on_free_port()
-        self._spawning = multiprocessing.get_context("spawn")
-        self._running: list[tuple[BaseProcess, Connection]] = []
-
-    def __enter__(self) -> Far:
-        if self._starts_router:
-            self.start(_router)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        while self._running:
-            self.end()
-
-    def start(self, run: Callable[..., None], *given: Any) -> Connection:
-        """Runs `run(network, pipe, *given)` in a process; returns once it has sent "ready"."""
-        here, there = self._spawning.Pipe()
-        process = self._spawning.Process(target=run, args=(self.network, there, *given), daemon=True)
-        # A Ctrl-C reaches the whole process group. These are ended by us, in order.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        self._running.append((process, here))
-        if not here.poll(_READY_S) or here.recv() != "ready":
-            raise SwarmError(f"the process {run.__name__} was not ready within {_READY_S:.0f} s")
-        return here
-
-    def end(self) -> None:
-        """Ends the process which was started last."""
-        process, pipe = self._running.pop()
-        with contextlib.suppress(OSError):  # it may have ended already
-            pipe.send("end")
-        process.join(_END_S)
-        if process.is_alive():
-            process.kill()
-            process.join(_END_S)
-
-
-def _on_free_port() -> NetworkConfig:
-    [port] = free_ports(1)
-    endpoint = f"tcp/127.0.0.1:{port}"
-    return NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
-
-
-def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:
-    """Asks a process over its pipe and returns its answer."""
-    far.send(question)
-    if not far.poll(within_s):
-        raise SwarmError(f"no answer to {question[0]} within {within_s:.0f} s")
-    return far.recv()
 
 
 def beside(
@@ -130,12 +51,6 @@ def beside(
         found |= {f"ours_{name}": one, f"raw_{name}": other}
         found[f"ratio_{name}"] = None if one is None or not other else one / other
     return {name: None if value is None else round(value, 2) for name, value in found.items()}
-
-
-def _router(network: NetworkConfig, pipe: Connection) -> None:
-    with open_bus(network, mode="router"):
-        pipe.send("ready")
-        pipe.recv()
 
 
 def read_on_thread(entity: Any, arrive: Callable[[Any], None]) -> Any:

@@ -7,8 +7,7 @@ from itertools import islice
 import pytest
 from chaos.fault_schedule import CALM, FAULTS, faults
 from chaos.hostile import KINDS, Hostile
-from chaos.recovery import Recovery
-from chaos.results import Ended, Outcome, Results, Sample
+from chaos.results import Ended, Outcome, Recovery, Results, Sample
 from support.message_fuzzer import MessageFuzzer
 
 from swarm.grid import GridSpec

@@ -11,13 +11,13 @@ import numpy as np
 import psutil
 import pytest
 from bench.isolated import isolated
-from bench.planning import library_adapters as rivals
-from bench.planning.certificate_checks import LAWS
+from bench.planning import peers as rivals
 from bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
-from bench.planning.fields import FIELDS, Field, make_field
 from bench.planning.peers import tree_memory_mb
 from bench.planning.strategies import points_of
 from support.benchmarks import assert_fits, bench, run
+from support.fields import FIELDS, Field, make_field
+from support.tree_lives import LAWS
 
 from planner_service.tree.bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
@@ -357,7 +357,6 @@ def test_flights_are_measured_beside_a_stack_of_levels_and_keep_their_clearance(
     assert report["clearance_broken"] == 0
     assert report["lowest_m"] >= report["clearance_m"]
     assert 1.0 <= report["over_stack_mean"] <= report["over_stack_p95"] < 2
-    assert report["worst_over_scipy"] < 1e-3
 
 
 @pytest.mark.parametrize("field", ["terrain", "maze"])

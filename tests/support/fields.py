@@ -1,12 +1,12 @@
-"""Fields of paces for benchmarks: synthetic ones and files."""
+"""Fields of paces for laws and benchmarks: synthetic ones, files, and costs of any ratio."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
@@ -16,9 +16,6 @@ from swarm.grid import GridSpec
 
 Pace = NDArray[np.float32]
 FIELDS = ("terrain", "uniform", "maze")
-FieldOption = Annotated[
-    str, typer.Option(help="terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces in s/m.")
-]
 
 
 def make_field(name: str, size: int, seed: int = 1) -> Pace:
@@ -149,3 +146,30 @@ class Field:
         """Random cells of the largest area, without repetition where there are enough."""
         home = self.terrain.home
         return rng.choice(home, count, replace=count > len(home))
+
+
+def paces_of_any_ratio(pace: Pace, rng: np.random.Generator) -> Iterator[tuple[str, Pace]]:
+    """What is met on real maps, and what is made against a queue of buckets. Lethal cells stay so."""
+    rows, cols = pace.shape
+    usual = np.float32(np.median(pace[np.isfinite(pace)]))
+    middle = int(np.flatnonzero(np.isfinite(pace))[np.isfinite(pace).sum() // 3])
+    for name, value in (("one dear cell, x 1e5", 1e5), ("one cheap cell, x 1e-5", 1e-5)):
+        marked = pace.copy()
+        marked.flat[middle] = usual * np.float32(value)
+        yield name, marked
+    marked = pace.copy()
+    marked[rows // 2] = usual * np.float32(1e-3)
+    yield "a road, x 1e-3", marked
+    yield "one cell in 35, x 30,000", pace * np.where(rng.random(pace.shape) < 1 / 35, 30_000, 1).astype(np.float32)
+    for value in (1e-3, 1e-5):
+        yield (
+            f"the left half, x {value:g}",
+            pace * np.where(np.arange(cols) < cols // 2, value, 1).astype(np.float32),
+        )
+        yield (
+            f"every other cell, x {value:g}",
+            pace * np.where(rng.random(pace.shape) < 0.5, value, 1).astype(np.float32),
+        )
+    for ratio in (1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7):
+        random = (ratio ** rng.random(pace.shape)).astype(np.float32)
+        yield f"log-uniform, 1 to {ratio:g}", np.where(np.isfinite(pace), random, pace)

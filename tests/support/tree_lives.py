@@ -7,15 +7,13 @@ adopted late, some routes are asked for in between. After each event every cell'
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
-import typer
+from support.route_oracle import Cells, Driven, Seconds, best_costs, drive
 
-from bench.harness import benchmark, track
-from bench.planning.route_oracle import Cells, Driven, Seconds, best_costs, drive
 from planner_service.full_growth import GrownTree
 from planner_service.kernel_build import load_all
 from planner_service.target_tree import TargetTree
@@ -82,50 +80,15 @@ class Findings:
             self.example.setdefault(law, seed)
 
 
-def run_checks(checks: int, seed: int = 1, seconds: float = math.inf) -> Findings:
-    """Lives until so many routes are checked, or so many seconds have gone by. Each has a seed of its own, counted
-    up from `seed`: a violation's is named, and `--seed` of it begins there."""
+def lives(seed: int) -> Iterator[Findings]:
+    """What has been found after each life, without end. Each life has a seed of its own, counted up from `seed`: a
+    violation's is named, and lives from it on begin with it."""
     load_all()
-    findings, began = Findings(), time.monotonic()
-    for _ in track(iter(lambda: findings.checks >= checks or time.monotonic() - began > seconds, True)):
+    findings = Findings()
+    while True:
         Life(seed + findings.lives, findings).live()
         findings.lives += 1
-    return findings
-
-
-@benchmark(fails=("violations",))
-def certificates(
-    checks: Annotated[int, typer.Option(min=1, help="Routes to check.")] = 1_000_000,
-    seconds: Annotated[float, typer.Option(min=1, help="End after so long, however many were checked.")] = 600,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first life; the next one's is one more.")] = 1,
-) -> dict[str, Any]:
-    """Random rules, strategies and lives: is each route what its planner says?
-
-    \b
-    ./launch_scripts/bench certificates --checks 10000000 --seconds 1200
-
-    Every route is driven step by step in float64 and held against the best way that scipy finds. The status is 1
-    where a law was broken; the seed shown repeats it.
-    """
-    found = run_checks(checks, seed, seconds)
-    return {
-        "seed": seed,
-        "asked": checks,
-        "checks": found.checks,
-        "lives": found.lives,
-        "violations": sum(found.violations.values()),
-        "stated_over_driven_worst": found.stated,
-        "laws": [
-            {
-                "law": law,
-                "says": LAWS[law],
-                "violations": many,
-                "worst": found.worst.get(law),
-                "seed": found.example.get(law),
-            }
-            for law, many in found.violations.items()
-        ],
-    }
+        yield findings
 
 
 class Life:

@@ -1,0 +1,94 @@
+"""Vehicles, routes, marks and a target which are only told of, for those who watch a swarm from outside."""
+
+from __future__ import annotations
+
+import time
+from multiprocessing.connection import Connection
+
+import msgspec
+import numpy as np
+
+from shared_map.replication.marks import Statements, mark_set
+from swarm.bus.bus import Asked
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.config.scenario import NetworkConfig
+from swarm.grid import GridSpec
+from swarm.runtime.inbox import Inbox
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.planning import TargetPose
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, RUN
+
+GRID = GridSpec(2048, 2048, 10.0)
+_PER_AGENT = 25
+_HZ = 10.0
+_ROUTE_CELLS, _NEW_ROUTE_S = 200, 2.0
+_MARK_SETS_A_TICK, _MARKS = 1, 20
+_WEST_M, _NORTH_M, _CRS = 500_000.0, 5_300_000.0, "EPSG:32632"
+
+
+def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
+    """A set of so many marks, spread over its tile."""
+    cells = np.arange(marks, dtype=np.uint16) * (1024 // max(marks, 16))
+    kinds = (np.arange(marks) % 2).astype(np.uint8)
+    paces = np.where(kinds == MarkKind.PACE, np.float32(0.25), np.float32(0))
+    return mark_set(author, "all", tile, 1, seq, Statements(cells, kinds, paces, np.full(marks, seq + 1, np.int64)))
+
+
+def swarm_peer(
+    network: NetworkConfig, pipe: Connection, vehicles: int, seconds: float, run_id: str = "bench"
+) -> None:
+    """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, and a target,
+    for so long. Answers which run it is."""
+    inbox, now_ns = Inbox(), time.time_ns()
+    info = RunInfo(
+        run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
+        cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=_WEST_M, north_m=_NORTH_M,
+        crs=_CRS,
+    )  # fmt: skip
+    with open_bus(network) as bus:
+        bus.serve(RUN, inbox.post, role="keeper", id="0")
+        pipe.send("ready")
+        began_s = time.monotonic()
+        tick = 0
+        while time.monotonic() < began_s + seconds and not pipe.poll():
+            tick += 1
+            _tell(bus, tick, vehicles)
+            target = TargetPose(
+                target="t0", incarnation=now_ns, seq=tick, stamp_ns=time.time_ns(), cell=0,
+                x_m=_WEST_M + 5.0, y_m=_NORTH_M - 5.0,
+            )  # fmt: skip
+            bus.publish(POSE, target, target="t0")
+            while (event := inbox.take(max(0.0, began_s + tick / _HZ - time.monotonic()))) is not None:
+                if isinstance(event, Asked):
+                    event.answer(msgspec.structs.replace(info, now_ns=time.time_ns()), role="keeper", id="0")
+                    event.end()
+
+
+def _tell(bus: ZenohBus, tick: int, vehicles: int) -> None:
+    for agent in range(vehicles // _PER_AGENT):
+        author = f"a{agent}.1"
+        numbers = np.arange(_PER_AGENT)
+        east_m = 500.0 + 40.0 * numbers + tick * 10.0 / _HZ
+        south_m = np.full(_PER_AGENT, 500.0 + 100.0 * agent)
+        cells = (south_m // GRID.resolution_m).astype(int) * GRID.cols + (east_m // GRID.resolution_m).astype(int)
+        ids = [f"a{agent}-{n:02d}" for n in numbers]
+        fleet = Fleet(
+            author=author, group="all", region=agent, seq=tick, stamp_ns=time.time_ns(), ids=ids, target_ids=["t0"],
+            cells=pack_column(cells, "<u4"), east_m=pack_column(east_m, "<f4"),
+            south_m=pack_column(south_m, "<f4"), heading_rad=pack_column(np.full(_PER_AGENT, np.pi / 2), "<f4"),
+            states=bytes([VehicleState.FOLLOWING] * _PER_AGENT), targets=bytes(_PER_AGENT),
+        )  # fmt: skip
+        bus.publish(FLEET, fleet, region=agent, author=author)
+        for n in range(tick % int(_NEW_ROUTE_S * _HZ), _PER_AGENT, int(_NEW_ROUTE_S * _HZ)):
+            steps = bytes((np.arange(_ROUTE_CELLS) // 7 % 2 + 2).astype(np.uint8))  # east and south-east
+            followed = Followed(
+                vehicle=ids[n], target="t0", start=int(cells[n]), directions=steps, cost_s=1.0, lower_bound_s=1.0
+            )
+            bus.publish(FOLLOWED, followed, agent=f"a{agent}", vehicle=ids[n])
+    for n in range(_MARK_SETS_A_TICK):
+        tile = (tick * _MARK_SETS_A_TICK + n) % GRID.tiles
+        marks = some_set(tile, tick, _MARKS, author="all.a0.1")
+        bus.publish(MARKS, marks, region=GRID.region_of_tile(tile), tile=tile, author=marks.author)
