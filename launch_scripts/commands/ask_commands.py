@@ -74,7 +74,7 @@ def route(
     out            Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture.
     """
     from launch_scripts.commands import terrain_routes
-    from launch_scripts.commands.routes.route_files import check_route_file
+    from launch_scripts.commands.route_files import check_route_file
     from swarm.places import read_place
 
     if terrain is not None:

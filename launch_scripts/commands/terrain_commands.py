@@ -217,7 +217,7 @@ def rules(
     else:
         shown = rules_of_scenario(find_scenario(scenario), Path(scenario).stem)
     if picture is not None:
-        from launch_scripts.commands.terrain.slope_picture import draw_rules
+        from launch_scripts.report.terrain_figure import draw_rules
 
         draw_rules(shown, picture)
     if as_json:
@@ -440,9 +440,9 @@ def _check_target(path: Path | None, option: str, *endings: str) -> None:
 
 def _draw(terrain: Terrain, path: Path | None, title: str) -> None:
     if path is not None:
-        from launch_scripts.commands.terrain.terrain_picture import draw
+        from launch_scripts.report.terrain_figure import draw_terrain
 
-        draw(terrain, path, title)
+        draw_terrain(terrain, path, title)
 
 
 def _shares(terrain: Terrain) -> str:

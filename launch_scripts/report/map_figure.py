@@ -72,8 +72,8 @@ def draw_map(axes: Axes, ground: GroundPicture, tracks: RunTracks, report: Mappi
     axes.set_aspect("equal", anchor="NW")
     axes.grid(False)
     _draw_coordinates(axes, grid)
-    _draw_scale_bar(axes, width_km, height_km)
-    _draw_north(axes)
+    draw_scale_bar(axes, width_km, height_km)
+    draw_north(axes)
     handles = _legend(ground, groups, report.get("aloft", ()))
     axes.legend(
         handles=handles, loc="upper left", bbox_to_anchor=(0, -0.022), ncol=-(-len(handles) // 2), handlelength=1.5,
@@ -214,19 +214,21 @@ def _round_steps(low: float, high: float, many: int) -> list[float]:
     return [n * step for n in range(first, math.floor(high / step) + 1)]
 
 
-def _draw_scale_bar(axes: Axes, width_km: float, height_km: float) -> None:
-    length_km = round_length(width_km / 5)
-    x0, y0 = 0.03 * width_km, height_km * 0.965
+def draw_scale_bar(axes: Axes, width: float, height: float, unit_m: float = 1000.0) -> None:
+    """A bar of a round length, about a fifth of the width, in the lower left corner of axes of this size."""
+    length = round_length(width / 5)
+    x0, y0 = 0.03 * width, height * 0.965
     for colour, width in (("white", 6.0), (INK, 3.0)):
-        axes.plot([x0, x0 + length_km], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
+        axes.plot([x0, x0 + length], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
     axes.annotate(
-        said_length(length_km * 1000), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left",
+        said_length(length * unit_m), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left",
         fontsize=9.5,
         fontweight="bold", zorder=11, path_effects=halo(),
     )  # fmt: skip
 
 
-def _draw_north(axes: Axes) -> None:
+def draw_north(axes: Axes) -> None:
+    """An arrow to the north in the upper right corner."""
     axes.annotate(
         "N", xy=(0.968, 0.985), xytext=(0.968, 0.915), xycoords="axes fraction", ha="center", va="center",
         fontsize=10, fontweight="bold", zorder=11, path_effects=halo(),

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 from typer.testing import CliRunner
 
 from launch_scripts.commands.ask_commands import app
-from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, profile_of, write_route
+from launch_scripts.commands.route_files import DescribedRoute, metres_along, profile_of, write_route
 from launch_scripts.commands.terrain_commands import app as terrain_app
 from launch_scripts.commands.terrain_routes import corridor, find_route
 from launch_scripts.launcher.options import find_scenario

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.observe.palette import said_length
 from launch_scripts.report.export import COSTS, Feature, FieldKind, Layer, check_file, write_layers
-from shared_map.arrays import Floats
 from shared_map.terrain.places import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.places import fields_of
 
@@ -150,71 +150,13 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     if ending != ".png":
         write_layers(path, layers_of(route, ending), MapFrame(route.grid))
         return
-    try:
-        _png(route, path)
-    except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
-
-
-def _png(route: DescribedRoute, path: Path) -> None:
-    """The route on the relief, and its heights below."""
     if route.terrain is None or route.height_m is None:
         raise ConfigError(
             f"--out {path}: a picture needs the terrain; find the route with --terrain, or write .geojson"
         )
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from launch_scripts.report.terrain_figure import draw_route
 
-    from launch_scripts.observe.palette import BLUE, INK, RED, STYLE
-
-    grid = route.grid
-    x_m, y_m = route.metres()
-    long_way = max(grid.rows, grid.cols) * grid.resolution_m >= 4000
-    unit, name = (1000.0, "km") if long_way else (1.0, "m")
-    with mpl.rc_context(STYLE):
-        high = 8.0 * min(max(grid.rows / grid.cols, 0.3), 1.4)
-        figure = Figure(figsize=(8.6, high + 3.0), layout="constrained")
-        FigureCanvasAgg(figure)
-        above, below = figure.subplots(2, 1, height_ratios=[high, 2.2])
-        light, (east, south) = _relief(route.terrain)
-        extent = (0.0, east / unit, south / unit, 0.0)
-        above.imshow(light, extent=extent, interpolation="nearest", aspect="equal")
-        above.grid(visible=False)
-        along, down = (x_m - grid.west_m) / unit, (grid.north_m - y_m) / unit
-        above.plot(along, down, color="white", linewidth=3.6)
-        above.plot(along, down, color=RED, linewidth=1.8)
-        for n, label in ((0, "from"), (-1, "to")):
-            above.plot(along[n], down[n], "o", color=RED, markeredgecolor="white", markersize=7)
-            above.annotate(
-                label, (along[n], down[n]), xytext=(7, 7), textcoords="offset points", weight="bold",
-                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-            )  # fmt: skip
-        above.set(xlabel=f"east, {name}", ylabel=f"south, {name}")
-        up_m, down_m = route.climb_m or (0.0, 0.0)
-        climbed = f"{up_m:.0f} m up, {down_m:.0f} m down"
-        above.set_title(f"{route.name}: {route.length_m / unit:.4g} {name} in {route.cost_s:.0f} s, {climbed}")
-        below.plot(route.at_m / unit, route.height_m, color=BLUE, linewidth=1.4)
-        if np.isfinite(route.height_m).any():
-            below.fill_between(route.at_m / unit, np.nanmin(route.height_m), route.height_m, color=BLUE, alpha=0.15)
-        below.set(xlabel=f"along the route, {name}", ylabel="height, m", xlim=(0, max(route.length_m / unit, 1e-9)))
-        below.tick_params(labelcolor=INK)
-        figure.savefig(path, dpi=120)
-
-
-def _relief(terrain: Terrain) -> tuple[Floats, tuple[float, float]]:
-    """Colours of the relief, lethal ground dark; and (metres from west to east, metres from north to south)."""
-    from launch_scripts.commands.terrain.terrain_picture import MOST_CELLS
-    from launch_scripts.observe.palette import hillshade
-    from shared_map.terrain.pyramid import level_of
-
-    level = level_of(terrain, MOST_CELLS)
-    light = np.float32(0.35) + np.float32(0.65) * hillshade(level.elevation_m, level.grid.resolution_m)
-    ground = np.array([0.93, 0.90, 0.82], np.float32) * light[..., None]
-    lethal = np.array([0.36, 0.27, 0.46], np.float32) * light[..., None]
-    share = level.lethal_share[..., None]
-    side_m = level.grid.resolution_m
-    return np.clip(ground * (1 - share) + lethal * share, 0, 1), (
-        level.grid.cols * side_m,
-        level.grid.rows * side_m,
-    )
+    up_m, down_m = route.climb_m or (0.0, 0.0)
+    title = f"{route.name}: {said_length(float(f'{route.length_m:.4g}'))} in {route.cost_s:.0f} s"
+    title += f", {up_m:.0f} m up, {down_m:.0f} m down"
+    draw_route(route.terrain, path, title, route.metres(), route.at_m, route.height_m)

@@ -1,1 +1,0 @@
-"""Routes asked for, and written for other programs."""
