@@ -19,7 +19,7 @@ from shared_map.keeper.store import KEEPER_STORE, KeeperStore
 from shared_map.prepared_classes import load_classes
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Event
+from swarm.bus.bus import Bus, Event, Worker
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
@@ -96,7 +96,7 @@ def rebuilt(setup: RoleSetup, ground: Ground, boundary: Replaying) -> Service:
     def post(event: Event) -> None:
         """What a service tells itself is in the recording, too."""
 
-    terrain, truth, bus = ground.terrain, ground.truth, boundary.bus()
+    terrain, truth, bus = ground.terrain, ground.truth, boundary.bus(cast(Bus, boundary.nobody))
     match setup.role:
         case "keeper":
             store = boundary.external(cast(KeeperStore, None), KEEPER_STORE)
@@ -106,9 +106,8 @@ def rebuilt(setup: RoleSetup, ground: Ground, boundary: Replaying) -> Service:
             kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
             shelf = boundary.external(cast(PreparedCosts, _Costs(terrain, setup.scenario)), PREPARED_COSTS)
-            return PlannerService(
-                setup, terrain, bus, post, boundary.worker(), stopwatch, kernels, of_classes, shelf
-            )
+            worker = boundary.worker(cast(Worker, boundary.nobody))
+            return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, shelf)
         case "targets":
             return TargetsService(setup, terrain, truth, bus, post)
         case "agent":

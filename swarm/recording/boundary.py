@@ -7,12 +7,13 @@ Everything that enters a service passes here, and everything that leaves it. The
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol, TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
 
-from swarm.bus.bus import Answerer, Bus, Heard, Post, Worker
+from swarm.bus.bus import Answerer, Asked, Bus, Heard, Post, Worker
 from swarm.liveness import Peer
 from swarm.recording.external_calls import ExternalCalls, content_of, unpack
 from swarm.runtime.process import Service
@@ -44,24 +45,47 @@ class Boundary:
         return thing
 
 
-class Crossing(Protocol):
-    """Takes down what is read and let out, or says what was."""
+class Crossing(Boundary):
+    """A boundary that takes down what is read and let out, or says what was read and takes what is let out."""
+
+    def __init__(self) -> None:
+        self._asked = 0
 
     def read(self, what: str, of: Callable[[], bytes]) -> bytes:
         """The value that a service reads, packed."""
-        ...
-
-    def let_out(self, to: str, content: bytes, what: object = None) -> None:
-        """Something left the service."""
-        ...
+        raise NotImplementedError
 
     def read_as(self, what: str, of: Callable[[], T], kind: Any) -> T:
         """As `read`, of a value that is as it was outside where nothing is fed."""
-        ...
+        raise NotImplementedError
+
+    def let_out(self, to: str, content: bytes, what: object = None) -> None:
+        """Something left the service."""
+        raise NotImplementedError
 
     def submit(self, worker: Worker, tag: str, job: Callable[[], object], post: Post, model_ns: int) -> None:
         """A job is begun."""
-        ...
+        raise NotImplementedError
+
+    def bus(self, bus: Bus) -> Bus:
+        return BoundaryBus(bus, self)
+
+    def worker(self, worker: Worker) -> Worker:
+        return BoundaryWorker(worker, self)
+
+    def function(self, name: str, function: Callable[[], T] | None, kind: Any) -> Callable[[], T] | None:
+        if not self.read_as(f"there is {name}", lambda: function is not None, bool):
+            return None
+        return lambda: self.read_as(name, cast(Callable[[], T], function), kind)
+
+    def external(self, thing: T, what: ExternalCalls) -> T:
+        there = self.read_as(f"there is {what.name}", lambda: thing is not None, bool)
+        return cast(T, BoundaryObject(thing, what, self) if there else None)
+
+    def asked(self, event: Asked) -> Asked:
+        """A query whose answers cross the boundary."""
+        self._asked += 1
+        return replace(event, answerer=BoundaryAnswerer(event.answerer, event.topic, self._asked, self))
 
 
 class BoundaryBus:

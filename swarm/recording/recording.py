@@ -5,20 +5,19 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from hashlib import blake2b
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
-from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
-from swarm.recording.boundary import Boundary, BoundaryAnswerer, BoundaryBus, BoundaryObject, BoundaryWorker
+from swarm.recording.boundary import Boundary, Crossing
 from swarm.recording.events import JobDone, LoopCounters, record_of
-from swarm.recording.external_calls import ExternalCalls, content_of, pack
+from swarm.recording.external_calls import content_of, pack
 from swarm.recording.records import (
     FOLDER,
     SUFFIX,
@@ -43,11 +42,6 @@ RAISED = "raise "
 _FLUSH_NS = NS_PER_S
 _LONGEST_ERROR = 500
 _PACKAGES = ("terrain-swarm", "numba", "numpy", "msgspec")
-
-
-def there_is(name: str) -> str:
-    """The name of the reading which says whether a function or an object is there."""
-    return f"there is {name}"
 
 
 def raised_as(error: BaseException) -> str:
@@ -75,7 +69,7 @@ def path_of(folder: Path, role: str, id: str, incarnation: int) -> Path:
     return folder / FOLDER / f"{role}-{id}.{incarnation}{SUFFIX}"
 
 
-class Recording(Boundary):
+class Recording(Crossing):
     """Writes down what enters and leaves one service.
 
     Its calls are made by the thread that owns the service; jobs of the worker only note what they read, which is
@@ -83,9 +77,9 @@ class Recording(Boundary):
     """
 
     def __init__(self, setup: RoleSetup, terrain: str, folder: Path) -> None:
+        super().__init__()
         self._writer = RecordWriter(path_of(folder, setup.role, setup.id, setup.incarnation))
         self._outputs: list[Output] = []
-        self._asked = 0
         self._jobs = 0
         self._job = threading.local()
         """Of the thread that runs a job: `reads`, what that has read."""
@@ -108,22 +102,8 @@ class Recording(Boundary):
         )
         self._writer.flush()  # a process that is killed at once is named, too
 
-    def bus(self, bus: Bus) -> Bus:
-        return BoundaryBus(bus, self)
-
-    def worker(self, worker: Worker) -> Worker:
-        return BoundaryWorker(worker, self)
-
     def service(self, service: Service) -> Service:
         return _RecordedService(service, self)
-
-    def function(self, name: str, function: Callable[[], T] | None, kind: Any) -> Callable[[], T] | None:
-        self.read_as(there_is(name), lambda: function is not None, bool)
-        return None if function is None else lambda: self.read_as(name, function, kind)
-
-    def external(self, thing: T, what: ExternalCalls) -> T:
-        self.read_as(there_is(what.name), lambda: thing is not None, bool)
-        return thing if thing is None else cast(T, BoundaryObject(thing, what, self))
 
     # --- what crosses ---------------------------------------------------------------------------------------
 
@@ -171,11 +151,6 @@ class Recording(Boundary):
         worker.submit(tag, run, done, model_ns)
 
     # --- calls of the service -------------------------------------------------------------------------------
-
-    def asked(self, event: Asked) -> Asked:
-        """A query whose answers cross the boundary."""
-        self._asked += 1
-        return replace(event, answerer=BoundaryAnswerer(event.answerer, event.topic, self._asked, self))
 
     @contextmanager
     def call(self, record: Call) -> Iterator[None]:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
-from swarm.bus.bus import Answerer, Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
-from swarm.recording.boundary import Boundary, BoundaryAnswerer, BoundaryBus, BoundaryObject, BoundaryWorker
+from swarm.recording.boundary import Crossing
 from swarm.recording.events import event_of, rest_of, set_figures
-from swarm.recording.external_calls import ExternalCalls, unpack
-from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as, there_is
+from swarm.recording.external_calls import unpack
+from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as
 from swarm.recording.records import Call, Called, Cut, Ended, Handled, Output, Outputs, Read, RecordReader
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.process import Service
@@ -82,35 +82,21 @@ class _LetOut:
     what: object
 
 
-class Replaying(Boundary):
+class Replaying(Crossing):
     """Gives a service what was recorded, and takes what it lets out."""
 
     def __init__(self, namespace: str) -> None:
-        self._bus = BoundaryBus(cast(Bus, _Nobody(namespace=namespace)), self)
-        self._worker = BoundaryWorker(cast(Worker, _Nobody()), self)
+        super().__init__()
+        self.nobody = _Nobody(namespace=namespace)
+        """The bus on which nothing is heard, and the worker."""
         self.reads: deque[tuple[str, bytes]] = deque()
         """Of the event in hand: what it may still read."""
         self.outputs: list[_LetOut] = []
         """What it has let out."""
         self._jobs: dict[int, Callable[[], object]] = {}
         """Jobs whose result was not taken yet, by number."""
-        self._submitted = self._asked = 0
+        self._submitted = 0
         self._in_job = False
-
-    def bus(self, bus: Bus | None = None) -> Bus:
-        return self._bus
-
-    def worker(self, worker: Worker | None = None) -> Worker:
-        return self._worker
-
-    def function(self, name: str, function: Callable[[], T] | None, kind: Any) -> Callable[[], T] | None:
-        if not self.read_as(there_is(name), None, bool):
-            return None
-        return lambda: cast(T, self.read_as(name, function, kind))
-
-    def external(self, thing: T, what: ExternalCalls) -> T:
-        there = self.read_as(there_is(what.name), None, bool)
-        return cast(T, BoundaryObject(thing, what, self) if there else None)
 
     # --- what crosses ---------------------------------------------------------------------------------------
 
@@ -145,10 +131,8 @@ class Replaying(Boundary):
             return self._job_done(*rest_of(record))
         event = event_of(record, _nobody_asks)
         if isinstance(event, Asked):
-            self._asked += 1
             (timeout_s,) = record.rest
-            answerer = cast(Answerer, _Nobody(timeout_s=timeout_s))
-            event = replace(event, answerer=BoundaryAnswerer(answerer, event.topic, self._asked, self))
+            return self.asked(replace(event, answerer=cast(Answerer, _Nobody(timeout_s=timeout_s))))
         return event
 
     def _job_done(self, tag: str, number: int, took_ns: int, read: list[tuple[str, bytes]]) -> WorkDone:

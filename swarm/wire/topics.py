@@ -12,31 +12,7 @@ from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
 from swarm.wire.codec import prime
-from swarm.wire.messages import Message, Nothing
-from swarm.wire.messages.map_data import (
-    BaseMap,
-    BaseMapRequest,
-    BaseMapTile,
-    Digest,
-    MarkSet,
-    MarkSets,
-    MarksRequest,
-)
-from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
-from swarm.wire.messages.planning import (
-    Believed,
-    CostReply,
-    CostRequest,
-    PlannerStatus,
-    PushedRoute,
-    RouteReply,
-    RouteRequest,
-    Sighted,
-    TargetPose,
-)
-from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
-from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.messages.vehicles import Body, Chasers, Fleet, Followed, Removed, RemoveVehicles, SharedCosts
+from swarm.wire.messages import Message, Nothing, map_data, orders, planning, processes, traffic, vehicles
 
 
 class Priority(Enum):
@@ -180,116 +156,117 @@ OBEYING = "agent planner targets keeper"
 OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
 
 RUN = Topic(
-    "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
-    access(serve=MEMBERS_OWN, ask=MEMBERS),
-    request=Nothing, published=False,
+    "run", "run/{role}/{id}", processes.RunInfo, "which run and terrain a process belongs to",
+    "asked at every start", access(serve=MEMBERS_OWN, ask=MEMBERS), request=Nothing, published=False,
 )  # fmt: skip
 MARKS = Topic(
-    "marks", "marks/{region}/{tile}/{author}", MarkSet,
+    "marks", "marks/{region}/{tile}/{author}", map_data.MarkSet,
     "an author's whole set for a tile; the author and the keeper answer for it",
     "on change, at most 10 Hz a tile",
     access(
         put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
         hear=f"{_REPLICAS} rover:author",
     ),
-    request=MarksRequest, bulk=MarkSets, buffer=8192,
+    request=map_data.MarksRequest, bulk=map_data.MarkSets, buffer=8192,
 )  # fmt: skip
 DIGEST = Topic(
-    "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
+    "digest", "digest/{author}", map_data.Digest, "which sets a replica holds", "1 Hz, and on change",
     access(put="agent:author rover:author keeper:author", hear=_REPLICAS),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_MAP = Topic(
-    "base-map", "base/{keeper}", BaseMap, "what a keeper has of the terrain, for those who lack its files",
+    "base-map", "base/{keeper}", map_data.BaseMap, "what a keeper has of the terrain, for those who lack its files",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
     request=Nothing, published=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_TILES = Topic(
-    "base-tiles", "base/{keeper}/tiles", BaseMapTile, "the terrain itself, by layer and region",
+    "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, "the terrain itself, by layer and region",
     "asked at a start",
     access(serve="keeper:keeper", ask=MEMBERS),
-    request=BaseMapRequest, published=False, priority=Priority.BACKGROUND,
+    request=map_data.BaseMapRequest, published=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 FLEET = Topic(
-    "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
-    access(put="agent:author", hear="targets monitor planner"),
+    "fleet", "fleet/{region}/{author}", vehicles.Fleet, "where the vehicles of an agent are; newest only",
+    "every tick", access(put="agent:author", hear="targets monitor planner"),
 )  # fmt: skip
 CHASERS = Topic(
-    "chasers", "target/{target}/chasers/{author}", Chasers,
+    "chasers", "target/{target}/chasers/{author}", vehicles.Chasers,
     "which vehicles of an agent chase a target, for its planner, and where routes for them may begin",
     "when a vehicle takes or leaves the target or has driven past the cell told; else 1 Hz",
     access(put="agent:author", hear="planner:target"),
 )  # fmt: skip
 SHARED_COSTS = Topic(
-    "shared-costs", "costs/{group}/{author}", SharedCosts,
+    "shared-costs", "costs/{group}/{author}", vehicles.SharedCosts,
     "what an agent's vehicles need to each target, for a group that shares them out", "per `vehicles.reassign_s`, "
     "only where `groups[].assignment` asks for it",
     access(put="agent:author", hear="agent"), echoed=False,
 )  # fmt: skip
 STANDING = Topic(
-    "standing", "standing/{plot}/{member}/{agent}", Standing,
+    "standing", "standing/{plot}/{member}/{agent}", traffic.Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
     "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
-    "table", "table/{plot}/{member}/{agent}", Table,
+    "table", "table/{plot}/{member}/{agent}", traffic.Table,
     "which cells the warden of a plot has granted, for one of its members; a member that is asked promises an "
     "epoch and answers with what it has stored", "on change, and at 5 Hz until both others have it on file",
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
-    request=Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
+    request=traffic.Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 GRANTED = Topic(
-    "granted", "granted/{plot}/{host}/{agent}", Granted,
+    "granted", "granted/{plot}/{host}/{agent}", traffic.Granted,
     "which cells of a plot its warden has granted to one host, on file with its members", "on change, else 5 Hz",
     access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{plot}/{member}/{agent}", Stored, "which table a member has on file, for another one",
+    "stored", "stored/{plot}/{member}/{agent}", traffic.Stored, "which table a member has on file, for another one",
     "per table by one member, 5 Hz by the other; 5 Hz by the warden, instead of a table that both have on file",
     access(put="agent:agent", hear="agent:member"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
-    "known", "known/{agent}", Known, "what an agent has on file about another, or a guest, for a new life of that",
-    "asked at a start", access(serve="agent:agent", ask="agent rover"), request=KnownRequest, published=False,
-    trusted=True, priority=Priority.INTERACTIVE,
+    "known", "known/{agent}", traffic.Known,
+    "what an agent has on file about another, or a guest, for a new life of that", "asked at a start",
+    access(serve="agent:agent", ask="agent rover"),
+    request=traffic.KnownRequest, published=False, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 LEAVE = Topic(
-    "leave", "leave/{agent}", Removed, "which vehicles have left, for an operator who asks an agent to let them",
-    "asked", access(serve="agent:agent"), request=RemoveVehicles, published=False, trusted=True,
-    priority=Priority.INTERACTIVE,
+    "leave", "leave/{agent}", vehicles.Removed,
+    "which vehicles have left, for an operator who asks an agent to let them", "asked",
+    access(serve="agent:agent"),
+    request=vehicles.RemoveVehicles, published=False, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
-    "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
+    "followed", "vehicle/{agent}/{vehicle}/followed", vehicles.Followed, "the route that a vehicle has begun",
     "per new route",
     access(put="agent:agent", hear="monitor"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
-    "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
+    "pushed-route", "vehicle/{agent}/{vehicle}/route", planning.PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
     access(put="planner", hear="agent:agent rover:agent"),
 )  # fmt: skip
 POSE = Topic(
-    "pose", "target/{target}/pose", TargetPose,
+    "pose", "target/{target}/pose", planning.TargetPose,
     "where a target is, by a tracker of it; each counts, as one tracker must not hide another's words",
     "per quarter of a cell, at least 2 Hz",
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
 )  # fmt: skip
 TRUE_POSE = Topic(
-    "true-pose", "world/target/{target}/pose", TargetPose,
+    "true-pose", "world/target/{target}/pose", planning.TargetPose,
     "where a target is that nobody tracks: for simulated sensors, not for planners", "as poses",
     access(put="targets", hear="agent targets"),
 )  # fmt: skip
 SIGHTED = Topic(
-    "sighted", "sighted/{target}/{author}", Sighted, "where a vehicle of this author saw a target",
+    "sighted", "sighted/{target}/{author}", planning.Sighted, "where a vehicle of this author saw a target",
     "while it is in sight, at most 2 Hz",
     access(put="agent:author", hear="agent planner keeper monitor"),
 )  # fmt: skip
 BODY = Topic(
-    "body", "body/{id}", Body,
+    "body", "body/{id}", vehicles.Body,
     "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
     "a person; each counts, as two senders under one id must not hide each other",
     "10 Hz while it moves, else once a second at least",
@@ -297,61 +274,61 @@ BODY = Topic(
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 ROUTE = Topic(
-    "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
+    "route", "target/{target}/route", planning.RouteReply, "routes from cells to the target", "asked",
     access(serve="planner:target", ask="agent rover"),
-    request=RouteRequest, published=False,
+    request=planning.RouteRequest, published=False,
 )  # fmt: skip
 COST = Topic(
-    "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
+    "cost", "target/{target}/cost", planning.CostReply, "cost-to-go of a batch of cells", "asked",
     access(serve="planner:target", ask="agent targets monitor rover"),
-    request=CostRequest, published=False,
+    request=planning.CostRequest, published=False,
 )  # fmt: skip
 STATUS = Topic(
-    "status", "target/{target}/status", PlannerStatus, "how a planner is doing", "2 Hz",
+    "status", "target/{target}/status", planning.PlannerStatus, "how a planner is doing", "2 Hz",
     access(put="planner:target", hear="targets monitor tracker:target"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BELIEVED = Topic(
-    "believed", "target/{target}/believed", Believed, "where a target may be that is searched for",
+    "believed", "target/{target}/believed", planning.Believed, "where a target may be that is searched for",
     "1 Hz during a search",
     access(put="planner:target", hear="monitor"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 LEAD = Topic(
-    "lead", "lead/{role}/{id}", Beat, "which of the processes with one job are ready, and which leads",
+    "lead", "lead/{role}/{id}", processes.Beat, "which of the processes with one job are ready, and which leads",
     "10 Hz, where there are standbys",
     access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 ZONES = Topic(
-    "zones", "order/{keeper}/zones", Zones, "adds, removes and lists zones: areas that operators close",
+    "zones", "order/{keeper}/zones", orders.Zones, "adds, removes and lists zones: areas that operators close",
     "asked by people", access(serve="keeper:keeper"),
-    request=ZoneOrder, published=False, priority=Priority.INTERACTIVE,
+    request=orders.ZoneOrder, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 GIVE_ORDER = Topic(
-    "give-order", "order/{keeper}/give", Orders,
+    "give-order", "order/{keeper}/give", orders.Orders,
     "enters an order into a keeper's book: pause, stop, whom to chase, which targets, settings", "asked by people",
-    access(serve="keeper:keeper"), request=GiveOrder, published=False, priority=Priority.INTERACTIVE,
+    access(serve="keeper:keeper"), request=orders.GiveOrder, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 ORDERS = Topic(
-    "orders", "orders/{role}/{id}", Orders,
+    "orders", "orders/{role}/{id}", orders.Orders,
     "what is ordered: keepers tell it, and everybody answers who starts and hears no keeper", "1 Hz, and on change",
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
     request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 OBEYED = Topic(
-    "obeyed", "obeyed/{role}/{id}", Obeyed, "that a process obeys an order, as soon as it does",
+    "obeyed", "obeyed/{role}/{id}", orders.Obeyed, "that a process obeys an order, as soon as it does",
     "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
-    request=Obey, published=False, priority=Priority.INTERACTIVE,
+    request=orders.Obey, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STATS = Topic(
-    "stats", "stats/{role}/{id}", Stats,
+    "stats", "stats/{role}/{id}", processes.Stats,
     "what a process has counted; keepers answer with the last words of processes that are gone", "1 Hz",
     access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"),
     request=Nothing, priority=Priority.BACKGROUND,
 )  # fmt: skip
 NOTE = Topic(
-    "note", "note/{role}/{id}", Note, "something worth telling a person", "as it happens",
+    "note", "note/{role}/{id}", processes.Note, "something worth telling a person", "as it happens",
     access(put=MEMBERS_OWN, hear="monitor"),
     newest=False, priority=Priority.BACKGROUND,
 )  # fmt: skip

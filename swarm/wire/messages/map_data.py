@@ -67,14 +67,6 @@ def check_lengths(
     count: int, cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes, untils_ns: bytes = b""
 ) -> None:
     """Raise ValueError unless these are columns of `count` statements; `untils_ns` may be empty."""
-    if (
-        len(kinds) == count
-        and len(cells) == 2 * count
-        and len(paces) == 4 * count
-        and len(stamps_ns) == 8 * count
-        and len(untils_ns) in (0, 8 * count)
-    ):
-        return
     check_column("cells", cells, 2, count)
     check_column("kinds", kinds, 1, count)
     check_column("paces", paces, 4, count)

@@ -163,50 +163,5 @@ def test_one_route_is_judged_at_a_glance_as_by_the_rules() -> None:
     assert len(faults) > 30
 
 
-FEW = np.array([0, 1, 2, 3, 5, 8])
-INFINITE = np.array([0.0, 1.0, math.inf])
-
-
-@given(st.data())
-def test_few_routes_are_judged_as_lists_as_they_are_as_arrays(data: st.DataObject) -> None:
-    """Columns of the right lengths, whatever else is wrong with them: steps, legs and numbers that contradict each
-    other."""
-    many = data.draw(st.integers(0, 4))
-
-    def drawn(from_: np.ndarray, dtype: str, size: int) -> bytes:
-        at = data.draw(st.lists(st.integers(0, len(from_) - 1), min_size=size, max_size=size))
-        return from_[at].astype(dtype).tobytes()
-
-    steps = drawn(FEW, "<u4", many)
-    right = -(-int(np.frombuffer(steps, "<u4").sum()) // 8) * 3
-    given_legs = data.draw(st.sampled_from(("none", "of each", "any")))
-    of_each = np.frombuffer(steps, "<u4")
-    legs = {
-        "none": lambda: b"",
-        "of each": lambda: of_each[of_each > 0].tobytes(),
-        "any": lambda: drawn(FEW[1:], "<u4", data.draw(st.integers(0, 4))),
-    }[given_legs]()
-    columns = msgspec.structs.replace(COLUMNS)
-    fields = {
-        "statuses": drawn(np.arange(len(STATUSES)), "u1", many),
-        "starts": drawn(FEW, "<i8", many),
-        "steps": steps,
-        "directions": bytes(data.draw(st.sampled_from((right, right, right + 3, max(right - 3, 0))))),
-        "legs": legs,
-        **{name: drawn(INFINITE, "<f8", many) for name in named._NUMBERS},
-    }
-    for name, value in fields.items():
-        msgspec.structs.force_setattr(columns, name, value)
-
-    def fault(judge: Callable[[named.Routes], None]) -> str | None:
-        try:
-            judge(columns)
-        except ValueError as error:
-            return str(error)
-        return None
-
-    assert fault(named.Routes._relate_listed) == fault(named.Routes._relate_arrays)
-
-
 def test_ok_is_the_first_status() -> None:
     assert (OK, STATUSES[OK]) == (0, RouteStatus.OK)
