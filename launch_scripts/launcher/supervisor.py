@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
@@ -114,6 +114,29 @@ class Running:
         """Whether this life has said so: nothing of it can be lost any more, however it leaves."""
         return isinstance(self.hear_last_word(), EndedAsAsked)
 
+    @property
+    def exitcode(self) -> int | None:
+        """That of a process which has ended; None as long as it runs, or if there is none."""
+        return None if self.process is None else self.process.exitcode
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.join(1.0)
+
+    def send(self, number: signal.Signals) -> None:
+        """Sends a signal to the process, if there is one."""
+        if self.process is not None and self.process.pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.process.pid, number)
+
+    def state(self) -> str:
+        """What it does, as far as the kernel says."""
+        with contextlib.suppress(psutil.Error):
+            process = psutil.Process(self.process.pid if self.process is not None else None)
+            return f"{process.status()}, {process.num_threads()} threads"
+        return "gone"
+
     def hear_last_word(self) -> ExitReason | EndedAsAsked | None:
         with contextlib.suppress(EOFError, OSError):
             if self.last_word is None and self.pipe is not None and self.pipe.poll():
@@ -192,11 +215,9 @@ class LocalSwarm:
     def _let_go(self) -> None:
         """Forget dismissed processes that have ended, and kill those that do not."""
         for running in [each for each in self.running if each.dismissed_s is not None]:
-            process = running.process
-            assert running.dismissed_s is not None
-            if process is not None and process.exitcode is None:
-                if time.monotonic() - running.dismissed_s > STOP_GRACE_S:
-                    process.kill()
+            if running.alive and running.exitcode is None:
+                if time.monotonic() - (running.dismissed_s or 0.0) > STOP_GRACE_S:
+                    running.kill()
                 continue
             self._forget(running)
             self.running.remove(running)
@@ -213,7 +234,7 @@ class LocalSwarm:
             if running.dismissed_s is not None:
                 continue
             if process is not None and process.sentinel in ended and process.exitcode is not None:
-                endings.append(self._ended(running, process))
+                endings.append(self._ended(running, process.exitcode))
             elif running.begins_when is not None and running.begins_when():
                 running.begins_when = None
                 self._start(running)
@@ -242,9 +263,7 @@ class LocalSwarm:
             if running.hung_s is None:
                 running.hung_s = now_s
                 log.error("%s hangs: its loop stands still for %.0f s", running.spec.name, STILL_S)
-                if process.pid is not None:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(process.pid, signal.SIGABRT)
+                running.send(signal.SIGABRT)
             elif now_s - running.hung_s > STOP_GRACE_S:
                 process.kill()
 
@@ -271,20 +290,30 @@ class LocalSwarm:
             of_role = [running for running in self.running if running.spec.role == role and running.alive]
             if of_role and not force():
                 before_role(role)
-                failures += self._stop(of_role, while_waiting, force)
-        self._see_off(while_waiting, force)
-        if left := [running for running in self.running if running.alive]:
-            self._stop_at_once(left, while_waiting)
+                _ask(of_role, STOP_GRACE_S, while_waiting, force)
+                failures += [said for running in of_role if (said := self._failure(running, force())) is not None]
+        leaving = [running for running in self.running if running.alive and running.ended_as_asked]
+        _wait(lambda: all(each.exitcode is not None for each in leaving), STOP_GRACE_S, while_waiting, force)
+        for running in leaving:
+            if running.exitcode is None:
+                log.warning("%s has ended and does not leave: %s", running.spec.name, running.state())
+                running.kill()
+            self._forget(running)
+        left = [running for running in self.running if running.alive]
+        _ask(left, FORCED_GRACE_S, while_waiting, lambda: False)
+        for running in left:
+            if running.exitcode is None:
+                running.kill()
+                self.cut_short.append(running.spec.name)
+            self._forget(running)
         return failures
 
     def kill(self) -> None:
         """Kills all processes."""
         for running in self.running:
             running.due_s = running.begins_when = None
-            if running.process is not None:
-                running.process.kill()
-                running.process.join(1.0)
-                self._forget(running)
+            running.kill()
+            self._forget(running)
 
     def _start(self, running: Running, restarts: int = 0) -> None:
         listen, tell = self._context.Pipe(duplex=False)
@@ -294,30 +323,22 @@ class LocalSwarm:
             running.health = self._context.RawArray(ctypes.c_char, BOARD_BYTES)
         running.health[:] = bytes(BOARD_BYTES)  # of the life before
         reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
-        process = self._context.Process(
-            target=run_child,
-            args=(
-                spec.entry,
-                replace(
-                    setup,
-                    restarts=restarts,
-                    anew=setup.anew and not restarts,
-                    takes_over=running.takes_over and not restarts,
-                ),
-                reports,
-            ),
-            name=spec.name,
-            daemon=True,  # should the launcher itself fail, multiprocessing ends them
+        first = not restarts
+        setup = replace(
+            setup, restarts=restarts, anew=setup.anew and first, takes_over=running.takes_over and first
         )
+        # Daemons: should the launcher itself fail, multiprocessing ends them.
+        arguments = (spec.entry, setup, reports)
+        process = self._context.Process(target=run_child, args=arguments, name=spec.name, daemon=True)
         with without_main():
             process.start()
         tell.close()
         running.process, running.pipe, running.last_word = process, listen, None
         running.began_s, running.due_s, running.hung_s = time.monotonic(), None, None
 
-    def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
+    def _ended(self, running: Running, code: int) -> Ending:
         """Decides what follows an unexpected end."""
-        reason = self._exit_reason(running, process)
+        reason = self._exit_reason(running, code)
         self._forget(running)
         now_s = time.monotonic()
         ran_s = now_s - running.began_s
@@ -339,68 +360,33 @@ class LocalSwarm:
         first = running.restarts == 0 and ran_s < SETTLED_S
         return first or (exit_code != StoreError.exit_code and len(running.refused_s) >= REFUSALS_ALLOWED)
 
-    def _exit_reason(self, running: Running, process: ForkServerProcess) -> ExitReason:
-        code = process.exitcode if process.exitcode is not None else 1
-        if code == 255 and process.pid is not None:
+    def _exit_reason(self, running: Running, code: int) -> ExitReason:
+        if code == 255:
             # The forkserver is gone and reports no more ends: kill, because two processes of one id must not run.
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
+            running.send(signal.SIGKILL)
         if isinstance(reason := running.hear_last_word(), ExitReason):
             return reason
-        if running.hung_s is not None:
-            return ExitReason("its loop stood still, so it was killed; its log says where", 1, refused=False)
-        if code == -KILLED_BY:
-            return ExitReason("a plug-in did not come back from native code; its log says where", 1, refused=False)
-        if code < 0:
-            return ExitReason(f"killed by {signal.Signals(-code).name}", 1, refused=False)
         how = "ended by itself" if code == 0 else f"ended with exit code {code}"
+        if code < 0:
+            how = f"killed by {signal.Signals(-code).name}"
+        if code == -KILLED_BY:
+            how = "a plug-in did not come back from native code; its log says where"
+        if running.hung_s is not None:
+            how = "its loop stood still, so it was killed; its log says where"
         return ExitReason(how, 1, refused=False)
 
-    def _stop(
-        self, of_role: list[Running], while_waiting: Callable[[], None], force: Callable[[], bool]
-    ) -> list[str]:
-        _ask(of_role, while_waiting, STOP_GRACE_S, force)
-        failures = []
-        for running in of_role:
-            process = running.process
-            assert process is not None
-            if running.ended_as_asked:
-                continue
-            if process.exitcode is None:
-                if force():
-                    continue
-                process.kill()
-                process.join(1.0)
-                failures.append(f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed")
-            elif process.exitcode not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
-                reason = self._exit_reason(running, process)
-                failures.append(f"{running.spec.name} was asked to end, but {reason.sentence}")
-            self._forget(running)
-        return failures
-
-    def _see_off(self, while_waiting: Callable[[], None], force: Callable[[], bool]) -> None:
-        """Waits for those that have said that they ended, and kills what is left of them."""
-        leaving = [running for running in self.running if running.process is not None and running.ended_as_asked]
-        deadline_s = time.monotonic() + STOP_GRACE_S
-        while time.monotonic() < deadline_s and not force():
-            if all(running.process is None or running.process.exitcode is not None for running in leaving):
-                break
-            while_waiting()
-        for running in leaving:
-            process = running.process
-            if process is not None and process.exitcode is None and process.pid is not None:
-                log.warning("%s has ended and does not leave: %s", running.spec.name, _state_of(process.pid))
-                process.kill()
-            self._forget(running)
-
-    def _stop_at_once(self, left: list[Running], while_waiting: Callable[[], None]) -> None:
-        _ask(left, while_waiting, FORCED_GRACE_S)
-        for running in left:
-            assert running.process is not None
-            if running.process.exitcode is None:
-                running.process.kill()
-                self.cut_short.append(running.spec.name)
-            self._forget(running)
+    def _failure(self, running: Running, force: bool) -> str | None:
+        """What kept a process that was asked to end from doing so, in words; it is forgotten if it has ended."""
+        code, said = running.exitcode, None
+        if running.ended_as_asked or (code is None and force):
+            return None
+        if code is None:
+            running.kill()
+            said = f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed"
+        elif code not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
+            said = f"{running.spec.name} was asked to end, but {self._exit_reason(running, code).sentence}"
+        self._forget(running)
+        return said
 
     def _forget(self, running: Running) -> None:
         if running.pipe is not None:
@@ -411,32 +397,23 @@ class LocalSwarm:
 
 
 def _ask(
-    processes: list[Running],
-    while_waiting: Callable[[], None],
-    within_s: float,
-    force: Callable[[], bool] = lambda: False,
+    processes: Sequence[Running], within_s: float, while_waiting: Callable[[], None], force: Callable[[], bool]
 ) -> None:
     """Ask processes to end, and wait until all have, the time is over, or `force` says so."""
     for running in processes:
-        assert running.process is not None
-        running.process.terminate()
+        if running.process is not None:
+            running.process.terminate()
+    ended = lambda: all(each.ended_as_asked or each.exitcode is not None for each in processes)  # noqa: E731
+    _wait(ended, within_s, while_waiting, force)
+
+
+def _wait(
+    done: Callable[[], bool], within_s: float, while_waiting: Callable[[], None], force: Callable[[], bool]
+) -> None:
+    """Wait until it is done, the time is over, or `force` says so."""
     deadline_s = time.monotonic() + within_s
-    while time.monotonic() < deadline_s and not force():
+    while not done() and time.monotonic() < deadline_s and not force():
         while_waiting()
-        if all(
-            running.process is None or running.ended_as_asked or running.process.exitcode is not None
-            for running in processes
-        ):
-            return
-
-
-def _state_of(pid: int) -> str:
-    """What keeps a process, as far as the kernel says."""
-    try:
-        process = psutil.Process(pid)
-        return f"{process.status()}, {process.num_threads()} threads"
-    except psutil.Error:
-        return "gone"
 
 
 class HangWatch:
