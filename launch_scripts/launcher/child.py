@@ -16,6 +16,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
@@ -105,9 +107,9 @@ def _run_until_launcher_ends(niceness: int) -> None:
     """Blocks until the launcher is gone. A role calls it once it is built, and gives way to others from then on.
     It does not before: all wait for whoever still starts."""
     with contextlib.suppress(OSError):  # not every system lets a process choose
-        for thread in map(int, os.listdir("/proc/self/task")):
-            now = os.getpriority(os.PRIO_PROCESS, thread)
-            os.setpriority(os.PRIO_PROCESS, thread, min(now + niceness, 19))
+        for thread in psutil.Process().threads():
+            now = os.getpriority(os.PRIO_PROCESS, thread.id)
+            os.setpriority(os.PRIO_PROCESS, thread.id, min(now + niceness, 19))
     wait_for_launcher()
 
 

@@ -203,27 +203,14 @@ def _busy_line(
 
 @contextlib.contextmanager
 def progress() -> Iterator[Tell]:
-    """Yields what draws one bar per kind of work, on a terminal only and after the first second."""
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+    """Yields what tells how far some work is, on a terminal only and after the first second."""
+    console, now = Console(stderr=True), ["working"]
 
-    started_s = time.monotonic()
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as shown:
-        tasks: dict[str, TaskID] = {}
+    def tell(what: str, share: float) -> None:
+        now[0] = f"{what}, {share:.0%}"
 
-        def tell(what: str, share: float) -> None:
-            if what not in tasks:
-                if time.monotonic() - started_s < _PATIENCE_S:
-                    return
-                tasks[what] = shown.add_task(what, total=1.0)
-            shown.update(tasks[what], completed=share)
-
+    shown = _busy_line(console, console.print, lambda: now[0], changes=True)
+    with shown if console.is_terminal else contextlib.nullcontext():
         yield tell
 
 

@@ -16,7 +16,6 @@ from launch_scripts.check.settings import check_start
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
-from launch_scripts.launcher.machine_signals import MachineSignals
 from launch_scripts.launcher.options import (
     UpOptions,
     as_process,
@@ -27,13 +26,12 @@ from launch_scripts.launcher.options import (
     table_of,
 )
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
-from launch_scripts.launcher.own_part import OwnPart
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
-from launch_scripts.launcher.stop_signals import StopAsked
+from launch_scripts.launcher.signals import MachineSignals, StopAsked
 from launch_scripts.launcher.supervisor import Ending, LocalSwarm
 from launch_scripts.launcher.tables import live_table, plain_line
 from launch_scripts.launcher.takeover import TakeOver
-from launch_scripts.launcher.watcher import Watcher, check_vacant
+from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
 from launch_scripts.observe import facts
 from launch_scripts.observe.plan import plan_of_members
 from launch_scripts.observe.recorder import Recorder

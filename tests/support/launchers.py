@@ -16,7 +16,7 @@ from support.live_swarm import client, write_scenario
 from support.neighbour import ROOT, environment_of
 from support.processes import eventually
 
-from launch_scripts.launcher.stop_signals import SAME_S
+from launch_scripts.launcher.signals import SAME_S
 from swarm.bus.bus import Event, Heard
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus

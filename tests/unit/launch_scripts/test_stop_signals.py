@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from launch_scripts.launcher.stop_signals import StopAsked
+from launch_scripts.launcher.signals import StopAsked
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -31,7 +31,7 @@ def _handlers() -> Iterator[None]:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     now_s = [100.0]
-    monkeypatch.setattr("launch_scripts.launcher.stop_signals.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("launch_scripts.launcher.signals.time.monotonic", lambda: now_s[0])
     return lambda seconds: now_s.__setitem__(0, now_s[0] + seconds)
 
 
@@ -90,7 +90,7 @@ def test_the_report_is_written_after_two_signals_and_left_by_one_more(clock: Cal
 _TALKER = """
 import logging, sys, time
 from pathlib import Path
-from launch_scripts.launcher.stop_signals import StopAsked
+from launch_scripts.launcher.signals import StopAsked
 from launch_scripts.launcher.console import Terminal
 
 asked, terminal, out = StopAsked(), Terminal(False, sys.argv[2] == "plain"), Path(sys.argv[1])

@@ -13,8 +13,7 @@ from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
 from launch_scripts.launcher.options import UpOptions
-from launch_scripts.launcher.own_part import OwnPart
-from launch_scripts.launcher.watcher import Watcher
+from launch_scripts.launcher.watcher import OwnPart, Watcher
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, planner_spec, processes_of
 from swarm.clock import NS_PER_S
