@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.check.settings import check_start
+from launch_scripts.check.scenario_check import check_start
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, Namespace, ScenarioArgument, Tls
@@ -23,8 +23,8 @@ from launch_scripts.deploy import certificates, revocations
 from launch_scripts.deploy.host_scenario import CERTIFICATES
 from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import keepers_before, write_kits
-from launch_scripts.deploy.plan import COLUMNS, Plan, make_plan, rows
-from launch_scripts.deploy.plan import as_json as plan_fields
+from launch_scripts.deploy.machine_plan import COLUMNS, Plan, make_plan, rows
+from launch_scripts.deploy.machine_plan import as_json as plan_fields
 from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
 from launch_scripts.deploy.size import (
     CELLS_PER_VEHICLE,

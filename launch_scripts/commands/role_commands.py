@@ -169,9 +169,9 @@ def run_role(
     from launch_scripts.launcher import options
     from launch_scripts.launcher.child import load_entry
     from launch_scripts.launcher.console import progress
+    from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.log_file import Speaker, log_to
     from launch_scripts.launcher.options import next_incarnation
-    from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import TABLE, processes_of
     from swarm.config.agents import added_agent

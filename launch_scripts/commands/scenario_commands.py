@@ -149,12 +149,14 @@ def _read(answer: object, kind: type[Any]) -> Any:
 
 def _check_choices(path: Path, choices: Choices) -> None:
     """Raises ConfigError where something chosen is not possible, by the option's name."""
-    from launch_scripts.check import settings
+    from launch_scripts.check import scenario_check
     from swarm.config.load import read_scenario
 
     option_of = {key: f"--{name}" for name, (key, _) in _ASKED.items()}
     scenario, faults = read_scenario(_text(path, choices), str(path), path.parent)
-    found = faults if scenario is None else [*faults, *(each.sentence for each in settings.files_named(scenario))]
+    found = (
+        faults if scenario is None else [*faults, *(each.sentence for each in scenario_check.files_named(scenario))]
+    )
     for sentence in found:
         key, _, rest = sentence.removeprefix(f"{path}: ").partition(": ")
         raise ConfigError(f"{option_of.get(key, key)}: {rest}")
@@ -219,7 +221,7 @@ def check(
 
     swarm check my.toml --json | jq .findings
     """
-    from launch_scripts.check import settings
+    from launch_scripts.check import scenario_check
     from launch_scripts.check.findings import as_fields, failure
     from launch_scripts.launcher.options import scenario_path, with_port
     from swarm.config.input_files import FileKind, read_text
@@ -234,7 +236,7 @@ def check(
             read = with_port(read, port)
         found += [
             finding._replace(about=f"{path}: {finding.about}" if finding.about else str(path))
-            for finding in (_findings(read, runs, facts) if not faults else settings.files_named(read))
+            for finding in (_findings(read, runs, facts) if not faults else scenario_check.files_named(read))
         ]
     found.sort(key=lambda finding: finding.level != "failure")  # failures stand before warnings
     if as_json:
@@ -247,26 +249,26 @@ def check(
 
 def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
     """facts  what is learnt on the way, for the last line"""
-    from launch_scripts.check import settings
+    from launch_scripts.check import scenario_check
     from launch_scripts.check.findings import warning
     from launch_scripts.ports import check_ports
     from launch_scripts.process_table import ROLES
 
-    yield from settings.network(scenario)
-    yield from settings.meets(scenario)
-    yield from settings.plugins(scenario)
+    yield from scenario_check.network(scenario)
+    yield from scenario_check.meets(scenario)
+    yield from scenario_check.plugins(scenario)
     try:
         check_ports(scenario, ROLES)
     except BusError as error:  # it may be free when the run starts
         yield warning("", str(error))
-    broken = [*settings.files_named(scenario), *settings.places_counted(scenario)]
+    broken = [*scenario_check.files_named(scenario), *scenario_check.places_counted(scenario)]
     yield from broken
     if not broken:
         yield from _of_ground(scenario, runs, facts)
 
 
 def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    from launch_scripts.check import ground, machine
+    from launch_scripts.check import machine, scenario_check
     from launch_scripts.check.findings import failure
     from launch_scripts.launcher.console import progress
     from shared_map.terrain.terrain import build_terrain, build_truth
@@ -278,8 +280,8 @@ def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterato
     except SwarmError as error:
         yield failure("", str(error))
         return
-    yield from ground.places(scenario, terrain, truth)
-    yield from ground.plots(scenario, terrain.grid)
+    yield from scenario_check.places(scenario, terrain, truth)
+    yield from scenario_check.plots(scenario, terrain.grid)
     wanted, here = machine.needs_of(scenario, terrain.grid.cells), machine.this_machine(runs)
     yield from machine.against(scenario, wanted, here, runs)
     facts |= _facts(scenario, terrain, wanted, here)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from launch_scripts.deploy.plan import Plan, PlannedHost
+from launch_scripts.deploy.machine_plan import Plan, PlannedHost
 from swarm.config.ground import ZoneConfig
 from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES
 from swarm.config.plugin_names import plugins_of

@@ -16,7 +16,7 @@ import msgspec
 from launch_scripts.deploy.certificates import CA, THIS_MACHINE, authority, issue, may_stay, private_file
 from launch_scripts.deploy.host_scenario import CERTIFICATES, GROUND, host_scenario, parts_of, plugin_files
 from launch_scripts.deploy.hosts import HostName
-from launch_scripts.deploy.plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
+from launch_scripts.deploy.machine_plan import KEEPER, ROUTER, Plan, PlannedHost, as_json, router_name
 from launch_scripts.deploy.revocations import FILE as REVOKED
 from launch_scripts.deploy.revocations import revoked_in
 from launch_scripts.observe.run_folder import write_file

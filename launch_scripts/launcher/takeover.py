@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from launch_scripts.launcher.supervisor import Running
+from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.liveness import job_of

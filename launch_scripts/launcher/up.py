@@ -11,10 +11,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.check.ground import check_places
-from launch_scripts.check.settings import check_start
+from launch_scripts.check.scenario_check import check_places, check_start
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
+from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
+from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.options import (
     UpOptions,
@@ -26,9 +27,7 @@ from launch_scripts.launcher.options import (
     table_of,
 )
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
-from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.signals import MachineSignals, StopAsked
-from launch_scripts.launcher.supervisor import Ending, LocalSwarm
 from launch_scripts.launcher.tables import live_table, plain_line
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant

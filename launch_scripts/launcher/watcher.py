@@ -135,7 +135,7 @@ class Watcher:
         self._observer = RunObserver(bus, self._inbox.post, known, {STATS: 0.0, NOTE: 0.0, **hears})
 
     def begin(self) -> None:
-        self._observer.collect(self._everywhere)
+        self._observer.keep_samples(self._everywhere)
         if not isinstance(self.known, OwnPart):
             self._observer.ask_gone()  # of a run that this is a part of
 
@@ -145,12 +145,9 @@ class Watcher:
         if not isinstance(self.known, OwnPart) or self.known.own == (own := frozenset(processes)):
             return
         for spec in self.known.own - own:
-            self._bus.unsubscribe(STATS, role=spec.role, id=spec.id)
-            self._bus.unsubscribe(NOTE, role=spec.role, id=spec.id)
+            self._observer.forget(spec.role, spec.id)
         for spec in own - self.known.own:
-            self._bus.collect(STATS, role=spec.role, id=spec.id)
-            self._bus.collect(NOTE, role=spec.role, id=spec.id)
-            self._observer.ask_gone(role=spec.role, id=spec.id)
+            self._observer.keep_samples_of(spec.role, spec.id)
         self.known.own = own
 
     def listen(self, for_s: float) -> None:

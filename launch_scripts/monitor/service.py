@@ -145,7 +145,7 @@ class MonitorService:
         self._started_ns = now_ns
         if self._joins:
             self._member.join()
-        self._observer.collect()
+        self._observer.keep_samples()
         self._observer.ask_gone()
         self.figures.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)

@@ -78,7 +78,7 @@ class RunObserver:
             self._bus.subscribe(topic, self._post, every_s=self._every_ns[name] / NS_PER_S)
         self._bus.watch_alive(self._post)
 
-    def collect(self, topics: Iterable[Topic] = ()) -> None:
+    def keep_samples(self, topics: Iterable[Topic] = ()) -> None:
         """Has samples kept until they are `due`: none wakes a thread, and what is passed over is not decoded.
 
         topics  if given, only these: the owner collects the others, from some senders
@@ -86,6 +86,17 @@ class RunObserver:
         for topic in topics or self._topics.values():
             self._bus.collect(topic)
         self._bus.watch_alive(self._post)
+
+    def keep_samples_of(self, role: str, id: str) -> None:
+        """Has the figures and notes of one process kept until they are due, and asks for the last of them."""
+        for topic in (STATS, NOTE):
+            self._bus.collect(topic, role=role, id=id)
+        self.ask_gone(role=role, id=id)
+
+    def forget(self, role: str, id: str) -> None:
+        """Ends `keep_samples_of`."""
+        for topic in (STATS, NOTE):
+            self._bus.unsubscribe(topic, role=role, id=id)
 
     def ask_gone(self, **of: str) -> None:
         """Asks what processes that are gone have said last; `of` names one of them."""

@@ -20,7 +20,7 @@ from laws.test_deploy_plan import SCENARIOS, machines, planned
 from support.effort import few
 
 from launch_scripts.cli import command
-from launch_scripts.deploy.plan import Plan
+from launch_scripts.deploy.machine_plan import Plan
 from launch_scripts.deploy.service_files import COMPOSE_FILE, HEALTH_PORT, compose_files, containers_of, dns_label
 from swarm.config.load import parse_scenario
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.deploy.hosts import HOST_ROLES, HostConfig, HostsConfig
-from launch_scripts.deploy.placement import LAUNCHER_CORES
-from launch_scripts.deploy.plan import Plan, make_plan
+from launch_scripts.deploy.machine_plan import LAUNCHER_CORES, Plan, make_plan
 from launch_scripts.launcher.options import UpOptions, chosen_processes
 from launch_scripts.process_table import processes_of
 from swarm.bus.access_control import access_control

@@ -19,7 +19,7 @@ from launch_scripts.cli import command
 from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy.certificates import check_signed, hosts_of
 from launch_scripts.deploy.hosts import parse_hosts
-from launch_scripts.deploy.plan import make_plan
+from launch_scripts.deploy.machine_plan import make_plan
 from launch_scripts.deploy.service_files import containers_of
 from launch_scripts.launcher.options import as_process
 from swarm.config.load import load_scenario, parse_scenario

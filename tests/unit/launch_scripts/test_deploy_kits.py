@@ -18,7 +18,7 @@ from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
 from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
 from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
-from launch_scripts.deploy.plan import Plan, make_plan
+from launch_scripts.deploy.machine_plan import Plan, make_plan
 from launch_scripts.deploy.revocations import revoke
 from launch_scripts.deploy.service_files import UNIT, systemd_files
 from launch_scripts.launcher.options import chosen_processes

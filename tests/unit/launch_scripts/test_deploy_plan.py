@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from launch_scripts.deploy.hosts import parse_hosts
-from launch_scripts.deploy.plan import make_plan
+from launch_scripts.deploy.machine_plan import make_plan
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
 

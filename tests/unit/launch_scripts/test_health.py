@@ -22,9 +22,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.processes import eventually
 
-from launch_scripts.launcher import supervisor
+from launch_scripts.launcher import local_swarm
 from launch_scripts.launcher.forkserver import WarmUp
-from launch_scripts.launcher.supervisor import LOOK_EVERY_S, STILL_S, Ending, HangWatch, LocalSwarm
+from launch_scripts.launcher.local_swarm import LOOK_EVERY_S, STILL_S, Ending, HangWatch, LocalSwarm
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web.health_probe import ask, fast
 from launch_scripts.web.health_verdict import HEALTHY, READY, Process, health_pages, verdict
@@ -312,7 +312,7 @@ def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str
 ) -> None:
     """One whose tick does not end, and one that was stopped, so that it cannot say anything."""
-    monkeypatch.setattr(supervisor, "STILL_S", 2.0)
+    monkeypatch.setattr(local_swarm, "STILL_S", 2.0)
     swarm = started(tmp_path, function)
     endings: list[Ending] = []
     try:

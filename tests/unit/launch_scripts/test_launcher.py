@@ -17,8 +17,8 @@ from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.forkserver import WarmUp, _find_missing, _find_nothing
+from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.options import UpOptions, chosen_processes
-from launch_scripts.launcher.supervisor import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.takeover import has_ended
 from launch_scripts.launcher.up import run_swarm
 from launch_scripts.process_table import ROLES, STOP_ORDER, TABLE, ProcessSpec, processes_of
@@ -253,7 +253,7 @@ def test_what_all_roles_wait_for_loads_nothing_slow() -> None:
 def test_who_does_not_end_when_asked_is_killed_and_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch_scripts.launcher.supervisor.STOP_GRACE_S", 0.5)
+    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 0.5)
     swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
     swarm.start()
     for line in ("+agent-a0", "+router-0"):
@@ -275,9 +275,9 @@ def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_fai
     def before(role: str) -> None:
         waited_for.append(role)
         if role == "router":  # all others have been waited for: now little time is left to leave
-            monkeypatch.setattr("launch_scripts.launcher.supervisor.STOP_GRACE_S", 1.0)
+            monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 1.0)
 
-    monkeypatch.setattr("launch_scripts.launcher.supervisor.STOP_GRACE_S", 60.0)
+    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 60.0)
     assert swarm.stop(lambda: time.sleep(0.02), before) == []
     assert waited_for == ["agent", "keeper", "router"]
     assert "agent-a0 has ended and does not leave: " in caplog.text
@@ -289,7 +289,7 @@ def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_fai
 def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed_is_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch_scripts.launcher.supervisor.FORCED_GRACE_S", 0.5)
+    monkeypatch.setattr("launch_scripts.launcher.local_swarm.FORCED_GRACE_S", 0.5)
     rows = [("agent", "a0", "stubborn"), ("keeper", "0", "quiet"), ("router", "0", "quiet")]
     swarm = swarm_of(swarms, tmp_path, *rows)
     swarm.start()
@@ -369,7 +369,7 @@ def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Pat
 _LAUNCHER = """
 import signal, sys, time
 from pathlib import Path
-from launch_scripts.launcher.supervisor import LocalSwarm
+from launch_scripts.launcher.local_swarm import LocalSwarm
 from launch_scripts.launcher.forkserver import WarmUp, _find_missing, _find_nothing
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario

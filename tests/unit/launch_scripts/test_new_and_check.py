@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from launch_scripts import ports
 from launch_scripts.check import machine
-from launch_scripts.check.ground import places, plots
+from launch_scripts.check.scenario_check import places, plots
 from launch_scripts.cli import main
 from launch_scripts.commands.scenario_commands import Choices, _asked
 from shared_map.class_grounds import class_grounds

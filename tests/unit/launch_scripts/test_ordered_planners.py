@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, OrderedPlanners, with_target
-from launch_scripts.launcher.supervisor import Running
 from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError

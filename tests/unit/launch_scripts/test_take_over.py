@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.launcher import takeover
+from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.options import UpOptions, common_run_id
 from launch_scripts.launcher.signals import MachineSignals
-from launch_scripts.launcher.supervisor import Running
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.observe.latest_state import LatestState
 from launch_scripts.observe.plan import RunPlan

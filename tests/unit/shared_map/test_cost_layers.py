@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.plugin_modules import forgotten_afterwards
 
-from launch_scripts.launcher.run_terrain import missing_files
+from launch_scripts.launcher.fetched_terrain import missing_files
 from shared_map.terrain.cache import kept_key
 from shared_map.terrain.store import scenario_key
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth

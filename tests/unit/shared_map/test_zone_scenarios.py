@@ -12,7 +12,7 @@ from support.zone_shapes import written
 from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain_commands import app
-from launch_scripts.launcher.run_terrain import missing_files
+from launch_scripts.launcher.fetched_terrain import missing_files
 from shared_map.terrain.cache import kept_key
 from shared_map.terrain.store import scenario_key
 from shared_map.terrain.terrain import build_terrain, build_truth
