@@ -30,9 +30,8 @@ from launch_scripts.gateways.ros2.ros_messages import (
     TERRAIN_FRAME,
     RosMessages,
     Severity,
-    base_frame,
+    frames_of,
     headings_along,
-    odom_frame,
     ros_name,
 )
 from launch_scripts.observe.alarms import Alarm
@@ -97,7 +96,7 @@ def _still(messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, 
     map = messages.map
     frames = [messages.transform(first_ns, (TERRAIN_FRAME, map.frame), map.origin_m)]
     names = frame_names(each.id for each in tracks.vehicles)
-    frames += [messages.transform(first_ns, (map.frame, odom_frame(name))) for name in names.values()]
+    frames += [messages.transform(first_ns, (map.frame, frames_of(name)[0])) for name in names.values()]
     yield Told(first_ns, "/tf_static", messages.transforms(frames))
     if ground is not None:
         occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
@@ -150,9 +149,7 @@ def _vehicles(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
     for now in _instants(tracks):
         places = zip(now.ids, now.xy_m.tolist(), now.headings_rad, strict=True)
         bases = [
-            messages.transform(
-                now.time_ns, (odom_frame(names[id]), base_frame(names[id])), messages.map.to_ros(*xy_m), heading_rad
-            )
+            messages.transform(now.time_ns, frames_of(names[id]), messages.map.to_ros(*xy_m), heading_rad)
             for id, xy_m, heading_rad in places
         ]
         yield Told(now.time_ns, "/tf", messages.transforms(bases))

@@ -21,34 +21,21 @@ from support.mavlink_world import (
     World,
 )
 
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Follow, Report, Unfollow
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, kind_of
 from launch_scripts.gateways.mavlink.guidance import MOST_TRIES, RETRY_NS, Way, Wishes
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    ARM_DISARM,
-    DO_SET_MODE,
-    MISSION_START,
-    NAV_TAKEOFF,
-    SET_MESSAGE_INTERVAL,
-    Beat,
-    Command,
-    CommandAnswered,
-    Heartbeat,
-    Incoming,
-    ItemAsked,
-    MissionAnswered,
-    MissionCancelled,
-    MissionCount,
-    MissionCurrent,
-    MissionItem,
-    Position,
-    Setpoint,
-    Warned,
-)
 from swarm.clock import NS_PER_S
 
-OF_THE_WHEEL = (ARM_DISARM, DO_SET_MODE, MISSION_START, NAV_TAKEOFF)
-TO_THE_VEHICLE = (Command, MissionCount, MissionItem, MissionCurrent, MissionCancelled, Setpoint)
+OF_THE_WHEEL = (codec.ARM_DISARM, codec.DO_SET_MODE, codec.MISSION_START, codec.NAV_TAKEOFF)
+TO_THE_VEHICLE = (
+    codec.Command,
+    codec.MissionCount,
+    codec.MissionItem,
+    codec.MissionCurrent,
+    codec.MissionCancelled,
+    codec.Setpoint,
+)
 LOST_S = 3.0
 
 modes = st.sampled_from([MANUAL, 3, 4, 10, 15, 4 << 16 | 4 << 24, 6 << 16, 4 << 16 | 3 << 24, 2**32 - 1])
@@ -63,18 +50,18 @@ places = st.sampled_from(
 )  # fmt: skip
 incoming = st.one_of(
     st.builds(
-        Beat, st.sampled_from([0, ARDUPILOT, PX4]), st.sampled_from([0, ROVER, COPTER]), st.booleans(), modes
+        codec.Beat, st.sampled_from([0, ARDUPILOT, PX4]), st.sampled_from([0, ROVER, COPTER]), st.booleans(), modes
     ),
-    places.map(lambda place: Position(*place, 10.0, 400.0, None)),
-    st.builds(ItemAsked, st.integers(0, 70)),
-    st.builds(MissionAnswered, st.sampled_from([0, 1, 13, 15])),
-    st.builds(CommandAnswered, st.sampled_from([*OF_THE_WHEEL, 511]), st.integers(0, 6)),
-    st.builds(Warned, st.text(max_size=5)),
+    places.map(lambda place: codec.Position(*place, 10.0, 400.0, None)),
+    st.builds(codec.ItemAsked, st.integers(0, 70)),
+    st.builds(codec.MissionAnswered, st.sampled_from([0, 1, 13, 15])),
+    st.builds(codec.CommandAnswered, st.sampled_from([*OF_THE_WHEEL, 511]), st.integers(0, 6)),
+    st.builds(codec.Warned, st.text(max_size=5)),
 )
 ways = st.sampled_from([TO_THE_EAST, WITH_A_TURN, NOWHERE])
 
 
-def heard(message: Incoming) -> Callable[[World], object]:
+def heard(message: codec.Incoming) -> Callable[[World], object]:
     return lambda world: world.hear(message)
 
 
@@ -139,7 +126,7 @@ class Laws:
     def __init__(self, world: World) -> None:
         self.world = world
         self.heartbeat_ns = world.now_ns
-        self.heard_ns = {Beat: -NS_PER_S * 1000, Position: -NS_PER_S * 1000}
+        self.heard_ns = {codec.Beat: -NS_PER_S * 1000, codec.Position: -NS_PER_S * 1000}
         self.answered_ns = -NS_PER_S
         self.asked_ns = -NS_PER_S
         self.spoken: Action | None = None
@@ -149,13 +136,13 @@ class Laws:
         """Of the mission in flight: how many it has, how many were asked for, how often `spoken` was said."""
         hear = world.adapter.hear
 
-        def listen(message: Incoming, now_ns: int) -> None:
+        def listen(message: codec.Incoming, now_ns: int) -> None:
             if type(message) in self.heard_ns:
                 self.heard_ns[type(message)] = now_ns
             # Whatever the vehicle answers, and each refusal, may end an upload.
-            if isinstance(message, MissionAnswered):
+            if isinstance(message, codec.MissionAnswered):
                 self.answered_ns = now_ns
-            if isinstance(message, ItemAsked):
+            if isinstance(message, codec.ItemAsked):
                 self.asked, self.asked_ns = self.asked + 1, now_ns
             hear(message, now_ns)
 
@@ -167,17 +154,17 @@ class Laws:
 
     def hold(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
-            if isinstance(action, Heartbeat):
+            if isinstance(action, codec.Heartbeat):
                 self.heartbeat_ns = now_ns
-            if isinstance(action, Command) and action.command in OF_THE_WHEEL:
+            if isinstance(action, codec.Command) and action.command in OF_THE_WHEEL:
                 assert self.world.wishes.arm, "nobody has asked us to arm it, or to change its mode"
             if isinstance(action, (*TO_THE_VEHICLE, Follow)):
                 lost = now_ns - min(self.heard_ns.values()) > LOST_S * NS_PER_S
-                asks = isinstance(action, Command) and action.command == SET_MESSAGE_INTERVAL
+                asks = isinstance(action, codec.Command) and action.command == codec.SET_MESSAGE_INTERVAL
                 assert not lost or asks, "it is left to its own fail-safe"
                 assert self.world.wishes.target is not None or asks, "it is not ours to drive"
-            if isinstance(action, Setpoint | MissionCount | MissionItem):
-                if isinstance(action, Setpoint) and self.world.vehicle.autopilot == ARDUPILOT:
+            if isinstance(action, codec.Setpoint | codec.MissionCount | codec.MissionItem):
+                if isinstance(action, codec.Setpoint) and self.world.vehicle.autopilot == ARDUPILOT:
                     continue  # which holds at one
                 assert self.world.adapter._swarm_up, "nobody avoids it now"
             self.one_mission(action, now_ns)
@@ -185,23 +172,26 @@ class Laws:
                 FRAME.cell(action.x_m, action.y_m)
                 assert 0 <= action.speed_m_per_s <= 340
         assert now_ns - self.heartbeat_ns <= NS_PER_S
-        assert sum(isinstance(action, Setpoint | MissionItem | MissionCount) for action in actions) <= 1
+        assert (
+            sum(isinstance(action, codec.Setpoint | codec.MissionItem | codec.MissionCount) for action in actions)
+            <= 1
+        )
 
     def one_mission(self, action: Action, now_ns: int) -> None:
         """A mission is begun where none is in flight: the one before was answered, cancelled, given up after its
         last try, or asked for beyond measure."""
         match action:
-            case MissionCount(items=items):
+            case codec.MissionCount(items=items):
                 again = action == self.spoken and self.tries < MOST_TRIES
                 given_up = self.tries == MOST_TRIES and now_ns - self.spoken_ns >= RETRY_NS
                 ended = self.answered_ns >= self.spoken_ns or self.asked > 8 * self.items
                 assert self.spoken is None or again or given_up or ended, "two missions in flight"
                 if not again:
                     self.items, self.asked, self.tries = items, 0, 0
-            case MissionItem(seq=seq):
+            case codec.MissionItem(seq=seq):
                 assert self.spoken is not None, "nobody was told of a mission"
                 assert seq < self.items
-            case MissionCancelled() | Unfollow():
+            case codec.MissionCancelled() | Unfollow():
                 self.spoken = None
                 return
             case _:
@@ -218,7 +208,7 @@ looks = st.tuples(st.booleans(), modes, st.sampled_from(["drive", "hold"]), st.f
 def test_whoever_takes_the_wheel_from_us_keeps_it(
     kind: tuple[int, int], guided: bool, looks: list[tuple[bool, int, str, float, float]]
 ) -> None:
-    made = kind_of(Beat(*kind, armed=False, mode=MANUAL))
+    made = kind_of(codec.Beat(*kind, armed=False, mode=MANUAL))
     mode = None if made.modes is None else made.modes.guided if guided else made.modes.mission
     if guided and mode is None:
         return
@@ -228,7 +218,7 @@ def test_whoever_takes_the_wheel_from_us_keeps_it(
     now_s = 0.0
     for armed, at, wish, for_s, height_m in looks:
         now_s += for_s
-        beat, now_ns = Beat(*kind, armed, at), int(now_s * NS_PER_S)
+        beat, now_ns = codec.Beat(*kind, armed, at), int(now_s * NS_PER_S)
         drives = armed and (mode is None or at == mode)
         drove = drove or drives
         foreign = drove and not drives and not (armed and held and at == hold)
@@ -237,6 +227,6 @@ def test_whoever_takes_the_wheel_from_us_keeps_it(
         assert not (foreign and command is not None), "somebody else has set this mode"
         taken_away = taken_away or (foreign and bool(wheel.why))
         assert not (taken_away and command is not None), "it was taken away for good"
-        if command is not None and command.command == ARM_DISARM:
+        if command is not None and command.command == codec.ARM_DISARM:
             assert not armed
             assert not drove, "it is armed once"

@@ -91,6 +91,16 @@ def running(gateway: Gateway) -> Iterator[Gateway]:
         process.wait(10)
 
 
+@pytest.fixture
+def session(gateway: Gateway) -> Iterator[zenoh.Session]:
+    """Of a node of ours at the ROS side's router."""
+    session = open_ros(gateway.endpoint)
+    try:
+        yield session
+    finally:
+        close_ros(session)
+
+
 @pytest.fixture(scope="module")
 def definitions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_definitions(tmp_path_factory.mktemp("definitions"), TYPES)
@@ -116,85 +126,67 @@ def test_a_foreign_stack_lists_every_topic(running: Gateway) -> None:
     eventually(lambda: not missing(), 60, "every topic in the list")  # each is there once it has something to tell
 
 
-def test_a_latched_map_comes_to_who_comes_late(running: Gateway) -> None:
-    session = open_ros(running.endpoint)
-    try:
-        node = PeerNode(session, "late", TYPES)
-        maps, frames = [], []
-        time.sleep(1.5)  # the map was put long before
-        node.subscribe("/map", ROWS["map"].type_name, maps.append, Qos.LATCHED)
-        node.subscribe("/tf_static", ROWS["tf_static"].type_name, frames.append, Qos.LATCHED)
-        eventually(lambda: maps and frames, 15, "the map and the frames")
-        grid = maps[0]
-        assert (grid.info.width, grid.info.height, grid.info.resolution) == (128, 96, 30.0)
-        assert grid.data.min() >= 0, "the terrain of the run is on this machine: every cell is known"
-        assert {each.child_frame_id for each in frames[-1].transforms} == {
-            f"a{agent}_{n:02}/odom" for agent in (0, 1) for n in range(6)
-        }
-        node.close()
-    finally:
-        close_ros(session)
+def test_a_latched_map_comes_to_who_comes_late(running: Gateway, session: zenoh.Session) -> None:
+    node = PeerNode(session, "late", TYPES)
+    maps, frames = [], []
+    time.sleep(1.5)  # the map was put long before
+    node.subscribe("/map", ROWS["map"].type_name, maps.append, Qos.LATCHED)
+    node.subscribe("/tf_static", ROWS["tf_static"].type_name, frames.append, Qos.LATCHED)
+    eventually(lambda: maps and frames, 15, "the map and the frames")
+    grid = maps[0]
+    assert (grid.info.width, grid.info.height, grid.info.resolution) == (128, 96, 30.0)
+    assert grid.data.min() >= 0, "the terrain of the run is on this machine: every cell is known"
+    assert {each.child_frame_id for each in frames[-1].transforms} == {
+        f"a{agent}_{n:02}/odom" for agent in (0, 1) for n in range(6)
+    }
+    node.close()
 
 
-def test_each_message_has_33_bytes_that_name_sender_number_and_time(running: Gateway) -> None:
-    session = open_ros(running.endpoint)
-    try:
-        attachments: list[bytes] = []
+def test_each_message_has_33_bytes_that_name_sender_number_and_time(
+    running: Gateway, session: zenoh.Session
+) -> None:
+    attachments: list[bytes] = []
 
-        def hear(sample: zenoh.Sample) -> None:
-            assert sample.attachment is not None
-            attachments.append(sample.attachment.to_bytes())
+    def hear(sample: zenoh.Sample) -> None:
+        assert sample.attachment is not None
+        attachments.append(sample.attachment.to_bytes())
 
-        session.declare_subscriber(f"0/a0_01/odom/*/{TYPES.hash_of(ROWS['odom'].type_name)}", hear)
-        eventually(lambda: len(attachments) >= 3, 15, "three messages")
-        read = [Attachment.of(each) for each in attachments[:3]]
-        assert {len(each) for each in attachments} == {33}
-        assert attachments[0][16] == 16
-        assert struct.unpack_from("<q", attachments[0]) == (read[0].sequence,)
-        assert [each.sequence - read[0].sequence for each in read] == [0, 1, 2]
-        assert len({each.gid for each in read}) == 1
-        assert read[0].stamp_ns == pytest.approx(time.time_ns(), abs=60e9)
-    finally:
-        close_ros(session)
+    session.declare_subscriber(f"0/a0_01/odom/*/{TYPES.hash_of(ROWS['odom'].type_name)}", hear)
+    eventually(lambda: len(attachments) >= 3, 15, "three messages")
+    read = [Attachment.of(each) for each in attachments[:3]]
+    assert {len(each) for each in attachments} == {33}
+    assert attachments[0][16] == 16
+    assert struct.unpack_from("<q", attachments[0]) == (read[0].sequence,)
+    assert [each.sequence - read[0].sequence for each in read] == [0, 1, 2]
+    assert len({each.gid for each in read}) == 1
+    assert read[0].stamp_ns == pytest.approx(time.time_ns(), abs=60e9)
 
 
-def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(running: Gateway) -> None:
-    session = open_ros(running.endpoint)
-    try:
-        elsewhere = PeerNode(session, "far", TYPES, domain=7)
-        elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
-        eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")
-        elsewhere.close()
-    finally:
-        close_ros(session)
-    session = open_ros(running.endpoint)
-    try:
-        older = PeerNode(session, "old", types_of(Distribution.HUMBLE))
-        older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
-        eventually(
-            lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble"
-        )
-        older.close()
-    finally:
-        close_ros(session)
+def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(
+    running: Gateway, session: zenoh.Session
+) -> None:
+    elsewhere = PeerNode(session, "far", TYPES, domain=7)
+    elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
+    eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")
+    elsewhere.close()
+    older = PeerNode(session, "old", types_of(Distribution.HUMBLE))
+    older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
+    eventually(lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble")
+    older.close()
 
 
-def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway) -> None:
-    session = open_ros(gateway.endpoint)
+def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway, session: zenoh.Session) -> None:
     there: set[str] = set()
+    node = PeerNode(session, "watcher", TYPES)
+    node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
+    process = gateway.start()
     try:
-        node = PeerNode(session, "watcher", TYPES)
-        node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
-        process = gateway.start()
-        try:
-            eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
-        finally:
-            process.kill()
-            process.wait(10)
-        eventually(lambda: not there, 15, "the end of all tokens")
-        node.close()
+        eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
     finally:
-        close_ros(session)
+        process.kill()
+        process.wait(10)
+    eventually(lambda: not there, 15, "the end of all tokens")
+    node.close()
 
 
 def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> None:

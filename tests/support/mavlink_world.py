@@ -4,23 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Tell
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
 from launch_scripts.gateways.mavlink.guidance import Way, Wishes
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    ARM_DISARM,
-    DO_SET_MODE,
-    MISSION_START,
-    Beat,
-    Command,
-    CommandAnswered,
-    Incoming,
-    ItemAsked,
-    MissionAnswered,
-    MissionCount,
-    MissionItem,
-    Position,
-)
 from swarm.client import Frame
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -50,46 +37,46 @@ class Autopilot:
     mode: int = MANUAL
     cell: int = START
     height_m: float = 0.0
-    missions: list[list[MissionItem]] = field(default_factory=list)
-    commands: list[Command] = field(default_factory=list)
+    missions: list[list[codec.MissionItem]] = field(default_factory=list)
+    commands: list[codec.Command] = field(default_factory=list)
     _wanted: int = 0
-    _items: list[MissionItem] = field(default_factory=list)
+    _items: list[codec.MissionItem] = field(default_factory=list)
 
-    def beat(self) -> Beat:
-        return Beat(self.autopilot, self.type, self.armed, self.mode)
+    def beat(self) -> codec.Beat:
+        return codec.Beat(self.autopilot, self.type, self.armed, self.mode)
 
-    def position(self) -> Position:
-        return Position(*FRAME.to_wgs84(*GRID.centre_m(self.cell)), self.height_m, 2.0, 1.0)
+    def position(self) -> codec.Position:
+        return codec.Position(*FRAME.to_wgs84(*GRID.centre_m(self.cell)), self.height_m, 2.0, 1.0)
 
-    def hear(self, action: Action) -> list[Incoming]:
+    def hear(self, action: Action) -> list[codec.Incoming]:
         """Its answers."""
-        if isinstance(action, Command):
+        if isinstance(action, codec.Command):
             self.commands.append(action)
         if not self.answers:
             return []
         match action:
-            case MissionCount(items=items):
+            case codec.MissionCount(items=items):
                 self._wanted, self._items = items, []
-                return [ItemAsked(0)]
-            case MissionItem(seq=seq) if seq == len(self._items) and self._wanted:
+                return [codec.ItemAsked(0)]
+            case codec.MissionItem(seq=seq) if seq == len(self._items) and self._wanted:
                 self._items.append(action)
                 if len(self._items) < self._wanted:
-                    return [ItemAsked(len(self._items))]
+                    return [codec.ItemAsked(len(self._items))]
                 self._wanted = 0
                 self.missions.append(self._items)
-                return [MissionAnswered(0)]
-            case Command(command=command, params=params):
-                return [CommandAnswered(command, self._obey(command, params))]
+                return [codec.MissionAnswered(0)]
+            case codec.Command(command=command, params=params):
+                return [codec.CommandAnswered(command, self._obey(command, params))]
         return []
 
     def _obey(self, command: int, params: tuple[float, ...]) -> int:
-        if command == ARM_DISARM:
+        if command == codec.ARM_DISARM:
             self.armed = params[0] == 1
-        elif command == DO_SET_MODE and self.autopilot == PX4:
+        elif command == codec.DO_SET_MODE and self.autopilot == PX4:
             self.mode = int(params[1]) << 16 | int(params[2]) << 24
-        elif command == DO_SET_MODE:
+        elif command == codec.DO_SET_MODE:
             self.mode = int(params[1])
-        elif command != MISSION_START:
+        elif command != codec.MISSION_START:
             return 0
         return 0
 
@@ -131,7 +118,7 @@ class World:
                     self.hear(answer)
         return actions
 
-    def hear(self, message: Incoming) -> None:
+    def hear(self, message: codec.Incoming) -> None:
         self.adapter.hear(message, self.now_ns)
 
     def told(self) -> list[str]:

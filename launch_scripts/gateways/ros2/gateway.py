@@ -14,6 +14,7 @@ from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2 import map_messages, ros_messages
@@ -46,7 +47,7 @@ _BAD_STATES = ("stranded", "lost")
 ToWgs84 = Callable[[float, float], tuple[float, float]]
 
 
-class Channel(NamedTuple):
+class Channel(Struct, frozen=True):
     """One topic in ROS.
 
     row    name of its row in the table
@@ -57,19 +58,19 @@ class Channel(NamedTuple):
     topic: str
 
 
-class Declare(NamedTuple):
+class Declare(Struct, frozen=True):
     """Put topics up: a publisher with its token each."""
 
     channels: tuple[Channel, ...]
 
 
-class Remove(NamedTuple):
+class Remove(Struct, frozen=True):
     """Take topics down."""
 
     channels: tuple[Channel, ...]
 
 
-class Put(NamedTuple):
+class Put(Struct, frozen=True):
     """Put a message; bytes are CDR already."""
 
     channel: Channel
@@ -124,7 +125,7 @@ class Moving:
     """One vehicle as ROS is told of it. Its speed is the difference of the last two places that were told, by a
     clock that never leaps: so are all times here.
 
-    id, name        in the swarm, and in ROS
+    id              in the swarm
     frames          the one that does not move, and its own
     place           a heading of None is told as the last known
     speed_m_per_s   forward; negative backwards
@@ -134,7 +135,7 @@ class Moving:
     """
 
     def __init__(self, id: str, frames: tuple[str, str], seen: SeenVehicle, now_ns: int, made: RosMessages) -> None:
-        self.id, self.name, self.frames = id, ros_name(id), frames
+        self.id, self.frames = id, frames
         self.place: Place = (seen.x_m, seen.y_m, seen.heading_rad)
         self.speed_m_per_s = self.turn_rad_per_s = 0.0
         self.route: NDArray[np.float64] = np.empty((0, 2), np.float64)
@@ -212,7 +213,9 @@ class Gateway:
         self._whole = False
         """The whole map is to be put."""
         self._due_ns = dict.fromkeys(self._rows, 0)
-        self._begun = False
+        """When each row is told again, by the clock that never leaps."""
+        always = tuple(self._channel(row.name) for row in self._rows.values() if self._per(row) is None)
+        self._first: list[Action] = [Declare(always)]
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
             "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
             "tf": self._tell_transforms, "odom": self._tell_odometry, "pose": self._tell_poses,
@@ -256,7 +259,7 @@ class Gateway:
             return []
         vehicles = {id: each for id, each in view.vehicles.items() if id not in robots}
         now = _Now(now_ns, stamp_ns, swarm_now_ns, vehicles, view.targets, health)
-        actions = [*self._begin(), *self._follow(now)]
+        actions, self._first = [*self._first, *self._follow(now)], []
         for id, points_m in view.take_routes().items():
             if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:
                 moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
@@ -270,14 +273,6 @@ class Gateway:
         return actions
 
     # --- who is there ---------------------------------------------------------------------------------------------
-
-    def _begin(self) -> list[Action]:
-        """Topics that are there from the first tick on."""
-        if self._begun:
-            return []
-        self._begun = True
-        rows = self._rows.values()
-        return [Declare(tuple(self._channel(row.name) for row in rows if self._per(row) is None))]
 
     def _follow(self, now: _Now) -> list[Action]:
         """Takes in who is where. Topics of vehicles that are new are declared, of those that have left taken down.
@@ -316,11 +311,7 @@ class Gateway:
         elif len(self._vehicles) >= MOST_VEHICLES:
             self._refuse(f"vehicle {id}", f"there are {MOST_VEHICLES} already")
         else:
-            frames = (
-                ("odom", "base_link")
-                if self._bare
-                else (ros_messages.odom_frame(name), ros_messages.base_frame(name))
-            )
+            frames = ("odom", "base_link") if self._bare else ros_messages.frames_of(name)
             self._vehicles[name] = Moving(id, frames, seen, now_ns, self._messages)
             return name
         return None

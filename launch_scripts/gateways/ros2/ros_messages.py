@@ -90,14 +90,10 @@ def ros_name(id: str) -> str:
     return f"v{name}" if name[:1].isdigit() else name or "_"
 
 
-def odom_frame(name: str) -> str:
-    """Of a vehicle, between the map and its base (REP 105). Both lie in one place: the swarm tells no drift."""
-    return f"{name}/odom"
-
-
-def base_frame(name: str) -> str:
-    """Fixed to a vehicle: x forward, y to the left, z up."""
-    return f"{name}/base_link"
+def frames_of(name: str) -> tuple[str, str]:
+    """The two frames of a vehicle (REP 105). The first lies where the map does, as the swarm tells no drift. The second
+    is fixed to the vehicle: x forward, y to the left, z up."""
+    return f"{name}/odom", f"{name}/base_link"
 
 
 def yaw_of(heading_rad: float) -> float:

@@ -23,31 +23,10 @@ from support.mavlink_world import (
     World,
 )
 
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Follow, Report, Unfollow, Withdraw
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
 from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Upload, Way, Wishes, is_end_of, rest, turns
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    ABOVE_HOME,
-    ABOVE_TERRAIN,
-    ARM_DISARM,
-    DO_SET_MODE,
-    MISSION_START,
-    NAV_LOITER_UNLIM,
-    NAV_TAKEOFF,
-    NAV_WAYPOINT,
-    SET_MESSAGE_INTERVAL,
-    Beat,
-    Command,
-    ItemAsked,
-    MissionAnswered,
-    MissionCancelled,
-    MissionCount,
-    MissionCurrent,
-    MissionItem,
-    Position,
-    Setpoint,
-    Warned,
-)
 
 MISSION, GUIDED = Wishes("t0"), Wishes("t0", "guided")
 OFFBOARD, AUTO_MISSION, AUTO_HOLD = 6 << 16, 4 << 16 | 4 << 24, 4 << 16 | 3 << 24
@@ -64,7 +43,7 @@ def driving(
     return world
 
 
-def places(items: list[MissionItem]) -> list[int]:
+def places(items: list[codec.MissionItem]) -> list[int]:
     """Their cells."""
     return [FRAME.cell(*FRAME.from_wgs84(item.lat_deg, item.lon_deg)) for item in items]
 
@@ -89,12 +68,12 @@ def test_positions_are_asked_for_until_they_come() -> None:
     world = World(Wishes())
     world.speaks = False
     world.hear(world.vehicle.beat())
-    asked = [each for each in world.run(4.0) if isinstance(each, Command)]
-    assert [each.command for each in asked] == [SET_MESSAGE_INTERVAL] * 2
+    asked = [each for each in world.run(4.0) if isinstance(each, codec.Command)]
+    assert [each.command for each in asked] == [codec.SET_MESSAGE_INTERVAL] * 2
     assert asked[0].params == (33, 100_000)
     world.speaks = True
     world.run(1.0)
-    assert not [each for each in world.run(3.0) if isinstance(each, Command)]
+    assert not [each for each in world.run(3.0) if isinstance(each, codec.Command)]
 
 
 def test_one_that_drives_stays_a_body_when_its_link_is_lost_and_gets_its_target_back() -> None:
@@ -154,7 +133,7 @@ def test_outside_the_terrain_it_is_nowhere_for_the_swarm() -> None:
     world = driving(MISSION)
     world.speaks = False
     world.hear(world.vehicle.beat())
-    world.hear(Position(0.5, 0.5, 0.0, 0.0, None))
+    world.hear(codec.Position(0.5, 0.5, 0.0, 0.0, None))
     said = world.run(0.2)
     assert [type(each) for each in said if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Withdraw]
     assert "the vehicle is outside the terrain" in world.told()
@@ -163,7 +142,7 @@ def test_outside_the_terrain_it_is_nowhere_for_the_swarm() -> None:
 def test_another_kind_under_the_same_number_is_not_heard() -> None:
     world = World(MISSION)
     world.run(1.0)
-    world.hear(Beat(PX4, COPTER, True, OFFBOARD))
+    world.hear(codec.Beat(PX4, COPTER, True, OFFBOARD))
     world.run(1.0)
     assert world.adapter.kind is not None
     assert world.adapter.kind.name == "ArduPilot"
@@ -173,7 +152,7 @@ def test_another_kind_under_the_same_number_is_not_heard() -> None:
 def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
     world = World(MISSION)
     for number in range(4000):
-        world.hear(Warned(f"number {number}"))
+        world.hear(codec.Warned(f"number {number}"))
         if number % 4 == 0:
             world.tick()
     assert sum("the vehicle says" in each for each in world.told()) < 20
@@ -185,11 +164,11 @@ def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
 def test_a_mission_has_the_turns_of_the_route_and_home_before_them_for_ardupilot() -> None:
     world = driving(MISSION)
     (mission,) = world.vehicle.missions
-    assert [item.command for item in mission] == [NAV_WAYPOINT] * 4
+    assert [item.command for item in mission] == [codec.NAV_WAYPOINT] * 4
     assert places(mission) == [START, START + 1, GRID.cell(40, 39), GRID.cell(21, 39)]
     assert [item.current for item in mission] == [False, True, False, False]
-    assert {(item.frame, item.height_m) for item in mission} == {(ABOVE_HOME, 0.0)}
-    assert of(world, MissionCurrent) == [MissionCurrent(1)]
+    assert {(item.frame, item.height_m) for item in mission} == {(codec.ABOVE_HOME, 0.0)}
+    assert of(world, codec.MissionCurrent) == [codec.MissionCurrent(1)]
     assert world.vehicle.mode == MANUAL
     assert not world.vehicle.armed
 
@@ -198,18 +177,18 @@ def test_px4_has_no_home_in_its_missions() -> None:
     world = driving(MISSION, Autopilot(PX4))
     (mission,) = world.vehicle.missions
     assert places(mission) == [START + 1, GRID.cell(40, 39), GRID.cell(21, 39)]
-    assert of(world, MissionCurrent) == [MissionCurrent(0)]
+    assert of(world, codec.MissionCurrent) == [codec.MissionCurrent(0)]
 
 
 def test_what_flies_takes_off_first_and_stays_at_the_end() -> None:
     wishes = Wishes("t0", altitude_m=60.0, above="terrain")
     (mission,) = driving(wishes, Autopilot(type=PLANE)).vehicle.missions
     assert [item.command for item in mission] == [
-        NAV_WAYPOINT, NAV_TAKEOFF, NAV_WAYPOINT, NAV_WAYPOINT, NAV_LOITER_UNLIM,
+        codec.NAV_WAYPOINT, codec.NAV_TAKEOFF, codec.NAV_WAYPOINT, codec.NAV_WAYPOINT, codec.NAV_LOITER_UNLIM,
     ]  # fmt: skip
-    assert {(item.frame, item.height_m) for item in mission} == {(ABOVE_TERRAIN, 60.0)}
+    assert {(item.frame, item.height_m) for item in mission} == {(codec.ABOVE_TERRAIN, 60.0)}
     (mission,) = driving(wishes, Autopilot(type=COPTER, height_m=50.0)).vehicle.missions
-    assert NAV_TAKEOFF not in [item.command for item in mission]
+    assert codec.NAV_TAKEOFF not in [item.command for item in mission]
 
 
 @pytest.mark.parametrize(
@@ -225,8 +204,8 @@ def test_what_cannot_be_driven_is_said_and_only_reported(wishes: Wishes, vehicle
     world = driving(wishes, vehicle)
     assert any(why in each for each in world.told())
     assert of(world, Report)
-    assert not of(world, MissionCount)
-    assert not of(world, Setpoint)
+    assert not of(world, codec.MissionCount)
+    assert not of(world, codec.Setpoint)
     assert not of(world, Follow)
 
 
@@ -261,7 +240,7 @@ def test_routes_that_change_ten_times_a_second_are_a_mission_in_three_seconds() 
 def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_anew() -> None:
     vehicle = Autopilot(answers=False)
     world = driving(MISSION, vehicle, seconds=20.0)
-    times_s = [ns / 1e9 for ns, action in world.said if isinstance(action, MissionCount)]
+    times_s = [ns / 1e9 for ns, action in world.said if isinstance(action, codec.MissionCount)]
     assert [round(b - a, 1) for a, b in pairwise(times_s[:5])] == [1.5] * 4
     assert times_s[5] - times_s[4] >= 5.0
     assert "a mission of 4 items has failed: the vehicle did not answer 5 times" in world.told()
@@ -275,12 +254,12 @@ def test_a_newer_route_waits_until_the_mission_in_flight_has_ended() -> None:
     for number in range(7):
         world.adapter.hear_way([TO_THE_EAST, WITH_A_TURN][number % 2])
         world.run(1.0)
-    assert {each.items for each in of(world, MissionCount)} == {4}  # type: ignore[attr-defined]
+    assert {each.items for each in of(world, codec.MissionCount)} == {4}  # type: ignore[attr-defined]
 
 
 def test_a_refused_mission_says_the_result() -> None:
     world = driving(MISSION, Autopilot(answers=False), seconds=0.2)
-    world.hear(MissionAnswered(13))
+    world.hear(codec.MissionAnswered(13))
     world.run(0.2)
     assert "a mission of 4 items has failed: the vehicle refused it with MAV_MISSION_RESULT 13" in world.told()
 
@@ -288,29 +267,29 @@ def test_a_refused_mission_says_the_result() -> None:
 def test_a_route_that_leads_nowhere_ends_an_upload() -> None:
     world = driving(MISSION, Autopilot(answers=False), seconds=0.2)
     world.adapter.hear_way(NOWHERE)
-    assert MissionCancelled() in world.run(0.2)
-    assert not of(world, MissionItem)
+    assert codec.MissionCancelled() in world.run(0.2)
+    assert not of(world, codec.MissionItem)
 
 
 def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
-    items = [MissionItem(seq, NAV_WAYPOINT, ABOVE_HOME, 1.0, 2.0, 0.0) for seq in range(3)]
+    items = [codec.MissionItem(seq, codec.NAV_WAYPOINT, codec.ABOVE_HOME, 1.0, 2.0, 0.0) for seq in range(3)]
     upload = Upload(items)
-    assert upload.tick(0) == MissionCount(3)
+    assert upload.tick(0) == codec.MissionCount(3)
     for seq in (2, 0, 0, 1):
-        upload.hear(ItemAsked(seq))
+        upload.hear(codec.ItemAsked(seq))
         assert upload.tick(0) == items[seq]
-    upload.hear(ItemAsked(9))
-    upload.hear(MissionAnswered(0))
+    upload.hear(codec.ItemAsked(9))
+    upload.hear(codec.MissionAnswered(0))
     assert not upload.accepted, "it has not had the last item since"
-    upload.hear(ItemAsked(2))
-    upload.hear(MissionAnswered(0))
+    upload.hear(codec.ItemAsked(2))
+    upload.hear(codec.MissionAnswered(0))
     assert upload.accepted
 
 
 def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
-    upload = Upload([MissionItem(0, NAV_WAYPOINT, ABOVE_HOME, 1.0, 2.0, 0.0)])
+    upload = Upload([codec.MissionItem(0, codec.NAV_WAYPOINT, codec.ABOVE_HOME, 1.0, 2.0, 0.0)])
     for _ in range(100):
-        upload.hear(ItemAsked(0))
+        upload.hear(codec.ItemAsked(0))
         upload.tick(0)
     assert upload.why
 
@@ -321,21 +300,26 @@ def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
 @pytest.mark.parametrize(
     ("vehicle", "steps"),
     [
-        (Autopilot(ARDUPILOT, ROVER), [(DO_SET_MODE, 15), (ARM_DISARM, 1), (DO_SET_MODE, 10), (MISSION_START, 0)]),
-        (Autopilot(PX4, ROVER), [(DO_SET_MODE, AUTO_MISSION), (ARM_DISARM, 1)]),
-        (Autopilot(0, 0), [(ARM_DISARM, 1), (MISSION_START, 0)]),
+        (
+            Autopilot(ARDUPILOT, ROVER),
+            [(codec.DO_SET_MODE, 15), (codec.ARM_DISARM, 1), (codec.DO_SET_MODE, 10), (codec.MISSION_START, 0)],
+        ),
+        (Autopilot(PX4, ROVER), [(codec.DO_SET_MODE, AUTO_MISSION), (codec.ARM_DISARM, 1)]),
+        (Autopilot(0, 0), [(codec.ARM_DISARM, 1), (codec.MISSION_START, 0)]),
     ],
 )
 def test_with_arm_it_is_armed_and_driven_in_the_order_of_its_make(
     vehicle: Autopilot, steps: list[tuple[int, int]]
 ) -> None:
     driving(Wishes("t0", arm=True), vehicle, seconds=20.0)
-    made = [(each.command, mode_of(each)) for each in vehicle.commands if each.command != SET_MESSAGE_INTERVAL]
+    made = [
+        (each.command, mode_of(each)) for each in vehicle.commands if each.command != codec.SET_MESSAGE_INTERVAL
+    ]
     assert made == steps
 
 
-def mode_of(command: Command) -> int:
-    if command.command == DO_SET_MODE and len(command.params) == 3:
+def mode_of(command: codec.Command) -> int:
+    if command.command == codec.DO_SET_MODE and len(command.params) == 3:
         return int(command.params[1]) << 16 | int(command.params[2]) << 24
     return int(command.params[-1]) if command.params else 0
 
@@ -355,7 +339,7 @@ def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
     vehicle = Autopilot(PX4, answers=True)
     vehicle._obey = lambda command, params: 2  # type: ignore[method-assign]
     world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
-    assert sum(each.command == DO_SET_MODE for each in vehicle.commands) == 10
+    assert sum(each.command == codec.DO_SET_MODE for each in vehicle.commands) == 10
     assert any("refuses to change its mode: MAV_RESULT 2" in each for each in world.told())
     assert world.told()[-1].endswith("it has not obeyed 10 commands")
 
@@ -363,9 +347,9 @@ def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
 def test_a_vehicle_that_knows_no_start_of_missions_is_told_three_times_and_left_in_peace() -> None:
     vehicle = Autopilot(0, 0)
     obey = vehicle._obey
-    vehicle._obey = lambda command, params: 3 if command == MISSION_START else obey(command, params)  # type: ignore[method-assign]
+    vehicle._obey = lambda command, params: 3 if command == codec.MISSION_START else obey(command, params)  # type: ignore[method-assign]
     world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
-    assert [each.command for each in vehicle.commands].count(MISSION_START) == 3
+    assert [each.command for each in vehicle.commands].count(codec.MISSION_START) == 3
     assert not any("left alone" in each for each in world.told())
 
 
@@ -387,32 +371,34 @@ def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() 
 def test_px4_gets_ten_setpoints_a_second_and_none_when_the_swarm_is_lost() -> None:
     vehicle = Autopilot(PX4)
     world = driving(GUIDED, vehicle, seconds=1.0)
-    setpoints = [each for each in world.run(3.0) if isinstance(each, Setpoint)]
+    setpoints = [each for each in world.run(3.0) if isinstance(each, codec.Setpoint)]
     assert 29 <= len(setpoints) <= 31
     assert setpoints[0].height_m is None
     assert FRAME.cell(*FRAME.from_wgs84(setpoints[0].lat_deg, setpoints[0].lon_deg)) == GRID.cell(40, 39)
     world.adapter.hear_swarm(False)
-    assert not [each for each in world.run(5.0) if isinstance(each, Setpoint)]
+    assert not [each for each in world.run(5.0) if isinstance(each, codec.Setpoint)]
     assert vehicle.mode == MANUAL
 
 
 def test_px4_is_brought_into_offboard_after_a_second_of_setpoints() -> None:
     vehicle = Autopilot(PX4)
     world = driving(Wishes("t0", "guided", arm=True), vehicle, seconds=8.0)
-    first = next(ns for ns, action in world.said if isinstance(action, Setpoint))
-    mode = next(ns for ns, each in world.said if isinstance(each, Command) and each.command == DO_SET_MODE)
+    first = next(ns for ns, action in world.said if isinstance(action, codec.Setpoint))
+    mode = next(
+        ns for ns, each in world.said if isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE
+    )
     assert 1.0 <= (mode - first) / 1e9 <= 1.2
     assert (vehicle.mode, vehicle.armed) == (OFFBOARD, True)
 
 
 def test_ardupilot_gets_the_next_turn_each_second_and_its_own_place_when_the_swarm_is_lost() -> None:
     world = driving(GUIDED, seconds=1.0)
-    assert 2 <= len([each for each in world.run(3.0) if isinstance(each, Setpoint)]) <= 4
+    assert 2 <= len([each for each in world.run(3.0) if isinstance(each, codec.Setpoint)]) <= 4
     world.vehicle.cell = GRID.cell(40, 39)
-    goal = next(each for each in world.run(1.0) if isinstance(each, Setpoint))
+    goal = next(each for each in world.run(1.0) if isinstance(each, codec.Setpoint))
     assert FRAME.cell(*FRAME.from_wgs84(goal.lat_deg, goal.lon_deg)) == GRID.cell(21, 39)
     world.adapter.hear_swarm(False)
-    holds = [each for each in world.run(10.0) if isinstance(each, Setpoint)]
+    holds = [each for each in world.run(10.0) if isinstance(each, codec.Setpoint)]
     assert places(holds) == [GRID.cell(40, 39)] * 3  # type: ignore[arg-type]
 
 
@@ -421,21 +407,21 @@ def test_what_was_steered_before_the_link_was_lost_is_not_held_when_it_is_back()
     world.speaks = False
     world.run(8.0)
     world.speaks = True
-    assert not [each for each in world.run(3.0) if isinstance(each, Setpoint)]
+    assert not [each for each in world.run(3.0) if isinstance(each, codec.Setpoint)]
 
 
 def test_a_copter_in_guided_takes_off_once() -> None:
     vehicle = Autopilot(type=COPTER)
     world = driving(Wishes("t0", "guided", arm=True, altitude_m=30.0), vehicle, seconds=10.0)
-    takeoffs = [each for each in vehicle.commands if each.command == NAV_TAKEOFF]
+    takeoffs = [each for each in vehicle.commands if each.command == codec.NAV_TAKEOFF]
     assert [each.params[-1] for each in takeoffs] == [30.0]
-    assert {each.height_m for each in of(world, Setpoint)} == {30.0}  # type: ignore[attr-defined]
+    assert {each.height_m for each in of(world, codec.Setpoint)} == {30.0}  # type: ignore[attr-defined]
 
 
 def test_the_last_words_stop_what_is_driven() -> None:
     world = driving(Wishes("t0", arm=True), Autopilot(PX4), seconds=10.0)
     last = world.adapter.stop(world.now_ns)
-    assert any(isinstance(each, Command) and each.command == DO_SET_MODE for each in last)
+    assert any(isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE for each in last)
 
 
 # --- waypoints ---------------------------------------------------------------------------------------------------
@@ -475,6 +461,6 @@ def off(point: tuple[float, float], a: tuple[float, float], b: tuple[float, floa
 
 def test_asked_before_anything_was_offered_nothing_is_said() -> None:
     world = World(MISSION)
-    world.hear(ItemAsked(0))
+    world.hear(codec.ItemAsked(0))
     world.run(1.0)
-    assert not of(world, MissionItem)
+    assert not of(world, codec.MissionItem)

@@ -7,11 +7,12 @@ from typing import Any
 
 import pytest
 from support.client_rig import run_info
+from support.mavlink_sender import Sender, beat, common, position
 from support.mavlink_world import FRAME, GRID, START, TO_THE_EAST
 from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.mavlink.guidance import Wishes
-from launch_scripts.gateways.mavlink.mavlink_codec import AUTOPILOT, Wire
+from launch_scripts.gateways.mavlink.mavlink_codec import Wire
 from launch_scripts.gateways.mavlink.service import Body, Shell, check_ground
 from swarm.bus.bus import Heard
 from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
@@ -20,7 +21,6 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Body as BodyMessage
 from swarm.wire.topics import BODY
 
-common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")
 LAT_DEG, LON_DEG = FRAME.to_wgs84(*GRID.centre_m(START))
 
 
@@ -73,7 +73,7 @@ class Rig:
             self.told.append,
             lambda: self.now_ns,
         )
-        self._mav = common.MAVLink(None, srcSystem=4, srcComponent=AUTOPILOT)
+        self._vehicle = Sender(4)
 
     def _hear(self, event: Any) -> None:
         assert isinstance(event, Heard)
@@ -81,10 +81,9 @@ class Rig:
         self.bodies.append(event.message)
 
     def vehicle_says(self, autopilot: int, type: int, mode: int = 0, base: int = 1) -> None:
-        beat = common.MAVLink_heartbeat_message(type, autopilot, base, mode, 4, 3)
         lat, lon = round(LAT_DEG * 1e7), round(LON_DEG * 1e7)
-        place = common.MAVLink_global_position_int_message(0, lat, lon, 0, 0, 0, 0, 0, 0)
-        self.link.pieces += [bytes(each.pack(self._mav)) for each in (beat, place)]
+        for said in (beat(autopilot, type, mode, base), position(lat, lon)):
+            self.link.pieces.append(self._vehicle.bytes_of(said))
 
     def turns(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
@@ -96,8 +95,7 @@ class Rig:
 def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None:
     rig = Rig(Wishes())
     rig.vehicle_says(3, 10)
-    stranger = common.MAVLink(None, srcSystem=9, srcComponent=AUTOPILOT)
-    rig.link.flood = bytes(common.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0).pack(stranger))
+    rig.link.flood = Sender(9).bytes_of(common.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     rig.turns(2.2)
     assert len(rig.link.heard("HEARTBEAT")) == 3
     assert rig.bodies[0].id == "mav4"

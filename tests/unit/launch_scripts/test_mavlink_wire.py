@@ -15,71 +15,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
+from support.mavlink_sender import NOW_S, Sender, beat, common, position
 
-from launch_scripts.gateways.mavlink.link import Link, open_link, read_address
-from launch_scripts.gateways.mavlink.mavlink_codec import (
-    ABOVE_HOME,
-    ABOVE_TERRAIN,
-    ARM_DISARM,
-    AUTOPILOT,
-    COMPID,
-    NAV_WAYPOINT,
-    SYSID,
-    Beat,
-    Command,
-    CommandAnswered,
-    Heartbeat,
-    ItemAsked,
-    MissionAnswered,
-    MissionCancelled,
-    MissionCount,
-    MissionCurrent,
-    MissionItem,
-    Position,
-    Setpoint,
-    Warned,
-    Wire,
-)
+from launch_scripts.gateways.mavlink import mavlink_codec as codec
+from launch_scripts.gateways.mavlink.link import Link, StreamLink, open_link, read_address
 from launch_scripts.gateways.mavlink.service import read_key
 from swarm.errors import BusError, ConfigError
 
-common: Any = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is not installed")
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
-NOW_S = 1_700_000_000.0
 
 
-class Sender:
-    """Another system on the link, by pymavlink itself."""
-
-    def __init__(
-        self, sysid: int = 1, compid: int = AUTOPILOT, key: bytes | None = None, at_s: float = NOW_S
-    ) -> None:
-        self.mav = common.MAVLink(None, srcSystem=sysid, srcComponent=compid)
-        if key is not None:
-            self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
-            self.mav.signing.timestamp = int((at_s - 1_420_070_400) * 1e5)
-
-    def bytes_of(self, *messages: Any) -> bytes:
-        packed = []
-        for message in messages:
-            packed.append(bytes(message.pack(self.mav)))
-            self.mav.seq = (self.mav.seq + 1) % 256
-        return b"".join(packed)
+def wire(sysid: int | None = None, key: bytes | None = None) -> codec.Wire:
+    return codec.Wire(sysid, key, NOW_S)
 
 
-def beat(autopilot: int = 3, type: int = 10, mode: int = 4, base: int = 129) -> Any:
-    return common.MAVLink_heartbeat_message(type, autopilot, base, mode, 4, 3)
-
-
-def position(lat: int = 365_000_000, lon: int = -841_000_000, vx: int = 300, hdg: int = 9000) -> Any:
-    return common.MAVLink_global_position_int_message(1, lat, lon, 500_000, 12_500, vx, 400, 0, hdg)
-
-
-def wire(sysid: int | None = None, key: bytes | None = None) -> Wire:
-    return Wire(sysid, key, NOW_S)
-
-
-def read(door: Wire, data: bytes) -> list[Any]:
+def read(door: codec.Wire, data: bytes) -> list[Any]:
     return door.read(data, whole=True)
 
 
@@ -91,18 +41,19 @@ def test_what_a_vehicle_says_is_read_with_its_units() -> None:
         beat(),
         position(),
         position(hdg=65535),
-        common.MAVLink_mission_request_int_message(SYSID, COMPID, 3),
-        common.MAVLink_mission_request_message(SYSID, COMPID, 4),
-        common.MAVLink_mission_ack_message(SYSID, COMPID, 0),
-        common.MAVLink_command_ack_message(ARM_DISARM, 4),
+        common.MAVLink_mission_request_int_message(codec.SYSID, codec.COMPID, 3),
+        common.MAVLink_mission_request_message(codec.SYSID, codec.COMPID, 4),
+        common.MAVLink_mission_ack_message(codec.SYSID, codec.COMPID, 0),
+        common.MAVLink_command_ack_message(codec.ARM_DISARM, 4),
         common.MAVLink_statustext_message(2, b"PreArm: \x1b[2J no fix"),
         common.MAVLink_statustext_message(6, b"only information"),
         common.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0),
     )
-    place = Position(36.5, -84.1, 12.5, 5.0, math.pi / 2)
+    place = codec.Position(36.5, -84.1, 12.5, 5.0, math.pi / 2)
     assert read(wire(), said) == [
-        Beat(3, 10, True, 4), place, Position(36.5, -84.1, 12.5, 5.0, None), ItemAsked(3), ItemAsked(4),
-        MissionAnswered(0), CommandAnswered(ARM_DISARM, 4), Warned("PreArm: [2J no fix"),
+        codec.Beat(3, 10, True, 4), place, codec.Position(36.5, -84.1, 12.5, 5.0, None), codec.ItemAsked(3),
+        codec.ItemAsked(4), codec.MissionAnswered(0), codec.CommandAnswered(codec.ARM_DISARM, 4),
+        codec.Warned("PreArm: [2J no fix"),
     ]  # fmt: skip
 
 
@@ -114,10 +65,10 @@ def test_what_a_vehicle_says_is_read_with_its_units() -> None:
         position(lon=-1_800_000_001),
         position(lat=2**31 - 1),
         beat(autopilot=8),
-        common.MAVLink_mission_request_int_message(SYSID, 1, 3),
-        common.MAVLink_mission_request_int_message(255, COMPID, 3),
-        common.MAVLink_mission_ack_message(SYSID, COMPID, 0, 1),
-        common.MAVLink_command_ack_message(ARM_DISARM, 0, 0, 0, 255, 190),
+        common.MAVLink_mission_request_int_message(codec.SYSID, 1, 3),
+        common.MAVLink_mission_request_int_message(255, codec.COMPID, 3),
+        common.MAVLink_mission_ack_message(codec.SYSID, codec.COMPID, 0, 1),
+        common.MAVLink_command_ack_message(codec.ARM_DISARM, 0, 0, 0, 255, 190),
         common.MAVLink_statustext_message(2, b"\x01\x02"),
     ],
 )
@@ -163,7 +114,7 @@ def test_any_bytes_pass_the_door_as_nothing_and_a_vehicle_is_heard_after_them(
     sender = Sender(key=key)
     heard = [each for _ in range(40) for each in door.read(sender.bytes_of(beat()), whole=whole)]
     assert heard
-    assert set(heard) == {Beat(3, 10, True, 4)}
+    assert set(heard) == {codec.Beat(3, 10, True, 4)}
 
 
 # --- signatures ---------------------------------------------------------------------------------------------------
@@ -188,7 +139,7 @@ def test_a_forged_signature_of_a_late_time_shuts_nobody_out() -> None:
 def test_what_we_say_is_signed() -> None:
     vehicle = common.MAVLink(None)
     vehicle.signing.secret_key, vehicle.signing.timestamp = KEY, int((NOW_S - 1_420_070_400) * 1e5)
-    (heard,) = vehicle.parse_buffer(wire(key=KEY).write(Heartbeat()))
+    (heard,) = vehicle.parse_buffer(wire(key=KEY).write(codec.Heartbeat()))
     assert heard.get_type() == "HEARTBEAT"
     assert heard._signed
 
@@ -221,30 +172,30 @@ def test_a_signed_message_that_was_changed_on_its_way_is_not_heard(other: bytes,
 def test_what_is_said_to_a_vehicle_has_its_number_and_the_units_of_mavlink() -> None:
     door, vehicle = wire(9), common.MAVLink(None)
     said = [
-        Heartbeat(), Command(ARM_DISARM, (1,)), MissionCount(2),
-        MissionItem(1, NAV_WAYPOINT, ABOVE_TERRAIN, 36.5, -84.1234567, 30.0, current=True),
-        MissionCurrent(1), MissionCancelled(), Setpoint(ABOVE_HOME, 36.5, -84.1, None),
-        Setpoint(ABOVE_HOME, 36.5, -84.1, 30.0),
+        codec.Heartbeat(), codec.Command(codec.ARM_DISARM, (1,)), codec.MissionCount(2),
+        codec.MissionItem(1, codec.NAV_WAYPOINT, codec.ABOVE_TERRAIN, 36.5, -84.1234567, 30.0, current=True),
+        codec.MissionCurrent(1), codec.MissionCancelled(), codec.Setpoint(codec.ABOVE_HOME, 36.5, -84.1, None),
+        codec.Setpoint(codec.ABOVE_HOME, 36.5, -84.1, 30.0),
     ]  # fmt: skip
     heard = [vehicle.parse_buffer(door.write(message))[0] for message in said]
-    assert {(each.get_srcSystem(), each.get_srcComponent()) for each in heard} == {(SYSID, COMPID)}
+    assert {(each.get_srcSystem(), each.get_srcComponent()) for each in heard} == {(codec.SYSID, codec.COMPID)}
     assert [each._header.seq for each in heard] == list(range(8))
     for each in heard[1:]:
-        assert (each.target_system, each.target_component) == (9, AUTOPILOT)
+        assert (each.target_system, each.target_component) == (9, codec.AUTOPILOT)
     first, command, count, item, current, cancelled, on_ground, in_air = heard
     assert (first.type, first.autopilot) == (18, 8)
-    assert (command.command, command.param1, command.param7) == (ARM_DISARM, 1.0, 0.0)
+    assert (command.command, command.param1, command.param7) == (codec.ARM_DISARM, 1.0, 0.0)
     assert (count.count, current.seq, cancelled.type) == (2, 1, 15)
     assert (item.seq, item.frame, item.x, item.y, item.z, item.current) == (
-        1, ABOVE_TERRAIN, 365_000_000, -841_234_567, 30.0, 1,
+        1, codec.ABOVE_TERRAIN, 365_000_000, -841_234_567, 30.0, 1,
     )  # fmt: skip
     assert math.isnan(item.param4)
     assert (on_ground.type_mask, in_air.type_mask, in_air.alt) == (0x0DFC, 0x0DF8, 30.0)
 
 
 def test_to_nobody_only_heartbeats_are_said() -> None:
-    assert wire().write(Heartbeat())
-    assert wire().write(MissionCount(3)) == b""
+    assert wire().write(codec.Heartbeat())
+    assert wire().write(codec.MissionCount(3)) == b""
 
 
 # --- links --------------------------------------------------------------------------------------------------------
@@ -380,3 +331,28 @@ def test_a_serial_port_is_read_and_written() -> None:
 def test_an_unknown_host_is_one_sentence() -> None:
     with pytest.raises(ConfigError, match="LINK: there is no host"):
         open_link(read_address("tcp:no such host:5760"))
+
+
+def test_half_a_message_ends_a_connection_and_a_peer_that_reads_late_loses_one() -> None:
+    sent: list[int] = [3, 0, -1]
+    closed = []
+
+    class Stream:
+        def close(self) -> None:
+            closed.append(self)
+
+    def give(stream: Stream, data: bytes) -> None:
+        left = sent.pop()
+        if left < 0:
+            raise BlockingIOError
+        if left < len(data):
+            raise OSError("half a message")
+
+    link = StreamLink(Stream, lambda stream: b"", give)
+    link.open()
+    link.write(b"abc")
+    assert not closed
+    link.write(b"abc")
+    assert len(closed) == 1
+    link.write(b"to nobody")
+    assert sent == [3]

@@ -19,11 +19,10 @@ from launch_scripts.gateways.ros2.ros_messages import (
     RosMap,
     RosMessages,
     Severity,
-    base_frame,
+    frames_of,
     heading_of,
     heading_of_quaternion,
     headings_along,
-    odom_frame,
     quaternion_of,
     yaw_of,
 )
@@ -37,7 +36,7 @@ GRIDS = st.builds(
     st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 1.0, 10.0, 25.0]),
     st.floats(-1e6, 1e6), st.floats(-1e7, 1e7), st.just("EPSG:32632"),
 )  # fmt: skip
-FRAMES = odom_frame("a1"), base_frame("a1")
+FRAMES = frames_of("a1")
 GRID = GridSpec(4, 6, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 
 
@@ -304,6 +303,16 @@ def test_frames_twists_and_places_are_those_of_rep_103_and_105() -> None:
     way = path(messages, STAMP_NS, [(x_m, y_m), (x_m, y_m + 5), (x_m + 5, y_m + 5)])
     yaws = [2 * math.atan2(each.pose.orientation.z, each.pose.orientation.w) for each in way.poses]
     assert yaws == pytest.approx([math.pi / 2, 0, 0], abs=1e-12)
+
+
+def test_what_a_message_is_not_given_is_nothing_and_a_field_that_it_has_not_is_refused() -> None:
+    types = maker().types
+    marker = types.make("visualization_msgs/msg/Marker", scale={"x": 2.0}, points=[{"y": 1.0}])
+    assert (marker.scale.x, marker.scale.y, marker.text, marker.frame_locked) == (2.0, 0.0, "", False)
+    assert [(each.x, each.y) for each in marker.points] == [(0.0, 1.0)]
+    assert types.make("nav_msgs/msg/Odometry").pose.covariance.tolist() == [0.0] * 36
+    with pytest.raises(TypeError, match="has no field 'w'"):
+        types.make("geometry_msgs/msg/Point", w=1.0)
 
 
 @given(st.integers(-(2**63), 2**63 - 1))

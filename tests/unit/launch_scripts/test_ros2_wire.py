@@ -8,15 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.gateways.ros2.rmw import (
-    NO_HASH,
-    Attachment,
-    Endpoint,
-    Kind,
-    NodeName,
-    Qos,
-    read_token,
-)
+from launch_scripts.gateways.ros2 import rmw
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.errors import ProtocolError
 
@@ -38,7 +30,7 @@ PUBLISHED = {
     "nav_msgs/srv/GetPlan": "234f7aff",
     "nav_msgs/srv/GetMap": "c8ae77c9",
 }
-NODE = NodeName(0, "54c1e0b8e18f2313ebc2c48bce10effe", "swarm_gateway")
+NODE = rmw.NodeName(0, "54c1e0b8e18f2313ebc2c48bce10effe", "swarm_gateway")
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,2}", fullmatch=True)
 
 
@@ -49,12 +41,14 @@ def test_hashes_are_those_that_ros_publishes(distribution: Distribution, name: s
 
 
 def test_humble_has_no_hashes() -> None:
-    assert types_of(Distribution.HUMBLE).hash_of("nav_msgs/msg/Path") == NO_HASH
+    assert types_of(Distribution.HUMBLE).hash_of("nav_msgs/msg/Path") == rmw.NO_HASH
 
 
 def test_key_and_token_of_a_latched_map() -> None:
     hash = types_of(Distribution.JAZZY).hash_of("nav_msgs/msg/OccupancyGrid")
-    endpoint = Endpoint(NODE, 4, Kind.PUBLISHER, "/map", "nav_msgs/msg/OccupancyGrid", hash, Qos.LATCHED.value)
+    endpoint = rmw.Endpoint(
+        NODE, 4, rmw.Kind.PUBLISHER, "/map", "nav_msgs/msg/OccupancyGrid", hash, rmw.Qos.LATCHED.value
+    )
     assert endpoint.key == f"0/map/nav_msgs::msg::dds_::OccupancyGrid_/{hash}"
     assert endpoint.token == (
         "@ros2_lv/0/54c1e0b8e18f2313ebc2c48bce10effe/0/4/MP/%/%/swarm_gateway/%map/"
@@ -63,48 +57,48 @@ def test_key_and_token_of_a_latched_map() -> None:
 
 
 @given(
-    domain=st.integers(0, 232), number=st.integers(1, 10**6), kind=st.sampled_from(Kind), topic=NAMES,
-    qos=st.sampled_from(Qos), namespace=NAMES, more=st.sampled_from(["", "/", "/x/y"]),
+    domain=st.integers(0, 232), number=st.integers(1, 10**6), kind=st.sampled_from(rmw.Kind), topic=NAMES,
+    qos=st.sampled_from(rmw.Qos), namespace=NAMES, more=st.sampled_from(["", "/", "/x/y"]),
 )  # fmt: skip
 def test_a_token_reads_back_what_it_says(
-    domain: int, number: int, kind: Kind, topic: str, qos: Qos, namespace: str, more: str
+    domain: int, number: int, kind: rmw.Kind, topic: str, qos: rmw.Qos, namespace: str, more: str
 ) -> None:
-    node = NodeName(domain, NODE.zid, "n", f"/{namespace}")
-    said = Endpoint(node, number, kind, f"/{topic}", "nav_msgs/msg/Path", "RIHS01_00", qos.value)
-    assert read_token(said.token + more) == said
-    assert read_token(node.token) is None
+    node = rmw.NodeName(domain, NODE.zid, "n", f"/{namespace}")
+    said = rmw.Endpoint(node, number, kind, f"/{topic}", "nav_msgs/msg/Path", "RIHS01_00", qos.value)
+    assert rmw.read_token(said.token + more) == said
+    assert rmw.read_token(node.token) is None
 
 
 @given(st.text(max_size=80) | NAMES.map(lambda text: f"@ros2_lv/0/{text}/0/0/MP/%/%/n/{text}/{text}/h/q"))
 def test_a_strange_token_raises_only_a_protocol_error(key: str) -> None:
     with suppress(ProtocolError):
-        seen = read_token(key)
+        seen = rmw.read_token(key)
         assert seen is None or all(part.isprintable() for part in (seen.node.name, seen.topic, seen.type_name))
 
 
 @pytest.mark.parametrize("place", [8, 9, 10, 11, 12])
 @pytest.mark.parametrize("sign", ["\x1b[2J", "\n", "\u202e"])
 def test_no_name_of_a_peer_steers_a_terminal(place: int, sign: str) -> None:
-    parts = Endpoint(NODE, 1, Kind.PUBLISHER, "/map", "nav_msgs/msg/Path", "RIHS01_00", "").token.split("/")
+    parts = rmw.Endpoint(NODE, 1, rmw.Kind.PUBLISHER, "/map", "nav_msgs/msg/Path", "RIHS01_00", "").token.split("/")
     parts[place] = sign + parts[place]
     with pytest.raises(ProtocolError) as error:
-        read_token("/".join(parts))
+        rmw.read_token("/".join(parts))
     assert str(error.value).isprintable()
 
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_attachments_are_33_bytes_and_read_back(sequence: int, stamp_ns: int, gid: bytes) -> None:
-    packed = Attachment(sequence, stamp_ns, gid).packed()
+    packed = rmw.Attachment(sequence, stamp_ns, gid).packed()
     assert (len(packed), packed[16], packed[17:]) == (33, 16, gid)
     assert int.from_bytes(packed[:8], "little", signed=True) == sequence
-    assert Attachment.of(packed) == Attachment(sequence, stamp_ns, gid)
+    assert rmw.Attachment.of(packed) == rmw.Attachment(sequence, stamp_ns, gid)
 
 
 @given(st.binary(max_size=60))
 def test_other_attachments_are_refused(content: bytes) -> None:
     if len(content) != 33 or content[16] != 16:
         with pytest.raises(ProtocolError):
-            Attachment.of(content)
+            rmw.Attachment.of(content)
 
 
 def test_an_empty_request_is_one_byte() -> None:
