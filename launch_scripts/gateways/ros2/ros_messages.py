@@ -91,8 +91,11 @@ def ros_name(id: str) -> str:
 
 
 def frames_of(name: str) -> tuple[str, str]:
-    """The two frames of a vehicle (REP 105). The first lies where the map does, as the swarm tells no drift. The second
-    is fixed to the vehicle: x forward, y to the left, z up."""
+    """The two frames of a vehicle (REP 105).
+
+    The first lies where the map does, as the swarm tells no drift. The second is fixed to the vehicle: x forward, y
+    to the left, z up.
+    """
     return f"{name}/odom", f"{name}/base_link"
 
 
