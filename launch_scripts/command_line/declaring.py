@@ -82,10 +82,16 @@ def _called_with_options(function: Callable[..., None]) -> Callable[..., None]:
             continue
         group: Any = each.annotation
         groups[each.name] = group
-        explained = {name: text for base in reversed(group.__mro__) for name, text in meanings(base).items()}
+        bases: list[Any] = [base for base in reversed(group.__mro__) if is_dataclass(base)]
+        explained = {name: text for base in bases for name, text in meanings(base).items()}
+        panels = {name: base.panel for base in bases for name in meanings(base)}
         hints = get_type_hints(group, include_extras=True)
         for field in fields(group):
-            parameters.append(_parameter(field.name, hints[field.name], field.default, explained, group.panel))
+            parameters.append(
+                _parameter(
+                    field.name, hints[field.name], field.default, explained, panels.get(field.name, group.panel)
+                )
+            )
 
     def run(**values: Any) -> None:
         for name, group in groups.items():
@@ -107,7 +113,7 @@ def _parameter(
     info = copy(declared[0]) if declared else typer.Argument() if is_argument else typer.Option()
     info.help = said.get(name, info.help)
     info.rich_help_panel = panel
-    if kind is bool and not info.param_decls:
+    if kind is bool and not isinstance(info.default, str):  # where Typer keeps a name that is declared
         info.param_decls = (f"--{name.replace('_', '-')}",)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info]

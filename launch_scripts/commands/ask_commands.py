@@ -19,7 +19,6 @@ from launch_scripts.commands.shared_options import (
     PresetOption,
     SignalsAddress,
     TargetId,
-    Tls,
     VehicleClass,
 )
 from swarm.errors import BusError, ConfigError
@@ -38,7 +37,6 @@ _TURN_S = 0.1
 @command(app, ASK)
 def route(
     where: Where,
-    tls: Tls,
     target: TargetId = None,
     row: int | None = None,
     col: int | None = None,
@@ -94,7 +92,7 @@ def route(
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
     from launch_scripts.commands import swarm_route
 
-    with where.bus(tls) as bus:
+    with where.bus() as bus:
         answer = swarm_route.ask_planner(
             bus, where, target, place, cost=cost, steps=steps, vehicle_class=vehicle_class
         )
@@ -107,7 +105,7 @@ def route(
 
 
 @command(app, ASK)
-def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def status(where: Where, as_json: AsJson = False) -> None:
     """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
 
     Without --connect it asks the newest run of this machine that runs, whatever its ports.
@@ -120,21 +118,21 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 
     from launch_scripts.commands.status_view import print_status, status_fields
 
-    told = _ask_status(where, tls)
+    told = _ask_status(where)
     if as_json:
         typer.echo(json.dumps(status_fields(told), indent=2))
     else:
         print_status(told, Console(markup=False))
 
 
-def _ask_status(where: Where, tls: Tls) -> Status:
+def _ask_status(where: Where) -> Status:
     """A running swarm as it is now. Raises BusError if nobody answers."""
     from launch_scripts.commands.status_view import status_of
     from launch_scripts.observe.run_observer import OutsideObserver
     from swarm.clock import MonotonicClock
 
     clock = MonotonicClock()
-    with where.bus(tls) as bus:
+    with where.bus() as bus:
         observer = OutsideObserver(bus)
         began_s = time.monotonic()
         while (spent_s := time.monotonic() - began_s) < _STATUS_MOST_S:
@@ -143,7 +141,7 @@ def _ask_status(where: Where, tls: Tls) -> Status:
             observer.listen(clock, 0.1)
         told = status_of(observer, clock.now_ns())
     if told is None:
-        admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
+        admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
         raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
     return told
 
@@ -151,7 +149,6 @@ def _ask_status(where: Where, tls: Tls) -> Status:
 @command(app, ASK)
 def top(
     where: Where,
-    tls: Tls,
     each: bool = False,
     once: bool = False,
     as_json: Annotated[bool, typer.Option("--json")] = False,
@@ -171,11 +168,11 @@ def top(
     """
     from launch_scripts.commands.status_view import show_top
 
-    show_top(where.network(tls), where, each=each, once=once, as_json=as_json)
+    show_top(where.network(), where, each=each, once=once, as_json=as_json)
 
 
 @command(app, ASK)
-def health(where: Where, tls: Tls, url: str | None = None, live: bool = False, as_json: AsJson = False) -> None:
+def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> None:
     """Say whether a swarm is ready: exit code 0 if it is, 1 if not, 4 if nobody answers. For probes.
 
     With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
@@ -194,11 +191,13 @@ def health(where: Where, tls: Tls, url: str | None = None, live: bool = False, a
 
     if url is None and live:
         raise ConfigError("--live goes with --url: of a whole swarm it is asked whether it is ready")
-    if url is not None and (where.connect or where.run or where.namespace or tls != Tls()):
+    if url is not None and (
+        where.connect or where.run or where.namespace or where.tls_ca or where.tls_cert or where.tls_key
+    ):
         raise ConfigError(
             "--url asks one machine without TLS; what says how a whole swarm is reached goes without it"
         )
-    answer = swarm_answer(_ask_status(where, tls)) if url is None else ask(url, live=live)
+    answer = swarm_answer(_ask_status(where)) if url is None else ask(url, live=live)
     raise typer.Exit(answer.show(as_json=as_json))
 
 
@@ -226,7 +225,6 @@ def swarm_answer(status: Status) -> Answer:
 @command(app, ASK)
 def metrics(
     where: Where,
-    tls: Tls,
     port: Annotated[int, typer.Option(min=0, max=HIGHEST_PORT)] = 9464,
     signals_address: SignalsAddress = "127.0.0.1",
     dashboard: bool = False,
@@ -252,7 +250,7 @@ def metrics(
         name = "dashboard.json" if dashboard else "alerts.yml"
         typer.echo(files("launch_scripts.web").joinpath(name).read_text(encoding="utf-8"), nl=False)
     else:
-        _serve_metrics(where.network(tls), port, signals_address)
+        _serve_metrics(where.network(), port, signals_address)
 
 
 def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:

@@ -317,7 +317,7 @@ def zenohd(
     if scenario is None and tls.tls_ca is not None:
         raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
     chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))
-    network = with_network(chosen, namespace=namespace, tls=tls.config()).network
+    network = with_network(chosen, namespace=namespace, tls=tls.tls()).network
     for option, endpoints in (("--listen", listen), ("--peer", peer)):
         for endpoint in endpoints or ():
             check_endpoint(endpoint, network.tls is not None, option)

@@ -14,7 +14,7 @@ import typer
 from launch_scripts.command_line.declaring import ASK, ORDER, command
 from launch_scripts.commands.role_commands import check_name
 from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import GroupName, TargetId, Tls, VehicleClass
+from launch_scripts.commands.shared_options import GroupName, TargetId, VehicleClass
 from swarm.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class RosSide:
     distribution  humble, jazzy, kilted, lyrical or rolling; jazzy if not given.
     """
 
-    panel: ClassVar = "The ROS side"
+    panel: ClassVar[str | None] = "The ROS side"
     ros: Annotated[str | None, typer.Option(metavar="ENDPOINT")] = None
     domain: Annotated[int | None, typer.Option(min=0, max=232)] = None
     distribution: str | None = None
@@ -44,7 +44,6 @@ class RosSide:
 @command(app, ASK)
 def ros2(
     where: Where,
-    tls: Tls,
     side: RosSide,
     settings: Annotated[Path | None, typer.Argument(metavar="[SETTINGS]")] = None,
     vehicles: list[str] | None = None,
@@ -72,8 +71,9 @@ def ros2(
         return
     ours = chosen.swarm
     where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
-    tls = tls if tls.tls_ca else Tls(ours.ca, ours.certificate, ours.key)
-    _serve_ros2(chosen, where.network(tls), where.runs)
+    if where.tls_ca is None:
+        where = replace(where, tls_ca=ours.ca, tls_cert=ours.certificate, tls_key=ours.key)
+    _serve_ros2(chosen, where.network(), where.runs)
 
 
 def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
@@ -142,7 +142,7 @@ class Drives:
     vehicle_class  Which class of the swarm's vehicles it drives as.
     """
 
-    panel: ClassVar = "How it is driven"
+    panel: ClassVar[str | None] = "How it is driven"
     target: TargetId = None
     drive: Literal["mission", "guided"] = "mission"
     arm: bool = False
@@ -163,7 +163,7 @@ class Vehicle:
     signing_key  File of 64 hexadecimal digits: messages are signed, and others not heard.
     """
 
-    panel: ClassVar = "Who the vehicle is"
+    panel: ClassVar[str | None] = "Who the vehicle is"
     id: str | None = None
     group: GroupName = "all"
     radius: Annotated[float, typer.Option(min=0.0, max=100.0)] = 1.0
@@ -174,7 +174,7 @@ class Vehicle:
 
 @command(app, ORDER)
 def mavlink(
-    link: Annotated[str, typer.Argument(metavar="LINK")], where: Where, tls: Tls, drives: Drives, vehicle: Vehicle
+    link: Annotated[str, typer.Argument(metavar="LINK")], where: Where, drives: Drives, vehicle: Vehicle
 ) -> None:
     """Let a PX4 or ArduPilot vehicle take part in a running swarm, until Ctrl-C.
 
@@ -211,7 +211,7 @@ def mavlink(
     if drives.above == "terrain" and altitude is None:
         raise ConfigError("--above terrain goes with --altitude: how many metres above it")
     pymavlink()
-    network = where.network(tls)
+    network = where.network()
 
     def join() -> Swarm:
         files = network.tls

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson, Tls
+from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.report.export import FORMATS, Layer, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
@@ -179,7 +179,6 @@ def import_(file: Path, store: Path) -> None:
 @command(app)
 def learned(
     where: Where,
-    tls: Tls,
     store: Annotated[Path | None, typer.Argument()] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -196,7 +195,7 @@ def learned(
         _, grid, held = _read(store / "map.sqlite" if store.is_dir() else store)
         words = _parted(grid, held)[1]
     else:
-        with where.bus(tls) as bus:
+        with where.bus() as bus:
             words = ask_learned(bus, where)
     print_learned(words, as_json=as_json)
 

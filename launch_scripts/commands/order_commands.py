@@ -15,7 +15,7 @@ import typer
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import ORDER, command, family_app
 from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson, Tls, Walk
+from launch_scripts.commands.shared_options import AsJson, Walk
 
 if TYPE_CHECKING:
     from swarm.runtime.operator import Acknowledged
@@ -37,30 +37,29 @@ Vehicles = Annotated[
 
 
 @command(app, ORDER)
-def pause(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def pause(where: Where, as_json: AsJson = False) -> None:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
     Vehicles drive to the middle of the cell that they are entering and stand there. Planners go on planning.
 
     swarm pause
     """
-    give(where, tls, as_json, {"subject": "pause"})
+    give(where, as_json, {"subject": "pause"})
 
 
 @command(app, ORDER)
-def resume(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def resume(where: Where, as_json: AsJson = False) -> None:
     """Let all go on after a pause.
 
     swarm resume
     """
-    give(where, tls, as_json, {"subject": "pause", "off": True})
+    give(where, as_json, {"subject": "pause", "off": True})
 
 
 @command(app, ORDER)
 def group(
     name: Annotated[str, typer.Argument(metavar="GROUP", autocompletion=complete.group_names)],
     where: Where,
-    tls: Tls,
     targets: Annotated[
         list[str] | None, typer.Argument(metavar="[targets] TARGET...", autocompletion=complete.target_ids)
     ] = None,
@@ -84,7 +83,7 @@ def group(
         chosen = chosen[1:]
     if as_scenario == bool(chosen):
         raise ConfigError("group: give either targets or --as-scenario")
-    give(where, tls, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
+    give(where, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
 
 
 @command(app, ORDER, "set")
@@ -93,7 +92,6 @@ def set_(
         str, typer.Argument(metavar="KEY", autocompletion=complete.words("swarm.runtime.order_book", "SETTINGS"))
     ],
     where: Where,
-    tls: Tls,
     value: Annotated[float | None, typer.Argument(metavar="VALUE")] = None,
     as_scenario: bool = False,
     as_json: AsJson = False,
@@ -116,11 +114,11 @@ def set_(
         raise ConfigError("set: give either a value or --as-scenario")
     if key not in SETTINGS:
         raise ConfigError(f"set: {key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
-    give(where, tls, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
+    give(where, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
 
 
 @command(app, ORDER)
-def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def orders(where: Where, as_json: AsJson = False) -> None:
     """Print what is ordered and not taken back. Zones are in `swarm zone list`.
 
     swarm orders --json
@@ -130,7 +128,7 @@ def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     from swarm.runtime.operator import Operator
     from swarm.runtime.order_book import OrderBook
 
-    with where.bus(tls) as bus:
+    with where.bus() as bus:
         book = Operator(bus).orders()
     if as_json:
         typer.echo(json.dumps([msgspec.to_builtins(order) for order in book.orders], indent=2))
@@ -146,7 +144,6 @@ def add(
     id: Id,
     at: At,
     where: Where,
-    tls: Tls,
     walk: Walk = "waypoints",
     speed: float = 4.0,
     as_json: AsJson = False,
@@ -161,47 +158,47 @@ def add(
     speed  Metres per second on level open ground.
     """
     fields = {"subject": "target", "name": id, "new": True, "walk": walk, "speed_m_per_s": speed}
-    give(where, tls, as_json, fields, at=at)
+    give(where, as_json, fields, at=at)
 
 
 @command(target_app)
-def move(id: Id, at: At, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def move(id: Id, at: At, where: Where, as_json: AsJson = False) -> None:
     """Put a target somewhere else; it goes on from there.
 
     swarm target move t3 --at cell:40,200
     """
-    give(where, tls, as_json, {"subject": "target", "name": id}, at=at)
+    give(where, as_json, {"subject": "target", "name": id}, at=at)
 
 
 @command(target_app)
-def remove(id: Id, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def remove(id: Id, where: Where, as_json: AsJson = False) -> None:
     """Remove a target. Its planner ends, and the vehicles that chased it chase others.
 
     swarm target remove t3
     """
-    give(where, tls, as_json, {"subject": "target", "name": id, "off": True})
+    give(where, as_json, {"subject": "target", "name": id, "off": True})
 
 
-def stop(ids: Vehicles, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> None:
     """Let vehicles stand in the middle of their cells until they are let go. Others drive around them.
 
     swarm vehicle stop a0-03 a0-04
     """
-    give(where, tls, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
+    give(where, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
 
 
-def go(ids: Vehicles, where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def go(ids: Vehicles, where: Where, as_json: AsJson = False) -> None:
     """Let stopped vehicles go.
 
     swarm vehicle go a0-03
     """
-    give(where, tls, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
+    give(where, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
 
 
 # --- how an order is given --------------------------------------------------------------------------------------
 
 
-def give(where: Where, tls: Tls, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> None:
+def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> None:
     """Gives orders, one after the other, and prints who obeys. Exit code 1 if somebody has not said so.
 
     orders  fields of `GiveOrder` each
@@ -219,7 +216,7 @@ def give(where: Where, tls: Tls, as_json: bool, *orders: dict[str, Any], at: str
     made = [checked(GiveOrder, fields if place is None else {**fields, "cell": 0}) for fields in orders]
     silent = False
     printed: list[dict[str, Any]] = []
-    with where.bus(tls) as bus:
+    with where.bus() as bus:
         operator = Operator(bus)
         for order in made:
             said: dict[str, Any] = {}

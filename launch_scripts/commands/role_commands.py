@@ -31,14 +31,14 @@ app = typer.Typer()
 
 
 @dataclass(frozen=True)
-class Place:
+class Place(Tls):
     """Where a process finds its scenario, its router and its files.
 
     connect      The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.
     health_port  Answer probes on this port, at /healthz and /readyz; 0 picks one.
     """
 
-    panel: ClassVar = None
+    panel: ClassVar[str | None] = None
     scenario: Annotated[
         str,
         typer.Argument(
@@ -75,7 +75,7 @@ class Joins:
 
 
 @command(app, ROLE)
-def router(place: Place, tls: Tls, listen: str | None = None, id: str = "0") -> None:
+def router(place: Place, listen: str | None = None, id: str = "0") -> None:
     """Pass everybody's messages on: the process that all others connect to. --connect names another router.
 
     With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
@@ -85,11 +85,11 @@ def router(place: Place, tls: Tls, listen: str | None = None, id: str = "0") -> 
     listen  Where to listen, such as tls/0.0.0.0:7447.
     id      Its name, where several routers pass on for each other.
     """
-    run_role("router", id, place, tls, listen=listen)
+    run_role("router", id, place, listen=listen)
 
 
 @command(app, ROLE)
-def keeper(part: Part, tls: Tls, store: Path | None = None, rebuild: bool = False, id: str = "0") -> None:
+def keeper(part: Part, store: Path | None = None, rebuild: bool = False, id: str = "0") -> None:
     """Keep the shared map's marks in a store that survives every crash.
 
     Also gives the terrain to machines that lack its files. Several keepers agree with each other:
@@ -100,12 +100,12 @@ def keeper(part: Part, tls: Tls, store: Path | None = None, rebuild: bool = Fals
     rebuild  Move a damaged store aside and fill a new one from the swarm.
     id       Its name, where several keepers keep the same map.
     """
-    run_role("keeper", id, part, tls, store_path=store, rebuild=rebuild)
+    run_role("keeper", id, part, store_path=store, rebuild=rebuild)
 
 
 @command(app, ROLE)
 def planner(
-    target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, tls: Tls, rank: Rank = 0
+    target: Annotated[str, typer.Option(autocompletion=complete.target_ids)], part: Part, rank: Rank = 0
 ) -> None:
     """Plan for one target, or stand by to do so.
 
@@ -114,47 +114,44 @@ def planner(
     target  The target whose tree this planner keeps, such as t0.
     rank    0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
     """
-    run_role("planner", ranked_id(target, rank), part, tls)
+    run_role("planner", ranked_id(target, rank), part)
 
 
 @command(app, ROLE)
-def agent(
-    id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part, tls: Tls
-) -> None:
+def agent(id: Annotated[str, typer.Option("--id", autocompletion=complete.agent_ids)], part: Part) -> None:
     """Drive the vehicles of one agent process.
 
     swarm agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
 
     id  The agent, such as a0: it hosts that part of the vehicles.
     """
-    run_role("agent", id, part, tls)
+    run_role("agent", id, part)
 
 
 @command(app, ROLE)
-def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
+def targets(part: Part, rank: Rank = 0) -> None:
     """Move the simulated targets and referee the run, or stand by to do so.
 
     swarm targets jacksboro --rank 1
 
     rank  0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).
     """
-    run_role("targets", ranked_id("0", rank), part, tls)
+    run_role("targets", ranked_id("0", rank), part)
 
 
 @command(app, ROLE)
-def monitor(part: Part, tls: Tls) -> None:
+def monitor(part: Part) -> None:
     """Show and record the run.
 
     swarm monitor jacksboro --connect tcp/127.0.0.1:7447
     """
-    run_role("monitor", "0", part, tls)
+    run_role("monitor", "0", part)
 
 
 def run_role(
     role: str,
     id: str,
     part: Place,
-    tls: Tls,
     *,
     listen: str | None = None,
     joins: Joins | None = None,
@@ -185,7 +182,7 @@ def run_role(
         connect=None if is_router else part.connect,
         listen=listen,
         namespace=part.namespace,
-        tls=tls.config(),
+        tls=part.tls(),
     )
     if is_router and part.connect is not None:
         network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 import typer
 
 from launch_scripts.command_line.declaring import RUN, command
-from launch_scripts.commands.shared_options import Meeting, RunOptions, ScenarioArgument, SomeProcesses, Tls
+from launch_scripts.commands.shared_options import Meeting, RunOptions, ScenarioArgument, SomeProcesses
 
 app = typer.Typer()
 
@@ -22,11 +22,11 @@ def demo(run: RunOptions) -> None:
 
     swarm demo --seconds 20 --port 0
     """
-    up("demo", run, Tls(), Meeting(), SomeProcesses())
+    up("demo", run, Meeting(), SomeProcesses())
 
 
 @command(app, RUN)
-def up(scenario: ScenarioArgument, run: RunOptions, tls: Tls, meeting: Meeting, part: SomeProcesses) -> None:
+def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: SomeProcesses) -> None:
     """Run a scenario: all of its processes on this machine, or some of them.
 
     swarm up jacksboro --seconds 20 --port 0
@@ -62,7 +62,7 @@ def up(scenario: ScenarioArgument, run: RunOptions, tls: Tls, meeting: Meeting, 
         connect=meeting.connect,
         also_listen=meeting.listen,
         namespace=meeting.namespace,
-        tls=tls.config(),
+        tls=meeting.tls(),
     )
     chosen = options.with_follow(chosen, run.follow)
     chosen = msgspec.structs.replace(

@@ -27,8 +27,8 @@ _NAMED = 3
 
 
 @dataclass(frozen=True)
-class Where:
-    """Router and namespace of the swarm that a command asks.
+class Where(Tls):
+    """Router, namespace and certificates of the swarm that a command asks.
 
     connect    The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447.
     namespace  Prefix of all keys; if not given, that of the run, or `swarm`.
@@ -36,7 +36,7 @@ class Where:
     runs       Folder of the runs of this machine.
     """
 
-    panel: ClassVar = NETWORK
+    panel: ClassVar[str | None] = NETWORK
     connect: str | None = None
     namespace: str | None = None
     run: str | None = None
@@ -57,7 +57,7 @@ class Where:
             typer.echo(f"asking run {found.run}, the newest; also running: {told} (--run NAME)", err=True)
         return found.network
 
-    def network(self, tls: Tls) -> NetworkConfig:
+    def network(self) -> NetworkConfig:
         """How this command reaches the swarm. Raises BusError if none runs here, ConfigError for a wrong option."""
         import msgspec
 
@@ -69,16 +69,16 @@ class Where:
             msgspec.structs.replace(Scenario(), network=self._found),
             connect=self.connect,
             namespace=self.namespace,
-            tls=tls.config(),
+            tls=self.tls(),
         )
         network = as_process(chosen, LAUNCHER, "0").network
         return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
 
-    def bus(self, tls: Tls) -> ZenohBus:
+    def bus(self) -> ZenohBus:
         """A session with the swarm; closed by `with`."""
         from swarm.bus.zenoh_bus import open_bus
 
-        return open_bus(self.network(tls))
+        return open_bus(self.network())
 
     def __str__(self) -> str:
         endpoint = self.connect or ", ".join(self._found.connect)

@@ -54,7 +54,7 @@ class Choices:
     seconds   How long the run lasts.
     """
 
-    panel: ClassVar = None
+    panel: ClassVar[str | None] = None
     terrain: Annotated[str | None, typer.Option(autocompletion=complete.terrains)] = None
     photo: str | None = None
     preset: PresetOption = None

@@ -69,19 +69,19 @@ Rank = Annotated[int, typer.Option(min=0, max=HIGHEST_RANK)]
 
 @dataclass(frozen=True)
 class Tls:
-    """The three files of mutual TLS: all, or none.
+    """The three files of mutual TLS: all, or none. Whatever says how a swarm is reached has them, too.
 
     tls_ca    Certificate of the authority, PEM.
     tls_cert  Our certificate, PEM.
     tls_key   Our private key, PEM.
     """
 
-    panel: ClassVar = CERTIFICATES
+    panel: ClassVar[str | None] = CERTIFICATES
     tls_ca: str | None = None
     tls_cert: str | None = None
     tls_key: str | None = None
 
-    def config(self) -> TlsConfig | None:
+    def tls(self) -> TlsConfig | None:
         from launch_scripts.launcher.options import tls_of
 
         return tls_of(self.tls_ca, self.tls_cert, self.tls_key)
@@ -100,7 +100,7 @@ class RunOptions:
     plain          Plain lines instead of the live table.
     """
 
-    panel: ClassVar = None
+    panel: ClassVar[str | None] = None
     seconds: Seconds = None
     seed: Seed = None
     runs: Runs = Path("runs")
@@ -116,14 +116,14 @@ class RunOptions:
 
 
 @dataclass(frozen=True)
-class Meeting:
+class Meeting(Tls):
     """Where the processes of a launcher meet others.
 
     connect  Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.
     listen   Where the router listens too, for other machines, such as tls/0.0.0.0:7448.
     """
 
-    panel: ClassVar = NETWORK
+    panel: ClassVar[str | None] = NETWORK
     connect: str | None = None
     listen: str | None = None
     namespace: Namespace = None
@@ -140,7 +140,7 @@ class SomeProcesses:
                successors are ready.
     """
 
-    panel: ClassVar = PART
+    panel: ClassVar[str | None] = PART
     only: Annotated[
         list[str] | None,
         typer.Option(metavar="ROLE[.ID]", autocompletion=complete.words("launch_scripts.process_table", "ROLES")),

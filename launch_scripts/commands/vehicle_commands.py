@@ -14,7 +14,7 @@ from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.order_commands import go, stop
 from launch_scripts.commands.role_commands import Joins, Part, run_role
 from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson, GroupName, Tls
+from launch_scripts.commands.shared_options import AsJson, GroupName
 from launch_scripts.observe.run_observer import ask_run
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.agents import agent_of
@@ -44,7 +44,6 @@ command(app)(go)
 def add(
     group: GroupName,
     part: Part,
-    tls: Tls,
     count: Annotated[int, typer.Option(min=1)] = 1,
     id: str = "",
     at: Annotated[str | None, typer.Option(metavar="PLACE")] = None,
@@ -63,14 +62,13 @@ def add(
     """
     if at is not None:
         read_place(at, "--at")
-    run_role("agent", id, part, tls, joins=Joins(group, count, at))
+    run_role("agent", id, part, joins=Joins(group, count, at))
 
 
 @command(app)
 def remove(
     names: Annotated[list[str], typer.Argument(autocompletion=complete.vehicle_ids)],
     where: Where,
-    tls: Tls,
     as_json: AsJson = False,
 ) -> None:
     """Let vehicles leave the map. Returns once their cells are free for others.
@@ -81,7 +79,7 @@ def remove(
 
     names  Agents, such as extra, or vehicles, such as a0-03.
     """
-    network = where.network(tls)
+    network = where.network()
     found = _members(network, where)
     agents = {info.id for info in found if info.role == "agent"}
     asked: dict[str, list[str]] = {}
@@ -105,7 +103,7 @@ def remove(
 
 
 @command(app)
-def gone(name: str, where: Where, tls: Tls) -> None:
+def gone(name: str, where: Where) -> None:
     """Say that vehicles of a dead process are not on the map any more, so that others may drive there.
 
     Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
@@ -115,7 +113,7 @@ def gone(name: str, where: Where, tls: Tls) -> None:
 
     name  The guest, such as extra or rover7.
     """
-    network = where.network(tls)
+    network = where.network()
     run = _members(network, where)[0]
     with _open(network, run.run_id) as bus:
         if not say_gone(bus, name, GridSpec(run.rows, run.cols, run.resolution_m), _WITHIN_S):

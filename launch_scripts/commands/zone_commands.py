@@ -16,7 +16,7 @@ import typer
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.order_commands import checked, print_obeyed
 from launch_scripts.commands.running_swarm import Where
-from launch_scripts.commands.shared_options import AsJson, Tls
+from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.observe.run_observer import frame_of_run
 from swarm.errors import ConfigError
 from swarm.places import FORMS, corners_of, fields_of, read_place, written
@@ -38,7 +38,6 @@ _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 @command(app)
 def add(
     where: Where,
-    tls: Tls,
     polygon: str | None = None,
     polygon_m: str | None = None,
     file: Path | None = None,
@@ -87,7 +86,6 @@ def add(
                 msgspec.structs.replace(order, polygon=corners_of(places, frame, "--polygon")) if places else order
             ],
             where,
-            tls,
             as_json,
         )
         return
@@ -106,13 +104,11 @@ def add(
             called = f"{name}-{number}" if several else name
             yield checked(ZoneOrder, fields | {"name": called, "polygon": outline})
 
-    _give(of_file, where, tls, as_json)
+    _give(of_file, where, as_json)
 
 
 @command(app)
-def remove(
-    name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, tls: Tls, as_json: AsJson = False
-) -> None:
+def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, as_json: AsJson = False) -> None:
     """Open a zone again.
 
     swarm zone remove bridge
@@ -120,16 +116,16 @@ def remove(
     name  The zone.
     """
     order = checked(ZoneOrder, {"action": "remove", "name": name})
-    _give(lambda frame: [order], where, tls, as_json)
+    _give(lambda frame: [order], where, as_json)
 
 
 @command(app, name="list")
-def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+def list_zones(where: Where, as_json: AsJson = False) -> None:
     """Print the zones that stand.
 
     swarm zone list
     """
-    with where.bus(tls) as bus:
+    with where.bus() as bus:
         zones, frame = Operator(bus).zones(), frame_of_run(bus, where)
     if as_json:
         typer.echo(json.dumps(_fields(zones, frame), indent=2))
@@ -140,14 +136,14 @@ def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
         typer.echo("no zones")
 
 
-def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, tls: Tls, as_json: bool) -> None:
+def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as_json: bool) -> None:
     """Gives orders and prints who obeys; as JSON all at once. Exit code 1 if somebody has not said so.
 
     orders_on  makes the orders for the swarm's terrain; all are made before the first is given
     """
     obeyed: dict[str, float] = {}
     silent: set[str] = set()
-    with where.bus(tls) as bus:
+    with where.bus() as bus:
         frame = frame_of_run(bus, where)
         for order in list(orders_on(frame)):
             zones, acknowledged = Operator(bus).zone(order)

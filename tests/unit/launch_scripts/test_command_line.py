@@ -74,6 +74,14 @@ def test_every_command_answers_to_h_as_to_help(
         assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
 
 
+def test_every_option_has_one_name_and_says_what_it_is() -> None:
+    for path, each in EVERY:
+        for param in each.params:
+            assert param.help, (path, param.name)
+            assert len(param.opts) == 1, (path, param.opts)
+            assert not param.secondary_opts, (path, param.secondary_opts)
+
+
 def test_every_command_that_does_something_shows_an_example() -> None:
     silent = [
         " ".join(path)

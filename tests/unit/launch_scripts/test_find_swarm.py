@@ -12,7 +12,6 @@ import msgspec
 import pytest
 
 from launch_scripts.commands.running_swarm import Where, find_swarm
-from launch_scripts.commands.shared_options import Tls
 from launch_scripts.observe.run_folder import begin_run
 from launch_scripts.ports import free_ports
 from swarm.config.scenario import NetworkConfig, Scenario
@@ -96,10 +95,10 @@ def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:
 
 def test_options_say_more_than_the_run_does(tmp_path: Path, listens: list[int]) -> None:
     make_run(tmp_path, "mine", listens[0], "2026-11-02T00:00:00Z", namespace="north")
-    assert Where(runs=tmp_path).network(Tls()).namespace == "north"
-    assert Where(runs=tmp_path, namespace="south").network(Tls()).namespace == "south"
+    assert Where(runs=tmp_path).network().namespace == "north"
+    assert Where(runs=tmp_path, namespace="south").network().namespace == "south"
     assert str(Where(runs=tmp_path)) == f"in namespace 'north' at tcp/127.0.0.1:{listens[0]}"
-    given = Where(connect="tcp/127.0.0.1:9", runs=tmp_path).network(Tls())
+    given = Where(connect="tcp/127.0.0.1:9", runs=tmp_path).network()
     assert (given.connect, given.namespace) == (("tcp/127.0.0.1:9",), "swarm")
     with pytest.raises(ConfigError, match="--connect and --run both say which swarm"):
-        Where(connect="tcp/127.0.0.1:9", run="mine", runs=tmp_path).network(Tls())
+        Where(connect="tcp/127.0.0.1:9", run="mine", runs=tmp_path).network()
