@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
 from launch_scripts.monitor.ground.ground_view import said_heights
 from launch_scripts.monitor.ground.legend import BACKGROUND, HEIGHT_PX, PHOTO, WIDTH_PX, Layer
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.map_lines import screen
 from launch_scripts.monitor.movers.movers_view import FOLLOWED_ENTITY
-from launch_scripts.monitor.movers.styles import HINT, level_for
-from launch_scripts.monitor.movers.vehicles_view import mover_overrides
+from launch_scripts.monitor.movers.styles import HINT, Level, level_for
 
 
 def make_blueprint(
@@ -81,8 +83,21 @@ def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None)
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=eye, look_target=look, eye_up=(0, 0, 1)
         ),
-        overrides=mover_overrides(level_for(vehicles)),
+        overrides=_sizes(level_for(vehicles)),
     )
+
+
+def _sizes(level: Level) -> dict[Any, Any]:
+    """Radii of what moves, and how long trails are seen."""
+    trail = rr.VisibleTimeRange(
+        "sim_time",
+        start=rr.TimeRangeBoundary.cursor_relative(seconds=-level.trail_s),
+        end=rr.TimeRangeBoundary.cursor_relative(),
+    )
+    px = {"vehicles": level.radius_px, "guests": 0.8 * level.radius_px, "targets/balls": 8.5, "bodies/names": 3.0}
+    radii = {f"/world/{entity}": rr.Points3D.from_fields(radii=[screen(radius)]) for entity, radius in px.items()}
+    trails = {f"/world/trails/{whose}": rrb.VisibleTimeRanges([trail]) for whose in ("vehicles", "targets")}
+    return {**radii, **trails}
 
 
 def _plot(name: str, title: str, legend: bool = True) -> rrb.TimeSeriesView:

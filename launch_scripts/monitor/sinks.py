@@ -76,6 +76,10 @@ class Streams:
             stream.flush(timeout_sec=timeout_sec)
 
 
+Rec = rr.RecordingStream | Streams
+"""What is drawn on."""
+
+
 class Sinks:
     """A recording stream and its sinks. `close` takes seconds at most, even if a disk or a viewer hangs."""
 

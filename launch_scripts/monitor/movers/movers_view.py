@@ -10,38 +10,15 @@ from bisect import bisect_left
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 
 from launch_scripts.monitor.figures_panel import shown
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.movers.details import (
-    MOST_LABELS,
-    Place,
-    alarm_marks,
-    body_details,
-    target_details,
-    target_labels,
-)
-from launch_scripts.monitor.movers.map_lines import feet, poles, rings
-from launch_scripts.monitor.movers.styles import (
-    BODY_COLOUR,
-    LABEL_COLOUR,
-    SEARCHED_COLOUR,
-    SIGHTED_COLOUR,
-    Looks,
-    RateLimit,
-    level_for,
-)
-from launch_scripts.monitor.movers.vehicles_view import (
-    VehiclesView,
-    log_label_style,
-    log_lines,
-    log_style,
-    screen,
-    trails_of,
-)
-from launch_scripts.monitor.sinks import Streams
+from launch_scripts.monitor.movers import details, styles
+from launch_scripts.monitor.movers.details import MOST_LABELS, Place
+from launch_scripts.monitor.movers.map_lines import Pen, feet, poles, rings, screen
+from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
+from launch_scripts.monitor.sinks import Rec
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.state import RunState
@@ -59,6 +36,8 @@ from vehicle_agent.bodies import Bodies
 FOLLOWED_ENTITY = "world/followed"
 _UNSEEN = 2
 """While nobody looks pins, routes and sentences are drawn so many times as seldom, for the recording."""
+_AGE_NS = 2 * NS_PER_S
+"""How old a sighting is is said in these steps."""
 SILENT_NS = 5 * NS_PER_S
 """A planner that searches tells its belief once a second: what is older is drawn no more."""
 _FAINT, _FULL = 40, 235
@@ -78,17 +57,17 @@ class MoversView:
 
     def __init__(
         self,
-        rec: rr.RecordingStream | Streams,
+        rec: Rec,
         mesh: TerrainMesh,
         scenario: Scenario,
         figures: RunFigures,
         counters: Counters,
         filter: MarkFilter,
     ) -> None:
-        self._rec, self._mesh, self._figures, self._counters = rec, mesh, figures, counters
-        self._level = level = level_for(scenario.vehicle_count)
-        self.looks = Looks([group.name for group in scenario.groups], scenario.target_ids)
-        self._vehicles = VehiclesView(rec, mesh, scenario, level, self.looks)
+        self._pen, self._mesh, self._figures, self._counters = Pen(rec, mesh), mesh, figures, counters
+        self._level = level = styles.level_for(scenario.vehicle_count)
+        self.looks = styles.Looks([group.name for group in scenario.groups], scenario.target_ids)
+        self._vehicles = VehiclesView(self._pen, scenario, level, self.looks)
         self._follow = scenario.monitor.follow
         self._trails = trails_of(scenario, mesh, level)
         self._sightings = Sightings(filter)
@@ -100,38 +79,38 @@ class MoversView:
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._details: dict[str, str] = {}
         """Target -> a sentence about it."""
+        self._posed: set[str] = set()
+        """Targets with a pin."""
         self._crew: frozenset[tuple[str, str]] = frozenset()
         """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
-        self._drawn: dict[str, object] = {}
-        """What was drawn last of sightings, pins and bodies; without those that are to be drawn anew."""
-        self._places: Floats | None = None
-        """Of pins, as drawn last."""
-        self._alarmed = False
-        """True if any alarm is drawn."""
         self._fleets_new = False
-        self._limit = RateLimit({"pins": 0.2, "details": 1.0, "trails": 0.5, "ages": 2.0, "bodies": 0.2})
+        self._told_anew = True
+        """True if sentences about targets are told, whether it is time or not."""
+        self._limit = styles.RateLimit({"pins": 0.2, "details": 1.0, "trails": 0.5, "bodies": 0.2})
 
     def begin(self) -> None:
         """Logs styles; all else is drawn anew."""
         self._vehicles.begin()
-        log_style(self._rec, "world/trails/targets", 1.6 * self._level.line_px)
-        log_style(self._rec, "world/targets/poles", 2.2)
-        log_style(self._rec, "world/targets/sighted", 1.2, SIGHTED_COLOUR)
-        log_style(self._rec, "world/alarms/poles", 1.8)
+        self._pen.style("world/trails/targets", 1.6 * self._level.line_px)
+        self._pen.style("world/targets/poles", 2.2)
+        self._pen.style("world/targets/sighted", 1.2, styles.SIGHTED_COLOUR)
+        self._pen.style("world/alarms/poles", 1.8)
+        balls = rr.Points3D.from_fields(radii=[screen(5.0)], show_labels=True)
+        self._pen.rec.log("world/alarms/marks", balls, static=True)
         for entity in ("world/targets/names", "world/targets/sighted/names"):
-            log_label_style(self._rec, entity)
+            self._pen.label_style(entity)
         self.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             px = self._level.radius_px + 2.5
-            halo = rr.Points3D([(0, 0, 0)], colors=[LABEL_COLOUR], radii=[screen(px)])
-            self._rec.log(f"{FOLLOWED_ENTITY}/halo", halo, static=True)
+            halo = rr.Points3D([(0, 0, 0)], colors=[styles.LABEL_COLOUR], radii=[screen(px)])
+            self._pen.rec.log(f"{FOLLOWED_ENTITY}/halo", halo, static=True)
             self._log_followed((self._mesh.width_m / 2, self._mesh.depth_m / 2))
 
     def draw_anew(self) -> None:
         """What is drawn on change only is drawn once more, when it is due."""
         self._vehicles.draw_anew()
-        self._drawn.clear()
-        self._searches.changed = True
+        self._pen.forget()
+        self._searches.changed = self._told_anew = True
 
     def hear(self, message: Message, now_ns: int) -> None:
         """Takes a message in."""
@@ -150,20 +129,17 @@ class MoversView:
 
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say, so that all places say the same; draws alarms where they are."""
-        self._details = {line.id: target_details(line) for line in summary.targets}
+        self._details = {line.id: details.target_details(line) for line in summary.targets}
         observed = self._figures.observed
         self._crew = frozenset(observed.plan.crew_now(observed.plan.targets_now(observed.book)))
-        marks = alarm_marks(
+        marks = details.alarm_marks(
             summary.alarms, summary.elapsed_s, observed.targets(), observed.vehicles(), self._mesh.grid
         )
-        if marks or self._alarmed:
-            self._alarmed = bool(marks)
-            tops = self._placed([mark.place_m for mark in marks], _ALARM)
-            colours = np.array([mark.colour for mark in marks], np.uint8).reshape(-1, 3)
-            log_lines(self._rec, "world/alarms/poles", poles(self._mesh, tops), colours)
-            texts = [shown(mark.text, 60) for mark in marks]
-            balls = rr.Points3D(tops, colors=colours, radii=[screen(5.0)], labels=texts, show_labels=True)
-            self._rec.log("world/alarms/marks", balls)
+        tops = self._pen.placed([mark.place_m for mark in marks], _ALARM)
+        colours = np.array([mark.colour for mark in marks], np.uint8).reshape(-1, 3)
+        self._pen.lines("world/alarms/poles", poles(self._mesh, tops), colours)
+        texts = [shown(mark.text, 60) for mark in marks]
+        self._pen.points("world/alarms/marks", positions=tops, colors=colours, labels=texts)
 
     def tick(self, now_ns: int, watched: bool) -> None:
         """Draws what is due in one frame."""
@@ -172,7 +148,7 @@ class MoversView:
         if self._fleets_new:
             self._fleets_new = False
             vehicles = observed.driven(self._crew, now_ns)
-            self._vehicles.draw(vehicles, observed.groups, observed.classes, now_ns, slower)
+            self._vehicles.draw(vehicles, observed, now_ns, slower)
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
         if self._limit.due("pins", now_ns, slower):
@@ -180,9 +156,9 @@ class MoversView:
             places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
             self._draw_targets(places_m, self._figures.observed.lost(now_ns), now_ns, slower)
         if (beliefs := self._searches.take_changed(now_ns)) is not None:
-            places, colours, radii_m, details = searched_points(self._mesh, beliefs)
-            balls = rr.Points3D(places, colors=colours, radii=radii_m)
-            self._rec.log("world/searched", balls, rr.AnyValues(searched=pa.array(details, pa.string())))
+            places, colours, radii_m, sentences = searched_points(self._mesh, beliefs)
+            its = {"positions": places, "colors": colours, "radii": radii_m}
+            self._pen.points("world/searched", {"searched": sentences}, **its)
         self._bodies.tick(now_ns)
         self._bodies.take_changed()
         self._bodies.complaints.clear()
@@ -196,65 +172,45 @@ class MoversView:
             id: self._seen_ns[id] if self._seen.get(id) == sighted else now_ns for id, sighted in seen.items()
         }
         self._seen = seen
-        ages_s = {id: (now_ns - heard_ns) / NS_PER_S for id, heard_ns in self._seen_ns.items()}
-        pins, sightings = target_labels(places_m, lost, ages_s)
-        rings_of = {id: sighted for id, sighted in seen.items() if id in sightings}
-        ages_due = bool(rings_of) and self._limit.due("ages", now_ns)
-        if self._is_new("sightings", rings_of) or ages_due:
-            self._draw_sightings(rings_of, sightings)
-        self._draw_pins(places_m, lost, pins, now_ns, slower)
-
-    def _draw_sightings(self, seen: Mapping[str, Sighted], labels: Mapping[str, str]) -> None:
-        """Draws rings within which targets were seen last."""
-        centres, radii_m = self._discs(list(seen.values()), [each.uncertainty_m for each in seen.values()], 0.3)
-        log_lines(self._rec, "world/targets/sighted", rings(self._mesh, centres, radii_m))
-        few = list(seen)[:MOST_LABELS]
-        self._names("world/targets/sighted/names", centres[: len(few)], 1.0, [labels[id] for id in few])
-
-    def _draw_pins(
-        self,
-        places_m: Mapping[str, Place],
-        lost: Collection[str],
-        labels: Mapping[str, str],
-        now_ns: int,
-        slower: int,
-    ) -> None:
-        ids, tops = list(places_m), self._placed(list(places_m.values()), _PIN)
+        ages_s = {id: (now_ns - heard_ns) // _AGE_NS * _AGE_NS / NS_PER_S for id, heard_ns in self._seen_ns.items()}
+        pins, labels = details.target_labels(places_m, lost, ages_s)
+        rings_of = [seen[id] for id in labels]
+        centres, radii_m = self._discs(rings_of, [each.uncertainty_m for each in rings_of], 0.3)
+        self._pen.lines("world/targets/sighted", rings(self._mesh, centres, radii_m))
+        self._draw_labels("world/targets/sighted/names", centres, 1.0, list(labels.values()))
+        ids, tops = list(places_m), self._pen.placed(list(places_m.values()), _PIN)
         colours = np.array([self.looks.target(id, id in lost) for id in ids], np.uint8).reshape(-1, 3)
-        whole = self._is_new("pins", (ids, colours.tolist(), labels))
-        moved = self._places is None or not np.array_equal(tops, self._places)
-        self._places = tops
-        told = self._limit.due("details", now_ns, slower) or whole
-        if moved or told:
-            changed = colours if whole else None
-            parts: list[rr.AsComponents] = [rr.Points3D.from_fields(positions=tops, colors=changed)]
-            if told:
-                sentences = pa.array([self._details.get(id, id) for id in ids], pa.string())
-                parts.append(rr.AnyValues(target=sentences))
-            self._rec.log("world/targets/balls", *parts)
-            log_lines(self._rec, "world/targets/poles", poles(self._mesh, tops), changed)
-        named = [n for n, id in enumerate(ids) if id in labels][:MOST_LABELS]
-        if (named and moved) or whole:
-            texts = [labels[ids[n]] for n in named] if whole else None
-            self._names("world/targets/names", tops[named], _LABEL - _PIN, texts)
+        told = None
+        if self._limit.due("details", now_ns, slower) or self._told_anew or set(ids) != self._posed:
+            told, self._told_anew, self._posed = [self._details.get(id, id) for id in ids], False, set(ids)
+        self._pen.points("world/targets/balls", {"target": told}, positions=tops, colors=colours)
+        self._pen.lines("world/targets/poles", poles(self._mesh, tops), colours)
+        named = [n for n, id in enumerate(ids) if id in pins]
+        self._draw_labels("world/targets/names", tops[named], _LABEL - _PIN, [pins[ids[n]] for n in named])
         if self._limit.due("trails", now_ns):
             trails, drawn = self._trails.advance(ids, feet(self._mesh, tops))
             if len(trails):
-                log_lines(self._rec, "world/trails/targets", trails, colours[drawn])
+                self._pen.trail("world/trails/targets", trails, colours[drawn])
+
+    def _draw_labels(self, entity: str, places: Floats, above: float, texts: list[str]) -> None:
+        """Draws as many labels as can be read, so many `scale_m` above places."""
+        above_m = np.array([0, 0, above * self._mesh.scale_m], np.float32)
+        self._pen.points(entity, positions=places[:MOST_LABELS] + above_m, labels=texts[:MOST_LABELS])
 
     def _draw_bodies(self, bodies: Sequence[Body], now_ns: int) -> None:
         """Draws discs as large as the bodies, if something about them is new."""
-        if bodies == self._drawn.get("bodies") or not self._limit.due("bodies", now_ns):
+        if not self._limit.due("bodies", now_ns):
             return
-        self._drawn["bodies"] = bodies
         centres, radii_m = self._discs(bodies, [each.radius_m for each in bodies], 0.2)
         sizes = np.stack([radii_m, radii_m, 0.35 * radii_m], axis=1)
-        discs = rr.Ellipsoids3D(centers=centres, half_sizes=sizes, colors=[BODY_COLOUR], fill_mode="solid")
-        self._rec.log("world/bodies/discs", discs)
+        if self._pen.news("world/bodies/discs", centres=centres, sizes=sizes):
+            colours = [styles.BODY_COLOUR]
+            discs = rr.Ellipsoids3D(centers=centres, half_sizes=sizes, colors=colours, fill_mode="solid")
+            self._pen.rec.log("world/bodies/discs", discs)
         tops = centres + sizes * np.array([0, 0, 1], np.float32)
-        points = rr.Points3D.from_fields(positions=tops, colors=np.full((len(tops), 3), 225, np.uint8))
-        details = pa.array(list(map(body_details, bodies)), pa.string())
-        self._rec.log("world/bodies/names", points, rr.AnyValues(body=details))
+        white = np.full((len(tops), 3), 225, np.uint8)
+        told = {"body": [details.body_details(each) for each in bodies]}
+        self._pen.points("world/bodies/names", told, positions=tops, colors=white)
 
     def _draw_followed(self, vehicles: VehicleColumns) -> None:
         """Draws the vehicle or target that the camera follows, where it is now; nothing while nobody knows."""
@@ -268,32 +224,14 @@ class MoversView:
             self._log_followed(place_m)
 
     def _log_followed(self, place_m: Place) -> None:
-        [place] = self._placed([place_m], 0.1)
-        self._rec.log(FOLLOWED_ENTITY, rr.Transform3D.from_fields(translation=place))
-
-    def _is_new(self, what: str, drawn: object) -> bool:
-        """Whether this differs from what was drawn last."""
-        if what in self._drawn and self._drawn[what] == drawn:
-            return False
-        self._drawn[what] = drawn
-        return True
-
-    def _placed(self, places_m: Sequence[Place], above: float) -> Floats:
-        """float32 (n, 3), so many `scale_m` over the ground."""
-        east_south = np.array(places_m, np.float32).reshape(-1, 2)
-        return self._mesh.place(east_south[:, 0], east_south[:, 1], above * self._mesh.scale_m)
+        [place] = self._pen.placed([place_m], 0.1)
+        self._pen.rec.log(FOLLOWED_ENTITY, rr.Transform3D.from_fields(translation=place))
 
     def _discs(self, there: Sequence[Sighted | Body], radii_m: list[float], above: float) -> tuple[Floats, Floats]:
         """Centres float32 (n, 3), and radii float32 (n,), m, that are seen."""
         grid = self._mesh.grid
-        centres = self._placed([(each.x_m - grid.west_m, grid.north_m - each.y_m) for each in there], above)
+        centres = self._pen.placed([(each.x_m - grid.west_m, grid.north_m - each.y_m) for each in there], above)
         return centres, np.maximum(np.array(radii_m, np.float32), np.float32(_SMALLEST * self._mesh.scale_m))
-
-    def _names(self, entity: str, positions: Floats, above: float, names: list[str] | None) -> None:
-        """Labels so many `scale_m` above places; their texts if they are not None."""
-        labels = None if names is None else pa.array(names, pa.string())
-        above_m = np.array([0, 0, above * self._mesh.scale_m], np.float32)
-        self._rec.log(entity, rr.Points3D.from_fields(positions=positions + above_m, labels=labels))
 
 
 class Searches:
@@ -325,15 +263,15 @@ def searched_points(mesh: TerrainMesh, beliefs: Sequence[Believed]) -> tuple[Flo
     """Places float32 (n, 3), colours uint8 (n, 4), the likelier the less transparent, radii float32 (n,), m, and a
     sentence about each. Cells outside of the map are left out."""
     cells, opacities, radii_m = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0, np.float32)]
-    details: list[str] = []
+    sentences: list[str] = []
     for believed in beliefs:
         its_cells, shares = np.array(believed.cells, np.int64), column(believed.shares, "<f4")
         on_map = (its_cells >= 0) & (its_cells < mesh.grid.cells)
         shares = shares[on_map]
         cells.append(its_cells[on_map])
         opacities.append(np.sqrt(shares / max(float(shares.max(initial=0.0)), 1e-12)))
-        details += [f"{believed.target} may be here: {share:.1%}" for share in shares.tolist()]
+        sentences += [f"{believed.target} may be here: {share:.1%}" for share in shares.tolist()]
         radii_m.append(np.full(len(shares), 0.4 * believed.side_m, np.float32))
     opaque = _FAINT + (_FULL - _FAINT) * np.concatenate(opacities)
-    colours = np.column_stack([np.tile(SEARCHED_COLOUR, (len(opaque), 1)), opaque]).astype(np.uint8)
-    return mesh.place_cells(np.concatenate(cells), 0.1 * mesh.scale_m), colours, np.concatenate(radii_m), details
+    colours = np.column_stack([np.tile(styles.SEARCHED_COLOUR, (len(opaque), 1)), opaque]).astype(np.uint8)
+    return mesh.place_cells(np.concatenate(cells), 0.1 * mesh.scale_m), colours, np.concatenate(radii_m), sentences

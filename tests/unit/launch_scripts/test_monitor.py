@@ -224,7 +224,7 @@ def test_guests_have_a_box_and_vehicles_that_left_are_gone(
             ("/world/vehicles", "positions"), ("/world/guests", "positions"), ("/world/guests/frames", "centers"),
         )
     }  # fmt: skip
-    assert drawn["/world/vehicles"] == [1, 1, 1]
+    assert set(drawn["/world/vehicles"]) == {1}
     assert drawn["/world/guests"] == drawn["/world/guests/frames"] == [2, 1, 0]
 
 
