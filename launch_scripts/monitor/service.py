@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
-
-import rerun as rr
+from collections.abc import Callable
+from functools import partial
 
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.figures_panel import FiguresPanel, level_of, summary_markdown
-from launch_scripts.monitor.ground.ground_view import GroundView
-from launch_scripts.monitor.ground.legend import PHOTO, Layer, shown_layers
-from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.monitor.ground.zone_areas import Area, scenario_areas
+from launch_scripts.monitor.ground.ground_view import GroundView, Scene
+from launch_scripts.monitor.ground.legend import shown_layers
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.ground.zone_areas import scenario_areas
 from launch_scripts.monitor.movers.movers_view import MoversView
-from launch_scripts.monitor.sinks import RecordingWatch, Sinks, Streams, new_recording_path
+from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.web.server import Audience
@@ -35,7 +32,7 @@ from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.classes import aloft_classes, class_numbers
+from swarm.config.classes import aloft_classes
 from swarm.config.ground import HiddenConfig
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
@@ -68,12 +65,9 @@ _LAST_WORD_NS = NS_PER_S // 2
 class MonitorService:
     """Shows a run on a recording stream.
 
-    rec        a recording stream whose sinks are set
+    scene      what it is drawn on, and what is known of the run beforehand
     web_port   port of the live view's page on this machine; 0: it has none
     recording  watches the file of the recording, if there is one
-    truth      the true ground, where this process knows it
-    zones      of the scenario
-    layers     tabs of the view; the photo if there are none
     audience   who looks at the stream; somebody always does if this is not given
     member     one that has joined already; None: one that joins when the service starts
     """
@@ -84,50 +78,36 @@ class MonitorService:
         terrain: Terrain,
         bus: Bus,
         post: Post,
-        rec: rr.RecordingStream | Streams,
+        scene: Scene,
         *,
-        mesh: TerrainMesh | None = None,
         web_port: int = 0,
         recording: RecordingWatch | None = None,
-        truth: Floats | None = None,
-        zones: Sequence[Area] = (),
-        layers: Sequence[Layer] = (),
         audience: Callable[[], Audience] = lambda: Audience(now=1, ever=1),
         member: Member | None = None,
     ) -> None:
-        self.figures = RunFigures(setup.scenario, terrain.grid, setup.started_ns)
+        scenario = setup.scenario
+        self.figures = RunFigures(scenario, terrain.grid, setup.started_ns)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
-        self._setup = setup
-        self._terrain = terrain
-        self._bus = bus
-        self._post = post
+        self._setup, self._bus, self._post, self._rec = setup, bus, post, scene.rec
+        self._recording, self._audience = recording, audience
         self._joins = member is None
         self._member = member or Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._member.web_port = web_port
         self.counters: Counters = self._member.counters
-        cost_map = CostMap(terrain, learning=setup.scenario.map.learning)
+        cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
-        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role, at_ticks=True)
-        self._mesh = mesh or TerrainMesh(terrain)
-        self._target_ids = setup.scenario.target_ids
-        self._rec = rec
-        self._recording = recording
-        self._panel = FiguresPanel(rec, self._target_ids)
-        self._movers = MoversView(rec, self._mesh, setup.scenario, self.figures, self.counters, replica.filter)
-        self._ground = GroundView(
-            rec, self._mesh, terrain, cost_map, replica, layers or [PHOTO], self._target_ids, truth, zones,
-            self._movers.looks.legend(), list(class_numbers(setup.scenario)),
-        )  # fmt: skip
+        self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        self._panel = FiguresPanel(scene.rec, scenario.target_ids)
+        self._movers = MoversView(scene.rec, scene.mesh, scenario, self.figures, self.counters, replica.filter)
+        self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
         self._observer = RunObserver(bus, post, self.figures, _READ)
-        self._audience = audience
         self._watched = False
         self._drawn_for = 0
         """So many viewers had ever come when all was drawn anew last."""
         self._anew_due_ns = 0
-        self._turn = 0
-        """Ticks so far; `_frame` counts those in which something was drawn."""
-        self._frame = 0
+        self._turn = self._frame = 0
+        """Ticks so far, and those in which something was drawn."""
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
         self._gone: dict[Peer, int] = {}
@@ -191,7 +171,7 @@ class MonitorService:
     @property
     def at_s(self) -> float:
         """Seconds since launch that the view has come to. Read by other threads, too."""
-        return self._seconds()
+        return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S
 
     # --- in -----------------------------------------------------------------------------------------------------
 
@@ -231,7 +211,6 @@ class MonitorService:
             return
         sentence, begun = self._recording.check(now_ns)
         if begun:
-            self._panel = FiguresPanel(self._rec, self._target_ids)
             self._begin_drawing()
         if sentence is not None:
             log.warning("%s", sentence)
@@ -243,9 +222,6 @@ class MonitorService:
         self._ground.begin()
         self._movers.begin()
 
-    def _seconds(self) -> float:
-        return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S
-
     # --- out ----------------------------------------------------------------------------------------------------
 
     def _draw_frame(self, now_ns: int, viewers: int) -> None:
@@ -255,7 +231,7 @@ class MonitorService:
             self._hear(heard, now_ns)
         self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
-        self._panel.set_time(self._frame, self._seconds())
+        self._panel.set_time(self._frame, self.at_s)
         self._watch_recording(now_ns)
         if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
             self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
@@ -292,13 +268,11 @@ def load_view(
 
     closing  closes what it opens. Raises SwarmError where a file or a port cannot be opened
     """
-    scenario = setup.scenario
-    config = scenario.monitor
+    scenario, config = setup.scenario, setup.scenario.monitor
     seen = load_terrain(setup)  # mapped once more: of what the mesh has read most is not read again
     load_classes(setup, seen)
-    aloft = class_terrains(scenario, seen, aloft_classes(scenario))
-    mesh = TerrainMesh(seen, config.height_factor, aloft)
-    del seen, aloft
+    mesh = TerrainMesh(seen, config.height_factor, class_terrains(scenario, seen, aloft_classes(scenario)))
+    del seen
     knows_truth = scenario.terrain.hidden != HiddenConfig()
     layers = shown_layers(scenario, knows_truth=knows_truth)
     blueprint = make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=config.follow)
@@ -306,36 +280,15 @@ def load_view(
     sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint)
     closing.callback(sinks.close)
     truth = load_truth(setup, terrain) if knows_truth else None
-    zones = scenario_areas(scenario, terrain.grid)
+    scene = Scene(sinks.streams, mesh, layers, truth, scenario_areas(scenario, terrain.grid))
+    watch = None if path is None else RecordingWatch(path, sinks.begin_file)
 
     def make(member: Member) -> MonitorService:
-        service = MonitorService(
-            setup,
-            terrain,
-            bus,
-            post,
-            sinks.streams,
-            mesh=mesh,
-            web_port=sinks.web_port,
-            recording=None if path is None else RecordingWatch(path, sinks.begin_file),
-            truth=truth,
-            zones=zones,
-            layers=layers,
-            audience=sinks.audience,
-            member=member,
-        )
+        served = partial(MonitorService, web_port=sinks.web_port, audience=sinks.audience)
+        service = served(setup, terrain, bus, post, scene, recording=watch, member=member)
         give_back_memory()  # a hundred megabytes of a large map, of which its picture was made
-        sinks.tell_page(lambda: page_facts(setup, service, path))
+        life, command = f"{setup.incarnation:x}", "" if path is None else f"rerun {path}"
+        sinks.tell_page(lambda: {"life": life, "at_s": service.at_s, "over": service.over, "recording": command})
         return service
 
     return make
-
-
-def page_facts(setup: RoleSetup, service: MonitorService, recording: Path | None) -> dict[str, Any]:
-    """What the page says beside the view: how far the run is, and how to open its recording."""
-    return {
-        "life": f"{setup.incarnation:x}",
-        "at_s": service.at_s,
-        "over": service.over,
-        "recording": "" if recording is None else f"rerun {recording}",
-    }

@@ -20,6 +20,8 @@ from support.swarm_model import SwarmModel
 from support.wire_strategies import types_of_the_wire
 
 from launch_scripts.launcher.router import RouterService
+from launch_scripts.monitor.ground.ground_view import Scene
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.service import PlannerService
@@ -180,7 +182,8 @@ class Lied(SwarmModel):
                     self.stores.append(KeeperStore(":memory:"))
                     return KeeperService(setup, terrain, bus, post, self.stores[-1])
                 case "monitor":
-                    return MonitorService(setup, terrain, bus, post, rr.RecordingStream("lied"))
+                    scene = Scene(rr.RecordingStream("lied"), TerrainMesh(terrain))
+                    return MonitorService(setup, terrain, bus, post, scene)
                 case "planner":
                     return PlannerService(setup, terrain, bus, post, InlineWorker(self.scheduler))
                 case "targets":

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from launch_scripts.commands.status_view import print_status, status_fields, status_of
 from launch_scripts.launcher.tables import live_table
+from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.details import _DOES
 from launch_scripts.monitor.service import MonitorService
@@ -161,14 +162,8 @@ class Watched:
         def post(event: Event) -> None:
             self.monitor.handle(event, clock.now_ns())
 
-        self.monitor = MonitorService(
-            setup,
-            terrain,
-            bus,
-            post,
-            self.logged,
-            mesh=TerrainMesh(terrain),  # type: ignore[arg-type]
-        )
+        scene = Scene(self.logged, TerrainMesh(terrain))  # type: ignore[arg-type]
+        self.monitor = MonitorService(setup, terrain, bus, post, scene)
         self.watching = True
         simulation.scheduler.after(1, self._start)
 

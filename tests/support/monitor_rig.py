@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.legend import shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
@@ -70,22 +71,15 @@ class Rig(SwarmModel):
         self.audience = audience
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
-        mesh = TerrainMesh(terrain)
+        mesh = self.mesh = TerrainMesh(terrain)
         layers = shown_layers(scenario, knows_truth=False)
         self.sinks = Sinks("run.1", path, config, make_blueprint(mesh, layers))
+        scene = Scene(self.sinks.streams, mesh, layers)
         setup = self.setup("monitor", "0")
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup,
-                terrain,
-                bus,
-                post,
-                self.sinks.streams,
-                mesh=mesh,
-                web_port=web_port,
-                layers=layers,
-                audience=lambda: self.audience,
+                setup, terrain, bus, post, scene, web_port=web_port, audience=lambda: self.audience
             ),
         )
 

@@ -12,28 +12,21 @@ import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor.figures_panel import shown
+from launch_scripts.monitor.ground import legend
 from launch_scripts.monitor.ground.cost_to_go import CostSamples, TargetPictures
 from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW, GroundColours
-from launch_scripts.monitor.ground.legend import (
-    COST,
-    KNOWN,
-    LEARNED,
-    NEAREST,
-    PHOTO,
-    ZONE_COLOURS,
-    Layer,
-    still_legend,
-    to_target_legend,
-)
+from launch_scripts.monitor.ground.legend import COST, KNOWN, LEARNED, NEAREST, PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
 from launch_scripts.monitor.ground.zone_areas import Area, borders, closed_cells, ordered_areas, title_places
 from launch_scripts.monitor.movers.styles import Look
-from launch_scripts.monitor.sinks import Streams
+from launch_scripts.monitor.sinks import Rec
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
+from swarm.config.classes import class_numbers
+from swarm.config.scenario import Scenario
 from swarm.grid import Window
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 
@@ -91,48 +84,54 @@ class _Tiles:
         return before != pixels
 
 
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a run is drawn on, and what is known of it beforehand.
+
+    rec     a recording stream whose sinks are set
+    layers  tabs of the view
+    truth   the true ground, where this process knows it
+    zones   those of the scenario
+    """
+
+    rec: Rec
+    mesh: TerrainMesh
+    layers: Sequence[Layer] = (PHOTO,)
+    truth: Floats | None = None
+    zones: Sequence[Area] = ()
+
+
 class GroundView:
     """Draws terrain, layers, zones and windows on a recording stream.
 
-    truth    the true ground, where this process knows it
-    zones    those of the scenario
-    layers   tabs of the view
-    targets  in order of their colours
-    movers   what the legends say of all that moves
-    classes  of vehicles beside "ground", in the order of their numbers
+    movers  what the legends say of all that moves
     """
 
     def __init__(
         self,
-        rec: rr.RecordingStream | Streams,
-        mesh: TerrainMesh,
+        scene: Scene,
         terrain: Terrain,
         cost_map: CostMap,
         replica: MapReplica,
-        layers: Sequence[Layer],
-        targets: Sequence[str],
-        truth: Floats | None = None,
-        zones: Sequence[Area] = (),
+        scenario: Scenario,
         movers: Sequence[Look] = (),
-        classes: Sequence[str] = (),
     ) -> None:
-        self._rec, self._mesh, self._cost_map, self._replica = rec, mesh, cost_map, replica
-        self._zones, self._movers, self._classes = list(zones), movers, classes
-        self._colours = colours = GroundColours(
-            mesh, terrain, cost_map.ground_s_per_m, truth, cost_map.prior_s_per_m
-        )
+        self._rec, self._mesh, self._cost_map, self._replica = scene.rec, scene.mesh, cost_map, replica
+        self._shown, self._zones, self._movers = scene.layers, list(scene.zones), movers
+        self._target_ids, self._classes = scenario.target_ids, list(class_numbers(scenario))
+        now, prior = cost_map.ground_s_per_m, cost_map.prior_s_per_m
+        self._colours = colours = GroundColours(scene.mesh, terrain, now, scene.truth, prior)
         self._colours.close(closed_cells(self._zones))
-        self._shown, self._target_ids = list(layers), list(targets)
         tiled = (
             _Tiles(PHOTO, colours.photo_of, NS_PER_S),
             _Tiles(COST, colours.cost_of, _LAYER_NS),
             _Tiles(KNOWN, colours.known_of, _LAYER_NS),
             _Tiles(LEARNED, colours.learned_of, _LAYER_NS),
         )
-        self._layers = [each for each in tiled if each.layer in layers]
-        self._targets = [layer for layer in layers if layer.target is not None]
+        self._layers = [each for each in tiled if each.layer in scene.layers]
+        self._targets = [layer for layer in scene.layers if layer.target is not None]
         self.samples = CostSamples(terrain.grid, next((layer.target for layer in self._targets), None))
-        self._pictures = TargetPictures(mesh, colours, self.samples)
+        self._pictures = TargetPictures(scene.mesh, colours, self.samples)
         self._nearest_due_ns = 0
         self._ordered: list[Area] = []
         self._zones_version = 0
@@ -149,13 +148,10 @@ class GroundView:
         for layer in self._shown:
             for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in tiled else whole):
                 self._rec.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
-            self._legend(layer, still_legend(layer, self._colours, self._target_ids, self._movers))
+            self._legend(layer, legend.still_legend(layer, self._colours, self._target_ids, self._movers))
         style = rr.LineStrips3D.from_fields(colors=[WINDOW], radii=[_LINE])
         self._rec.log("world/windows", style, static=True)
-        lines, texts, places = map_margin(self._mesh)
-        bars = rr.LineStrips3D(lines, colors=[_MARGIN_COLOUR], radii=[_LINE])
-        self._rec.log("world/margin", bars, static=True)
-        self._rec.log("world/margin/texts", _texts(places, texts, [_MARGIN_COLOUR]), static=True)
+        self._draw_margin()
         self._draw_zones("planned", self._zones, static=True)
         self._pictures.full_s = 0.0  # so that the next answer draws a legend
         self.draw_anew()
@@ -248,12 +244,12 @@ class GroundView:
         lines, radii = self._pictures.tree(target)
         self._rec.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
-            self._legend(layer, to_target_legend(target, self._pictures.full_s, self._movers))
+            self._legend(layer, legend.to_target_legend(target, self._pictures.full_s, self._movers))
 
     def _draw_zones(self, whose: str, zones: Sequence[Area], *, static: bool) -> None:
         parts = [borders(self._mesh, area) for area in zones]
         strips = np.concatenate([np.empty((0, 2, 3), np.float32), *parts])
-        per_zone = np.array([ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
+        per_zone = np.array([legend.ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         path = f"world/zones/{whose}"
         self._rec.log(path, rr.LineStrips3D(strips, colors=colours, radii=[_LINE]), static=static)
@@ -261,6 +257,31 @@ class GroundView:
         pale = (per_zone[:_NAMES_SHOWN].astype(np.uint16) + 2 * 255) // 3  # on their own hatches names would drown
         texts = _texts(title_places(self._mesh, named), [area.title for area in named], pale.astype(np.uint8))
         self._rec.log(f"{path}/names", texts, static=static)
+
+    def _draw_margin(self) -> None:
+        """Draws what a map has south of it, level with its lowest ground: a bar of known length in the west, an
+        arrow to the north in the east, and how much heights are stretched."""
+        mesh, unit = self._mesh, self._mesh.scale_m
+        length_m = round_length(_BAR_SHARE * mesh.width_m)
+        south, beneath = -mesh.depth_m - 3 * unit, -mesh.depth_m - 4.5 * unit
+        east = mesh.width_m - unit
+        bar = rr.LineStrips3D([[(0, south, 0), (length_m, south, 0)]], colors=[_MARGIN_COLOUR], radii=[_LINE])
+        self._rec.log("world/margin", bar, static=True)
+        arrow = rr.Arrows3D(
+            origins=[(east, south - 2.5 * unit, 0)],
+            vectors=[(0, 4 * unit, 0)],
+            colors=[_MARGIN_COLOUR],
+            radii=[0.15 * unit],
+        )
+        self._rec.log("world/margin/north", arrow, static=True)
+        texts = {
+            "0": (0, beneath),
+            said_length(length_m): (length_m, beneath),
+            said_heights(mesh.stretch): (mesh.width_m / 2, beneath),
+            "N": (east - 2.2 * unit, south),
+        }
+        places = np.array([(*place, 0) for place in texts.values()], np.float32)
+        self._rec.log("world/margin/texts", _texts(places, list(texts), [_MARGIN_COLOUR]), static=True)
 
     def _draw_windows(self) -> None:
         """Draws the window that each planner grew last, unless it is the whole terrain."""
@@ -288,26 +309,6 @@ def window_outlines(mesh: TerrainMesh, windows: Sequence[Window]) -> Floats:
     rows = np.concatenate([north + flat, down, south + flat, down[:, ::-1]], axis=1)
     cols = np.concatenate([across, east + flat, across[:, ::-1], west + flat], axis=1)
     return mesh.place_cells(rows * mesh.grid.cols + cols, 0.25 * mesh.scale_m)
-
-
-def map_margin(mesh: TerrainMesh) -> tuple[Floats, list[str], Floats]:
-    """What a map has in its margin, south of the terrain and level with its lowest ground: a bar of known length in
-    the west, an arrow to the north in the east, how much heights are stretched. Lines float32 (n, 2, 3), and texts
-    at places float32 (n, 3)."""
-    unit, south = mesh.scale_m, -mesh.depth_m - 3 * mesh.scale_m
-    length_m = round_length(_BAR_SHARE * mesh.width_m)
-    east, beneath = mesh.width_m - unit, south - 1.5 * unit
-    lines = [((0.0, south), (length_m, south))]
-    lines += [((x, south - unit / 2), (x, south + unit / 2)) for x in (0.0, length_m / 2, length_m)]
-    tip = (east, south + 1.5 * unit)
-    lines += [((east, south - 2.5 * unit), tip), *((tip, (east + side * unit, south)) for side in (-0.8, 0.8))]
-    texts = {
-        "0": (0.0, beneath), said_length(length_m): (length_m, beneath), "N": (east - 2.2 * unit, south),
-        said_heights(mesh.stretch): (mesh.width_m / 2, beneath),
-    }  # fmt: skip
-    level = ((0, 0), (0, 1))
-    places = np.pad(np.array(list(texts.values()), np.float32), level)
-    return np.pad(np.array(lines, np.float32), ((0, 0), *level)), list(texts), places
 
 
 def said_heights(stretch: float) -> str:

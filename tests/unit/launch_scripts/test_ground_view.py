@@ -26,7 +26,7 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
-from launch_scripts.monitor.ground.ground_view import GroundView, map_margin, said_heights
+from launch_scripts.monitor.ground.ground_view import GroundView, Scene, said_heights
 from launch_scripts.monitor.ground.legend import (
     COST,
     HEIGHT_PX,
@@ -191,14 +191,20 @@ def test_zones_of_operators_are_those_that_stand() -> None:
 
 @pytest.mark.parametrize(("width_cells", "text"), [(50, "100 m"), (400, "1 km"), (4100, "10 km")])
 def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: int, text: str) -> None:
-    lines, texts, _ = map_margin(TerrainMesh(terrain_of_pace(np.ones((10, width_cells), np.float32), 10.0)))
-    bar = lines[0]
+    terrain = terrain_of_pace(np.ones((10, width_cells), np.float32), 10.0)
+    logged: dict[str, Any] = {}
+    rec = rr.RecordingStream("margin", recording_id="r")
+    rec.log = lambda path, what, static: logged.__setitem__(path, what)  # type: ignore[method-assign,assignment]
+    scene = Scene(rec, TerrainMesh(terrain))
+    GroundView(scene, terrain, CostMap(terrain), MapReplica(terrain.grid), zoned(""))._draw_margin()
+    start, end = logged["world/margin"].strips.as_arrow_array().to_pylist()[0]
     number, unit = text.split()
-    assert text in texts
-    assert bar[1, 0] - bar[0, 0] == float(number) * (1000 if unit == "km" else 1)
-    foot, tip = lines[4]
-    assert (tip[0], tip[2]) == (foot[0], foot[2])
-    assert tip[1] > foot[1]
+    texts = logged["world/margin/texts"].labels.as_arrow_array().to_pylist()
+    assert {text, "heights to scale"} <= set(texts)
+    assert end[0] - start[0] == float(number) * (1000 if unit == "km" else 1)
+    [arrow] = logged["world/margin/north"].vectors.as_arrow_array().to_pylist()
+    assert (arrow[0], arrow[2]) == (0, 0)
+    assert arrow[1] > 0
 
 
 def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
@@ -206,9 +212,7 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
     terrain = terrain_of_pace(np.ones((40, 50), np.float32), 10.0, elevation_m)
     assert (said_heights(1.0), said_heights(3.24)) == ("heights to scale", "heights x 3.2")
     for factor in (1.0, 2.5):
-        mesh = TerrainMesh(terrain, factor)
-        assert mesh.heights_m.max() == pytest.approx(5 * factor)
-        assert said_heights(factor) in map_margin(mesh)[1]
+        assert TerrainMesh(terrain, factor).heights_m.max() == pytest.approx(5 * factor)
 
 
 @pytest.mark.parametrize(
@@ -232,7 +236,7 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
     rec = rr.RecordingStream("names", recording_id="r")
     rec.set_sinks(rr.FileSink(str(tmp_path / "names.rrd"), write_footer=False))
     drawn: dict[str, Any] = {}
-    view = GroundView(rec, mesh, terrain, cost_map, replica, [PHOTO], ["t0"])
+    view = GroundView(Scene(rec, mesh), terrain, cost_map, replica, zoned(""))
     rec.log = drawn.__setitem__  # type: ignore[method-assign]
     for count, named in ((3, {"t0", "t1", "t2"}), (6, {"t5"})):
         for n in range(count):
@@ -254,10 +258,8 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
 def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
     terrain = flat()
     cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
-    view = GroundView(
-        rr.RecordingStream("same", recording_id="r"), TerrainMesh(terrain), terrain, cost_map, replica,
-        [PHOTO, COST], ["t0"],
-    )  # fmt: skip
+    scene = Scene(rr.RecordingStream("same", recording_id="r"), TerrainMesh(terrain), [PHOTO, COST])
+    view = GroundView(scene, terrain, cost_map, replica, zoned(""))
     logged: list[str] = []
     view._texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
     both = [PHOTO.entity, COST.entity]

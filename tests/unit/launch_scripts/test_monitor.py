@@ -84,7 +84,7 @@ def still_entities(path: Path) -> set[str]:
 
 def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
     rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    tiles = rig.service._mesh.tile_rows * rig.service._mesh.tile_cols
+    tiles = rig.mesh.tile_rows * rig.mesh.tile_cols
     rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
     rows = rows_by_entity(tmp_path / "run.rrd")
@@ -145,7 +145,7 @@ def test_whoever_opens_the_view_late_has_all_of_it_soon(
     rig.audience = SOMEBODY
     rig.play(each for each in told if each[0] >= 12 * NS_PER_S)
     rig.close()
-    tiles = [f"/world/ground/{tile}" for tile in range(rig.service._mesh.tiles)]
+    tiles = [f"/world/ground/{tile}" for tile in range(rig.mesh.tiles)]
     for entity in ("/world/vehicles", "/world/targets/balls", "/world/targets/names", "/world/routes/t0", *tiles):
         whole, late = (components(tmp_path / "run.rrd", entity, since_s).keys() for since_s in (0.0, came_s))
         assert whole == late, entity
