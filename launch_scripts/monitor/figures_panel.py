@@ -1,21 +1,16 @@
-"""Figures beside the view: plots, a summary and a log.
-
-Texts of others are shown so that they do nothing but stand there. Rerun's headless viewer ends on a character that
-its fonts lack, and its text panel reads Markdown, where an image may be fetched. Ids are safe by their characters;
-what an alarm or a note says, or what a zone is called, may be anything.
-"""
+"""Figures beside the view: plots, a summary and a log."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor.movers.styles import HUES
-from launch_scripts.monitor.sinks import Streams
+from launch_scripts.monitor.pen import in_markdown, shown
+from launch_scripts.monitor.sinks import Rec
 from launch_scripts.observe import facts
 from launch_scripts.observe.alarms import KINDS
 from launch_scripts.observe.history import Sample
@@ -26,15 +21,12 @@ from swarm.wire.messages.vehicles import VehicleState
 _WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside", "teleported")
 _SHOWN_TARGETS = 12
 _SHOWN_ALARMS = 8
-_UNSHOWN = re.compile(r"[^ -~]+")
-_MARKDOWN = re.compile(r"([\\`*_\[\]<>|#!~&$])")
-_LONGEST = 300
 
 
 class FiguresPanel:
     """Logs plots, the summary and notes to one recording stream, and sets its time."""
 
-    def __init__(self, rec: rr.RecordingStream | Streams, target_ids: Sequence[str]) -> None:
+    def __init__(self, rec: Rec, target_ids: Sequence[str]) -> None:
         self._rec = rec
         self._target_ids = list(target_ids)
 
@@ -97,14 +89,3 @@ def summary_markdown(setup: RoleSetup, state: RunState) -> str:
     if len(rows) > _SHOWN_TARGETS:
         lines.append(f"\n{len(rows) - _SHOWN_TARGETS} more targets")
     return "\n".join(lines)
-
-
-def shown(text: str, most: int = _LONGEST) -> str:
-    """A text in one line of characters that every viewer has; `?` stands for others."""
-    line = _UNSHOWN.sub("?", " ".join(text.split()))
-    return line if len(line) <= most else line[: most - 3] + "..."
-
-
-def in_markdown(text: str) -> str:
-    """The same where Markdown is read: it says itself and does nothing."""
-    return _MARKDOWN.sub(r"\\\1", shown(text))

@@ -11,13 +11,12 @@ import logging
 from collections.abc import Callable
 from functools import partial
 
-from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.figures_panel import FiguresPanel, level_of, summary_markdown
-from launch_scripts.monitor.ground.ground_view import GroundView, Scene
-from launch_scripts.monitor.ground.legend import shown_layers
+from launch_scripts.monitor.ground.ground_view import GroundView, Scene, scenario_areas
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.ground.zone_areas import scenario_areas
+from launch_scripts.monitor.live_layout import make_blueprint, shown_layers
 from launch_scripts.monitor.movers.movers_view import MoversView
+from launch_scripts.monitor.pen import Pen
 from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
@@ -89,7 +88,7 @@ class MonitorService:
         self.figures = RunFigures(scenario, terrain.grid, setup.started_ns)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
-        self._setup, self._bus, self._post, self._rec = setup, bus, post, scene.rec
+        self._setup, self._bus, self._post, self._pen = setup, bus, post, scene.pen
         self._recording, self._audience = recording, audience
         self._joins = member is None
         self._member = member or Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
@@ -98,8 +97,8 @@ class MonitorService:
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        self._panel = FiguresPanel(scene.rec, scenario.target_ids)
-        self._movers = MoversView(scene.rec, scene.mesh, scenario, self.figures, self.counters, replica.filter)
+        self._panel = FiguresPanel(scene.pen.rec, scenario.target_ids)
+        self._movers = MoversView(scene.pen, scenario, self.figures, self.counters, replica.filter)
         self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
         self._observer = RunObserver(bus, post, self.figures, _READ)
         self._watched = False
@@ -218,6 +217,7 @@ class MonitorService:
 
     def _begin_drawing(self) -> None:
         """Draws all that does not move."""
+        self._pen.forget()
         self._panel.begin()
         self._ground.begin()
         self._movers.begin()
@@ -235,6 +235,7 @@ class MonitorService:
         self._watch_recording(now_ns)
         if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
             self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
+            self._pen.forget()
             self._ground.draw_anew()
             self._movers.draw_anew()
         self._ground.tick(now_ns, self._watched)
@@ -244,7 +245,7 @@ class MonitorService:
         self._movers.tick(now_ns, self._watched)
         self._draw_plots(now_ns)
         if self._watched:
-            self._rec.flush(timeout_sec=0)  # else rerun packs what is logged within a second together
+            self._pen.rec.flush(timeout_sec=0)  # else rerun packs what is logged within a second together
 
     def _draw_plots(self, now_ns: int) -> None:
         sample = self.figures.samples.last
@@ -280,7 +281,7 @@ def load_view(
     sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint)
     closing.callback(sinks.close)
     truth = load_truth(setup, terrain) if knows_truth else None
-    scene = Scene(sinks.streams, mesh, layers, truth, scenario_areas(scenario, terrain.grid))
+    scene = Scene(Pen(sinks.streams, mesh), layers, truth, scenario_areas(scenario, terrain.grid))
     watch = None if path is None else RecordingWatch(path, sinks.begin_file)
 
     def make(member: Member) -> MonitorService:

@@ -21,7 +21,7 @@ from support.devtools import CHROMIUM, Browser, BrowserError
 from support.fake_run import fake_run
 from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
 
-from launch_scripts.monitor.blueprint import BACKGROUND
+from launch_scripts.monitor.live_layout import BACKGROUND
 from launch_scripts.web.live_page import viewer_program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -16,7 +16,8 @@ from launch_scripts.commands.status_view import print_status, status_fields, sta
 from launch_scripts.launcher.tables import live_table
 from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.details import _DOES
+from launch_scripts.monitor.movers.vehicles_view import _DOES
+from launch_scripts.monitor.pen import Pen
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.observe import facts
 from launch_scripts.observe.run_observer import OutsideObserver
@@ -162,7 +163,7 @@ class Watched:
         def post(event: Event) -> None:
             self.monitor.handle(event, clock.now_ns())
 
-        scene = Scene(self.logged, TerrainMesh(terrain))  # type: ignore[arg-type]
+        scene = Scene(Pen(self.logged, TerrainMesh(terrain)))  # type: ignore[arg-type]
         self.monitor = MonitorService(setup, terrain, bus, post, scene)
         self.watching = True
         simulation.scheduler.after(1, self._start)

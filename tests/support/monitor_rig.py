@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 
-from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.ground_view import Scene
-from launch_scripts.monitor.ground.legend import shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.live_layout import make_blueprint, shown_layers
+from launch_scripts.monitor.pen import Pen
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.sinks import Sinks
 from launch_scripts.web.server import Audience
@@ -74,7 +74,7 @@ class Rig(SwarmModel):
         mesh = self.mesh = TerrainMesh(terrain)
         layers = shown_layers(scenario, knows_truth=False)
         self.sinks = Sinks("run.1", path, config, make_blueprint(mesh, layers))
-        scene = Scene(self.sinks.streams, mesh, layers)
+        scene = Scene(Pen(self.sinks.streams, mesh), layers)
         setup = self.setup("monitor", "0")
         self.service = self.start(
             "monitor",

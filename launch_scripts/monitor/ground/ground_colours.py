@@ -20,6 +20,7 @@ from shared_map.terrain.pyramid import any_in_blocks
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import Window
 
+Colour = tuple[int, int, int]
 LETHAL_MARK, SLOW_MARK, FAST_MARK = (98, 30, 165), (235, 150, 0), (90, 200, 250)
 LETHAL_PRIOR, HATCH, NO_GO, ROAD = (12, 14, 20), (200, 200, 212), rgb(palette.RED), (232, 222, 196)
 STILL_HIDDEN_LETHAL, STILL_HIDDEN_SLOW = rgb(palette.RED), rgb(palette.ORANGE)
@@ -57,7 +58,9 @@ class GroundColours:
         seen = mesh.seen
         shade = 0.42 + 0.78 * hillshade(seen.elevation_m, seen.grid.resolution_m)[..., None]
         self._shade = np.asarray(shade, np.float32)
-        self.photo = _lit_photo(seen.photo, self._shade)
+        colours = seen.photo.astype(np.float32)
+        grey = colours.mean(axis=2, keepdims=True)  # on full colours green vehicles would drown
+        self.photo: Bytes = np.clip((0.42 * colours + 0.53 * grey) * self._shade, 0, 255).astype(np.uint8)
         road = seen.classes == TerrainClass.ROAD
         self.photo[road] = _mixed(self.photo[road], ROAD, 0.4)
         self._closed: Bools = seen.lethal_share >= 0.5
@@ -76,35 +79,24 @@ class GroundColours:
         self._no_go[cells // cols // side, cells % cols // side] = True
 
     def photo_of(self, window: Window) -> Bytes:
-        """Photo of a window with closed ground and marks drawn in: where the map's ground differs from the prior.
-
-        However many cells a texel shows, a mark on one of them is seen."""
+        """Photo of a window with closed ground and marks drawn in: where the ground differs from the prior."""
         texels = self._texels(window)
         photo: Bytes = self.photo[texels].copy()
         self._hatch(photo, window)
-        part = _cells(window)
-        now, before = self._now[part], self._prior[part]
-        lethal = np.isinf(now) & ~np.isinf(before)
-        slow, fast = np.isfinite(now) & (now > before), np.isfinite(now) & (now < before)
-        found = any_in_blocks(lethal, self._mesh.texel) & ~self._no_go[texels]
-        for where, colour, share in (
-            (any_in_blocks(fast, self._mesh.texel), FAST_MARK, 0.75),
-            (any_in_blocks(slow, self._mesh.texel), SLOW_MARK, 0.75),
-            (found, LETHAL_MARK, 0.85),
-        ):
-            photo[where] = _mixed(photo[where], colour, share)
+        now, before = self._now[_cells(window)], self._prior[_cells(window)]
+        drivable = np.isfinite(now)
+        self._mark(photo, drivable & (now < before), FAST_MARK, 0.75)
+        self._mark(photo, drivable & (now > before), SLOW_MARK, 0.75)
+        self._mark(photo, ~drivable & np.isfinite(before), LETHAL_MARK, 0.85, ~self._no_go[texels])
         return photo
 
     def cost_of(self, window: Window) -> Bytes:
         """What a metre costs, dark where it is dear, and hatched where nothing drives."""
-        side, part = self._mesh.texel, _cells(window)
-        now = self._now[part]
+        side, now = self._mesh.texel, self._now[_cells(window)]
         low, high = np.log(self.quickest_s_per_m), np.log(self.slowest_s_per_m)
         with np.errstate(divide="ignore"):
-            level = np.clip((high - np.log(now[::side, ::side])) / (high - low), 0, 1)
-        index = (level * (_COST_STEPS - 1)).astype(np.intp)
-        shade = 0.45 + 0.55 * self._shade[self._texels(window)]
-        image: Bytes = np.clip(self._cost_colours[index] * shade, 0, 255).astype(np.uint8)
+            level = (high - np.log(now[::side, ::side])) / (high - low)
+        image = self._scaled(self._cost_colours, level, window)
         image[any_in_blocks(np.isinf(now), side)] = LETHAL_PRIOR
         self._hatch(image, window)
         return image
@@ -112,34 +104,44 @@ class GroundColours:
     def known_of(self, window: Window) -> Bytes:
         """What the map knows against what is true, on grey relief."""
         assert self._truth is not None
-        part, side = _cells(window), self._mesh.texel
-        now, before, true = self._now[part], self._prior[part], self._truth[part]
-        grey = np.clip(105 * self._shade[self._texels(window)], 0, 255)
-        image: Bytes = np.broadcast_to(grey, (*grey.shape[:2], 3)).astype(np.uint8)
-        image[self._closed[self._texels(window)]] //= 2
+        now, before, true = (each[_cells(window)] for each in (self._now, self._prior, self._truth))
+        texels = self._texels(window)
+        image: Bytes = np.clip(105 * self._shade[texels], 0, 255).repeat(3, axis=2).astype(np.uint8)
+        image[self._closed[texels]] //= 2
         hidden = now != true
-        for where, colour in (
-            ((now == true) & (true != before), FOUND),
-            (hidden & (now != before), OVERRULED),
-            (hidden & (now == before) & np.isfinite(true), STILL_HIDDEN_SLOW),
-            (hidden & (now == before) & np.isinf(true), STILL_HIDDEN_LETHAL),
-        ):
-            seen = any_in_blocks(where, side)
-            image[seen] = _mixed(image[seen], colour, 0.85)
+        self._mark(image, ~hidden & (true != before), FOUND)
+        self._mark(image, hidden & (now != before), OVERRULED)
+        self._mark(image, hidden & (now == before) & np.isfinite(true), STILL_HIDDEN_SLOW)
+        self._mark(image, hidden & (now == before) & np.isinf(true), STILL_HIDDEN_LETHAL)
         return image
 
     def learned_of(self, window: Window) -> Bytes:
         """By what the prior pace is multiplied, by what vehicles have measured of each kind of ground: on grey
         relief, orange where it is slower and blue where it is quicker."""
-        part, side, texels = _cells(window), self._mesh.texel, self._texels(window)
+        part, side = _cells(window), self._mesh.texel
         before, prior = (np.asarray(each[part])[::side, ::side] for each in (self._known_before, self._prior))
-        lethal = np.isinf(before)
         with np.errstate(invalid="ignore"):
-            off = np.where(lethal, 0.0, np.log(prior / before)) / np.log(_MOST_FACTOR)
-        index = np.rint((np.clip(off, -1, 1) + 1) / 2 * (_COST_STEPS - 1)).astype(np.intp)
-        shade = 0.45 + 0.55 * self._shade[texels]
-        image: Bytes = np.clip(self._learned_colours[index] * shade, 0, 255).astype(np.uint8)
+            off = np.where(np.isinf(before), 0.0, np.log(prior / before)) / np.log(_MOST_FACTOR)
+        image = self._scaled(self._learned_colours, (off + 1) / 2, window)
         self._hatch(image, window)
+        return image
+
+    def _mark(
+        self, image: Bytes, cells: Bools, colour: Colour, share: float = 0.85, but: Bools | None = None
+    ) -> None:
+        """Mixes a colour into the texels with any of these cells: however many a texel shows, one of them is seen.
+
+        but  bool, by texel: where the colour goes; None: everywhere
+        """
+        where = any_in_blocks(cells, self._mesh.texel)
+        where = where if but is None else where & but
+        image[where] = _mixed(image[where], colour, share)
+
+    def _scaled(self, colours: Floats, level: Floats, window: Window) -> Bytes:
+        """Colours of a scale, 0 to 1, on the relief."""
+        index = np.rint(np.clip(level, 0, 1) * (_COST_STEPS - 1)).astype(np.intp)
+        shade = 0.45 + 0.55 * self._shade[self._texels(window)]
+        image: Bytes = np.clip(colours[index] * shade, 0, 255).astype(np.uint8)
         return image
 
     def lethal_at(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bools:
@@ -184,21 +186,13 @@ def between(colours: Sequence[str], steps: int) -> Floats:
     named = np.array([rgb(colour) for colour in colours], np.float32)
     at = np.linspace(0, len(named) - 1, steps)
     channels = [np.interp(at, np.arange(len(named)), named[:, n]) for n in range(3)]
-    mixed: Floats = np.stack(channels, axis=1).astype(np.float32)
-    return mixed
+    return np.stack(channels, axis=1).astype(np.float32)
 
 
 def _cells(window: Window) -> tuple[slice, slice]:
     return slice(window.row0, window.row1), slice(window.col0, window.col1)
 
 
-def _mixed(pixels: Bytes, colour: tuple[int, int, int], share: float) -> Bytes:
+def _mixed(pixels: Bytes, colour: Colour, share: float) -> Bytes:
     mixed: Bytes = ((1 - share) * pixels + share * np.array(colour)).astype(np.uint8)
     return mixed
-
-
-def _lit_photo(photo: Bytes, shade: Floats) -> Bytes:
-    colours = photo.astype(np.float32)
-    grey = colours.mean(axis=2, keepdims=True)  # on full colours green vehicles would drown
-    lit: Bytes = np.clip((0.42 * colours + 0.53 * grey) * shade, 0, 255).astype(np.uint8)
-    return lit

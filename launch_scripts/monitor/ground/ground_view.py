@@ -1,35 +1,52 @@
-"""Draws what lies still on a recording stream: decides which tiles, zones and windows are drawn again, and when.
+"""Draws what lies still: decides which tiles, zones and windows are drawn again, and when.
 
-Few entities, style logged once: see docs/decisions/0008-the-live-view.md.
+Zones are those of the scenario, those that its files draw, and those that operators ordered. Few entities, style
+logged once: see docs/decisions/0008-the-live-view.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from launch_scripts.monitor.figures_panel import shown
-from launch_scripts.monitor.ground import legend
+from launch_scripts.monitor import live_layout
 from launch_scripts.monitor.ground.cost_to_go import CostSamples, TargetPictures
 from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW, GroundColours
-from launch_scripts.monitor.ground.legend import COST, KNOWN, LEARNED, NEAREST, PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
-from launch_scripts.monitor.ground.zone_areas import Area, borders, closed_cells, ordered_areas, title_places
+from launch_scripts.monitor.live_layout import COST, KNOWN, LEARNED, NEAREST, PHOTO, Layer
 from launch_scripts.monitor.movers.styles import Look
-from launch_scripts.monitor.sinks import Rec
+from launch_scripts.monitor.pen import Pen, even, screen
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
+from shared_map.keeper.zones import cells_of_zones
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.zones import zone_mask
 from swarm.clock import NS_PER_S
 from swarm.config.classes import class_numbers
+from swarm.config.ground import ZoneConfig
 from swarm.config.scenario import Scenario
-from swarm.grid import Window
+from swarm.errors import SwarmError
+from swarm.grid import GridSpec, Window
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 
+log = logging.getLogger(__name__)
+
+Rule = Literal["no-go", "slow", "quick", "pace"]
+_RULES: dict[str, Rule] = {
+    "forbidden": "no-go", "water": "no-go", "rough": "slow", "preferred": "quick", "road": "quick", "pace": "pace",
+}  # fmt: skip
+_MOST_EDGES = 20_000
+"""Sides of texels along a border that is drawn. A zone with more is named, and hatched if closed."""
+_LARGEST_FILE = 1 << 25
 _WINDOWS_NS = NS_PER_S
 _LAYER_NS = 5 * NS_PER_S
 _NEAREST_NS = 8 * NS_PER_S
@@ -43,13 +60,30 @@ _NAMES_SHOWN = 40
 _MOST_TARGETS = 256
 """Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""
 _MARGIN_COLOUR = (200, 206, 214)
-_LINE, _NO_BALL = -1.3, -0.1
-"""Radii in points of the viewer's window, the same at every zoom: rerun takes negative radii so."""
+_LINE_PX = 1.3
 _WHOLE_SIDE = 112
 _BAR_SHARE = 0.25
 """Of the terrain's width, at most."""
 SIDE_POINTS = 33
 """Points along each side of a window: its outline follows the terrain."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Area:
+    """A zone: its cells, int64 (n,), and what it does to them.
+
+    vehicle_class  for whom; None: for all
+    """
+
+    name: str
+    rule: Rule
+    cells: NDArray[np.int64]
+    vehicle_class: str | None = None
+
+    @property
+    def title(self) -> str:
+        whom = "" if self.vehicle_class is None else f" for {self.vehicle_class}"
+        return self.name if self.name == self.rule else f"{self.name}: {self.rule}{whom}"
 
 
 @dataclass(eq=False)
@@ -65,37 +99,19 @@ class _Tiles:
     picture: Callable[[Window], Bytes]
     every_ns: int
     due_ns: int = 0
-
-    def __post_init__(self) -> None:
-        self.stale: dict[int, None] = {}
-        self._shown: dict[int, int] = {}
-        """Tile -> hash of its pixels as they were logged last."""
-
-    def draw_anew(self, tiles: int) -> None:
-        """All of so many tiles are to be logged, whatever they look like, and soon."""
-        self.stale = dict.fromkeys(range(tiles))
-        self._shown.clear()
-        self.due_ns = 0
-
-    def looks_new(self, tile: int, image: Bytes) -> bool:
-        """Whether a tile has other pixels than when this was asked last."""
-        pixels = hash(image.tobytes())
-        before, self._shown[tile] = self._shown.get(tile), pixels
-        return before != pixels
+    stale: dict[int, None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a run is drawn on, and what is known of it beforehand.
+    """What a run is drawn with, and what is known of it beforehand.
 
-    rec     a recording stream whose sinks are set
     layers  tabs of the view
     truth   the true ground, where this process knows it
     zones   those of the scenario
     """
 
-    rec: Rec
-    mesh: TerrainMesh
+    pen: Pen
     layers: Sequence[Layer] = (PHOTO,)
     truth: Floats | None = None
     zones: Sequence[Area] = ()
@@ -116,11 +132,11 @@ class GroundView:
         scenario: Scenario,
         movers: Sequence[Look] = (),
     ) -> None:
-        self._rec, self._mesh, self._cost_map, self._replica = scene.rec, scene.mesh, cost_map, replica
+        self._pen, self._mesh, self._cost_map, self._replica = scene.pen, scene.pen.mesh, cost_map, replica
         self._shown, self._zones, self._movers = scene.layers, list(scene.zones), movers
         self._target_ids, self._classes = scenario.target_ids, list(class_numbers(scenario))
         now, prior = cost_map.ground_s_per_m, cost_map.prior_s_per_m
-        self._colours = colours = GroundColours(scene.mesh, terrain, now, scene.truth, prior)
+        self._colours = colours = GroundColours(self._mesh, terrain, now, scene.truth, prior)
         self._colours.close(closed_cells(self._zones))
         tiled = (
             _Tiles(PHOTO, colours.photo_of, NS_PER_S),
@@ -131,26 +147,26 @@ class GroundView:
         self._layers = [each for each in tiled if each.layer in scene.layers]
         self._targets = [layer for layer in scene.layers if layer.target is not None]
         self.samples = CostSamples(terrain.grid, next((layer.target for layer in self._targets), None))
-        self._pictures = TargetPictures(scene.mesh, colours, self.samples)
+        self._pictures = TargetPictures(self._mesh, colours, self.samples)
         self._nearest_due_ns = 0
         self._ordered: list[Area] = []
         self._zones_version = 0
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
-        self._windows_new, self._windows_due_ns = False, 0
+        self._windows_due_ns = 0
 
     def begin(self) -> None:
         """Draws all of it. What never changes is static: the shape of the ground, legends, the scenario's zones."""
-        self._rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._pen.rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         tiled = [each.layer for each in self._layers]
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
         for layer in self._shown:
             for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in tiled else whole):
-                self._rec.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
-            self._legend(layer, legend.still_legend(layer, self._colours, self._target_ids, self._movers))
-        style = rr.LineStrips3D.from_fields(colors=[WINDOW], radii=[_LINE])
-        self._rec.log("world/windows", style, static=True)
+                self._pen.rec.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
+            self._legend(layer, live_layout.still_legend(layer, self._colours, self._target_ids, self._movers))
+        self._pen.style("world/windows", _LINE_PX, WINDOW)
+        self._pen.label_style("world/windows/names", WINDOW)
         self._draw_margin()
         self._draw_zones("planned", self._zones, static=True)
         self._pictures.full_s = 0.0  # so that the next answer draws a legend
@@ -158,11 +174,10 @@ class GroundView:
         self.finish()
 
     def draw_anew(self) -> None:
-        """What is drawn on change only is drawn once more, when it is due."""
+        """All is drawn once more when it is due, as the pen has forgotten it."""
         self._draw_zones("ordered", self._ordered, static=False)
-        self._windows_new = bool(self._windows)
         for layer in self._layers:
-            layer.draw_anew(self._mesh.tiles)
+            layer.stale, layer.due_ns = dict.fromkeys(range(self._mesh.tiles)), 0
 
     def finish(self) -> None:
         """Draws all tiles that are out of date."""
@@ -175,10 +190,7 @@ class GroundView:
         if status.target not in self._windows and len(self._windows) >= _MOST_TARGETS + len(self._target_ids):
             return
         self.samples.hear_target(status.target)
-        window = tuple(status.window)
-        if self._windows.get(status.target) != window:
-            self._windows[status.target] = window
-            self._windows_new = True
+        self._windows[status.target] = tuple(status.window)
 
     def hear_costs(self, reply: CostReply, now_ns: int) -> None:
         """Draws what a planner answered."""
@@ -204,8 +216,8 @@ class GroundView:
             if now_ns >= layer.due_ns:
                 layer.due_ns = now_ns + slower * layer.every_ns
                 self._draw_tiles(layer, _TILES_AT_ONCE)
-        if self._windows_new and now_ns >= self._windows_due_ns:
-            self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
+        if self._windows and now_ns >= self._windows_due_ns:
+            self._windows_due_ns = now_ns + _WINDOWS_NS
             self._draw_windows()
 
     def next_target(self, now_ns: int, watched: bool) -> str | None:
@@ -222,7 +234,7 @@ class GroundView:
         for tile in list(layer.stale)[:most]:
             del layer.stale[tile]
             image = layer.picture(self._mesh.tile_window(tile))
-            if layer.looks_new(tile, image):
+            if self._pen.news(f"{layer.layer.entity}/{tile}", pixels=hash(image.tobytes())):
                 self._texture(layer.layer.entity, tile, image)
 
     def _texture(self, entity: str, tile: int, image: Bytes) -> None:
@@ -231,32 +243,32 @@ class GroundView:
         form = rr.components.ImageFormat(width=width, height=height, color_model="RGB", channel_datatype="U8")
         pixels = np.ascontiguousarray(image).tobytes()
         texture = rr.Mesh3D.from_fields(albedo_texture_buffer=pixels, albedo_texture_format=form)
-        self._rec.log(f"{entity}/{tile}", texture)
+        self._pen.rec.log(f"{entity}/{tile}", texture)
 
     def _legend(self, layer: Layer, picture: bytes | None) -> None:
         if picture is not None:
             image = rr.EncodedImage(contents=picture, media_type="image/png")
-            self._rec.log(f"legend/{layer.name}", image, static=True)
+            self._pen.rec.log(f"legend/{layer.name}", image, static=True)
 
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
         self._texture(layer.entity, 0, self._pictures.to_target(target))
         lines, radii = self._pictures.tree(target)
-        self._rec.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
+        self._pen.rec.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
-            self._legend(layer, legend.to_target_legend(target, self._pictures.full_s, self._movers))
+            self._legend(layer, live_layout.to_target_legend(target, self._pictures.full_s, self._movers))
 
     def _draw_zones(self, whose: str, zones: Sequence[Area], *, static: bool) -> None:
         parts = [borders(self._mesh, area) for area in zones]
         strips = np.concatenate([np.empty((0, 2, 3), np.float32), *parts])
-        per_zone = np.array([legend.ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
+        per_zone = np.array([live_layout.ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         path = f"world/zones/{whose}"
-        self._rec.log(path, rr.LineStrips3D(strips, colors=colours, radii=[_LINE]), static=static)
+        self._pen.rec.log(path, rr.LineStrips3D(strips, colors=colours, radii=[screen(_LINE_PX)]), static=static)
         named = zones[:_NAMES_SHOWN]
         pale = (per_zone[:_NAMES_SHOWN].astype(np.uint16) + 2 * 255) // 3  # on their own hatches names would drown
-        texts = _texts(title_places(self._mesh, named), [area.title for area in named], pale.astype(np.uint8))
-        self._rec.log(f"{path}/names", texts, static=static)
+        titles, places = [area.title for area in named], title_places(self._mesh, named)
+        self._pen.texts(f"{path}/names", places, titles, pale.astype(np.uint8), static=static)
 
     def _draw_margin(self) -> None:
         """Draws what a map has south of it, level with its lowest ground: a bar of known length in the west, an
@@ -265,23 +277,24 @@ class GroundView:
         length_m = round_length(_BAR_SHARE * mesh.width_m)
         south, beneath = -mesh.depth_m - 3 * unit, -mesh.depth_m - 4.5 * unit
         east = mesh.width_m - unit
-        bar = rr.LineStrips3D([[(0, south, 0), (length_m, south, 0)]], colors=[_MARGIN_COLOUR], radii=[_LINE])
-        self._rec.log("world/margin", bar, static=True)
+        ends = [[(0, south, 0), (length_m, south, 0)]]
+        bar = rr.LineStrips3D(ends, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
+        self._pen.rec.log("world/margin", bar, static=True)
         arrow = rr.Arrows3D(
             origins=[(east, south - 2.5 * unit, 0)],
             vectors=[(0, 4 * unit, 0)],
             colors=[_MARGIN_COLOUR],
             radii=[0.15 * unit],
         )
-        self._rec.log("world/margin/north", arrow, static=True)
+        self._pen.rec.log("world/margin/north", arrow, static=True)
         texts = {
             "0": (0, beneath),
             said_length(length_m): (length_m, beneath),
-            said_heights(mesh.stretch): (mesh.width_m / 2, beneath),
+            mesh.said_heights: (mesh.width_m / 2, beneath),
             "N": (east - 2.2 * unit, south),
         }
         places = np.array([(*place, 0) for place in texts.values()], np.float32)
-        self._rec.log("world/margin/texts", _texts(places, list(texts), [_MARGIN_COLOUR]), static=True)
+        self._pen.texts("world/margin/texts", places, list(texts), [_MARGIN_COLOUR], static=True)
 
     def _draw_windows(self) -> None:
         """Draws the window that each planner grew last, unless it is the whole terrain."""
@@ -294,8 +307,8 @@ class GroundView:
         named = named[:_NAMES_SHOWN]
         names = [f"window of {parts[n][0]}" for n in named]
         south = outlines[named, 5 * SIDE_POINTS // 2]
-        self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=outlines))
-        self._rec.log("world/windows/names", _texts(south, names, [WINDOW]))
+        self._pen.lines("world/windows", even(outlines))
+        self._pen.points("world/windows/names", positions=south, labels=names)
 
 
 def window_outlines(mesh: TerrainMesh, windows: Sequence[Window]) -> Floats:
@@ -311,18 +324,95 @@ def window_outlines(mesh: TerrainMesh, windows: Sequence[Window]) -> Floats:
     return mesh.place_cells(rows * mesh.grid.cols + cols, 0.25 * mesh.scale_m)
 
 
-def said_heights(stretch: float) -> str:
-    """How high heights are drawn, in words."""
-    return "heights to scale" if stretch == 1 else f"heights x {stretch:.2g}"
-
-
 def _mesh(tile: MeshTile) -> rr.Mesh3D:
     return rr.Mesh3D.from_fields(
         vertex_positions=tile.vertices, triangle_indices=tile.triangles, vertex_texcoords=tile.texcoords
     )
 
 
-def _texts(places: Floats, texts: list[str], colours: Sequence[tuple[int, ...]] | Bytes) -> rr.Points3D:
-    return rr.Points3D(
-        places, labels=[shown(text, 60) for text in texts], colors=colours, radii=[_NO_BALL], show_labels=True
+def scenario_areas(scenario: Scenario, grid: GridSpec) -> list[Area]:
+    """The zones of a scenario. Roads from files are left out, as the terrain's classes show them; so are files that
+    are not on this machine."""
+    areas = []
+    for zone in scenario.cost.zones:
+        try:
+            cells = _cells_of(zone, grid)
+        except SwarmError as error:
+            log.warning("a zone is not drawn: %s", error)
+            continue
+        if len(cells):
+            factor = zone.factor or 1.0
+            rule = _RULES.get(zone.kind) or ("slow" if factor > 1 else "quick")
+            areas.append(Area(zone.called, rule, cells))
+    return areas
+
+
+def ordered_areas(replica: MapReplica, now_ns: int, classes: Sequence[str]) -> list[Area]:
+    """The zones of operators that stand.
+
+    classes  of vehicles beside "ground", in the order of their numbers
+    """
+    return [
+        Area(
+            name,
+            "no-go" if each.kind == MarkKind.LETHAL else "pace",
+            each.cells,
+            classes[each.class_number - 1] if each.class_number else None,
+        )
+        for name, each in cells_of_zones(replica, now_ns).items()
+        if each.class_number <= len(classes)
+    ]
+
+
+def closed_cells(areas: Iterable[Area]) -> NDArray[np.int64]:
+    """Cells that any of these closes for all vehicles."""
+    closed = (area.cells for area in areas if area.rule == "no-go" and area.vehicle_class is None)
+    return np.concatenate([np.empty(0, np.int64), *closed])
+
+
+def title_places(mesh: TerrainMesh, areas: Sequence[Area]) -> Floats:
+    """Where the zones' names stand: over the cell of each that is next to its middle."""
+    places = []
+    for area in areas:
+        rows, cols = np.divmod(area.cells, mesh.grid.cols)
+        apart = (rows - rows.mean()) ** 2 + (cols - cols.mean()) ** 2
+        places.append(int(area.cells[int(apart.argmin())]))
+    return mesh.place_cells(np.array(places, np.int64), 0.5 * mesh.scale_m)
+
+
+def _cells_of(zone: ZoneConfig, grid: GridSpec) -> NDArray[np.int64]:
+    if zone.file is None:
+        return np.flatnonzero(zone_mask(zone, grid))
+    path = Path(zone.file)
+    if zone.kind == "road" or not path.exists() or path.stat().st_size > _LARGEST_FILE:
+        return np.empty(0, np.int64)
+    from shared_map.importers.zone_files import burn_zone
+
+    burnt = burn_zone(zone, grid, f"zone {zone.called!r}")
+    inside = np.zeros((grid.rows, grid.cols), np.bool_)
+    for window, found in (burnt.lethal, (burnt.values[0], ~np.isnan(burnt.values[1]))):
+        inside[window.row0 : window.row1, window.col0 : window.col1] |= found
+    return np.flatnonzero(inside)
+
+
+def borders(mesh: TerrainMesh, area: Area) -> Floats:
+    """The border of a zone, laid over the terrain: float32 (n, 2, 3), one line for each side of a texel."""
+    rows, cols = np.divmod(area.cells, mesh.grid.cols)
+    side = mesh.texel
+    row0, col0 = int(rows.min()) // side, int(cols.min()) // side
+    inside = np.zeros((int(rows.max()) // side - row0 + 3, int(cols.max()) // side - col0 + 3), np.bool_)
+    inside[rows // side - row0 + 1, cols // side - col0 + 1] = True
+    # Between texel n and n + 1 of the padded part lies the line n of the part, counted from its north or west.
+    south_row, south_col = np.nonzero(inside[:-1] != inside[1:])
+    east_row, east_col = np.nonzero(inside[:, :-1] != inside[:, 1:])
+    ends = np.concatenate(
+        [
+            np.stack([south_row, south_col - 1, south_row, south_col], axis=1),
+            np.stack([east_row - 1, east_col, east_row, east_col], axis=1),
+        ]
     )
+    if len(ends) > _MOST_EDGES:
+        return np.empty((0, 2, 3), np.float32)
+    corners = (ends.reshape(-1, 2, 2) + np.array((row0, col0))) * (side * mesh.grid.resolution_m)
+    south_m, east_m = (corners[..., n].astype(np.float32) for n in (0, 1))
+    return mesh.place(east_m, south_m, 0.12 * mesh.scale_m)

@@ -84,6 +84,11 @@ class TerrainMesh:
         """Length in metres which is the same share of any terrain's width."""
         return max(self.width_m, self.depth_m) / 100
 
+    @property
+    def said_heights(self) -> str:
+        """How high heights are drawn, in words."""
+        return "heights to scale" if self.stretch == 1 else f"heights x {self.stretch:.2g}"
+
     def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
         """Points on the terrain, float32 (n, 3), lifted by some metres of the view. Outside, the ground is as high
         as at its border."""

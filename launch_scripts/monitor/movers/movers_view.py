@@ -7,33 +7,43 @@ opaque the likelier a target is there, alarms poles with their words.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.figures_panel import shown
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.movers import details, styles
-from launch_scripts.monitor.movers.details import MOST_LABELS, Place
-from launch_scripts.monitor.movers.map_lines import Pen, feet, poles, rings, screen
+from launch_scripts.monitor.movers import styles
+from launch_scripts.monitor.movers.map_lines import feet, poles, rings
+from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY, mixed
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.sinks import Rec
+from launch_scripts.monitor.pen import LABEL_COLOUR, Colour, Pen, screen, shown
+from launch_scripts.observe.alarms import Alarm
+from launch_scripts.observe.facts import TARGET_FACTS
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.state import RunState, TargetLine
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
 from swarm.config.scenario import Scenario
+from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import column
 from swarm.wire.messages import Message
 from swarm.wire.messages.planning import Believed, Sighted
-from swarm.wire.messages.vehicles import Body, Fleet, Followed
+from swarm.wire.messages.vehicles import Body, Fleet, Followed, VehicleState
 from vehicle_agent.bodies import Bodies
 
-FOLLOWED_ENTITY = "world/followed"
+MOST_LABELS = 40
+"""With more labels nothing can be read."""
+FADES_S = 8.0
+"""An alarm that is over is seen for so long, ever greyer."""
+_FADED: Colour = (96, 100, 106)
+_MOST_MARKS = 24
+"""The serious come first, as in the list of alarms."""
 _UNSEEN = 2
 """While nobody looks pins, routes and sentences are drawn so many times as seldom, for the recording."""
 _AGE_NS = 2 * NS_PER_S
@@ -48,6 +58,10 @@ _PIN, _LABEL, _ALARM = 2.2, 5.4, 4.6
 """Heights of pins, of their labels, and of alarms over the ground, in `TerrainMesh.scale_m`."""
 
 
+Place = tuple[float, float]
+"""East and south in metres from the grid's north-west corner."""
+
+
 class MoversView:
     """Vehicles, guests, targets, sightings, bodies, routes and trails.
 
@@ -57,25 +71,25 @@ class MoversView:
 
     def __init__(
         self,
-        rec: Rec,
-        mesh: TerrainMesh,
+        pen: Pen,
         scenario: Scenario,
         figures: RunFigures,
         counters: Counters,
         filter: MarkFilter,
     ) -> None:
-        self._pen, self._mesh, self._figures, self._counters = Pen(rec, mesh), mesh, figures, counters
+        self._pen, self._mesh, self._figures, self._counters = pen, pen.mesh, figures, counters
         self._level = level = styles.level_for(scenario.vehicle_count)
         self.looks = styles.Looks([group.name for group in scenario.groups], scenario.target_ids)
         self._vehicles = VehiclesView(self._pen, scenario, level, self.looks)
         self._follow = scenario.monitor.follow
-        self._trails = trails_of(scenario, mesh, level)
+        self._trails = trails_of(scenario, pen.mesh, level)
         self._sightings = Sightings(filter)
         self._seen: Mapping[str, Sighted] = {}
         self._seen_ns: dict[str, int] = {}
         """Target -> when its newest sighting was heard."""
-        self._searches = Searches()
-        self._bodies = Bodies(mesh.grid)
+        self._believed: dict[str, tuple[Believed, int]] = {}
+        """Target that nobody sees -> where it is believed to be, and when that was heard."""
+        self._bodies = Bodies(pen.mesh.grid)
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._details: dict[str, str] = {}
         """Target -> a sentence about it."""
@@ -86,7 +100,7 @@ class MoversView:
         self._fleets_new = False
         self._told_anew = True
         """True if sentences about targets are told, whether it is time or not."""
-        self._limit = styles.RateLimit({"pins": 0.2, "details": 1.0, "trails": 0.5, "bodies": 0.2})
+        self._limit = styles.RateLimit({"pins": 0.2, "details": 1.0, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
 
     def begin(self) -> None:
         """Logs styles; all else is drawn anew."""
@@ -102,15 +116,14 @@ class MoversView:
         self.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             px = self._level.radius_px + 2.5
-            halo = rr.Points3D([(0, 0, 0)], colors=[styles.LABEL_COLOUR], radii=[screen(px)])
+            halo = rr.Points3D([(0, 0, 0)], colors=[LABEL_COLOUR], radii=[screen(px)])
             self._pen.rec.log(f"{FOLLOWED_ENTITY}/halo", halo, static=True)
             self._log_followed((self._mesh.width_m / 2, self._mesh.depth_m / 2))
 
     def draw_anew(self) -> None:
-        """What is drawn on change only is drawn once more, when it is due."""
+        """All is drawn once more when it is due, as the pen has forgotten it."""
         self._vehicles.draw_anew()
-        self._pen.forget()
-        self._searches.changed = self._told_anew = True
+        self._told_anew = True
 
     def hear(self, message: Message, now_ns: int) -> None:
         """Takes a message in."""
@@ -120,7 +133,7 @@ class MoversView:
             case Sighted() as sighted:
                 self._sightings.hear(sighted, now_ns)
             case Believed() as believed:
-                self._searches.hear(believed, now_ns)
+                self._believed[believed.target] = believed, now_ns
             case Body() as body:
                 self._bodies.hear(body, now_ns)
             case Followed() as followed:
@@ -129,10 +142,10 @@ class MoversView:
 
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say, so that all places say the same; draws alarms where they are."""
-        self._details = {line.id: details.target_details(line) for line in summary.targets}
+        self._details = {line.id: target_details(line) for line in summary.targets}
         observed = self._figures.observed
         self._crew = frozenset(observed.plan.crew_now(observed.plan.targets_now(observed.book)))
-        marks = details.alarm_marks(
+        marks = alarm_marks(
             summary.alarms, summary.elapsed_s, observed.targets(), observed.vehicles(), self._mesh.grid
         )
         tops = self._pen.placed([mark.place_m for mark in marks], _ALARM)
@@ -155,10 +168,8 @@ class MoversView:
             # A target that an operator removed is in no table either.
             places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
             self._draw_targets(places_m, self._figures.observed.lost(now_ns), now_ns, slower)
-        if (beliefs := self._searches.take_changed(now_ns)) is not None:
-            places, colours, radii_m, sentences = searched_points(self._mesh, beliefs)
-            its = {"positions": places, "colors": colours, "radii": radii_m}
-            self._pen.points("world/searched", {"searched": sentences}, **its)
+        if self._limit.due("beliefs", now_ns):
+            self._draw_beliefs(now_ns)
         self._bodies.tick(now_ns)
         self._bodies.take_changed()
         self._bodies.complaints.clear()
@@ -173,7 +184,7 @@ class MoversView:
         }
         self._seen = seen
         ages_s = {id: (now_ns - heard_ns) // _AGE_NS * _AGE_NS / NS_PER_S for id, heard_ns in self._seen_ns.items()}
-        pins, labels = details.target_labels(places_m, lost, ages_s)
+        pins, labels = target_labels(places_m, lost, ages_s)
         rings_of = [seen[id] for id in labels]
         centres, radii_m = self._discs(rings_of, [each.uncertainty_m for each in rings_of], 0.3)
         self._pen.lines("world/targets/sighted", rings(self._mesh, centres, radii_m))
@@ -209,8 +220,17 @@ class MoversView:
             self._pen.rec.log("world/bodies/discs", discs)
         tops = centres + sizes * np.array([0, 0, 1], np.float32)
         white = np.full((len(tops), 3), 225, np.uint8)
-        told = {"body": [details.body_details(each) for each in bodies]}
+        told = {"body": [body_details(each) for each in bodies]}
         self._pen.points("world/bodies/names", told, positions=tops, colors=white)
+
+    def _draw_beliefs(self, now_ns: int) -> None:
+        """Draws where targets are believed to be; one without cells is no longer searched."""
+        heard = self._believed.items()
+        self._believed = {id: each for id, each in heard if each[0].cells and now_ns - each[1] < SILENT_NS}
+        told = [believed for believed, _ in self._believed.values()]
+        places, colours, radii_m, sentences = searched_points(self._mesh, told)
+        its = {"positions": places, "colors": colours, "radii": radii_m}
+        self._pen.points("world/searched", {"searched": sentences}, **its)
 
     def _draw_followed(self, vehicles: VehicleColumns) -> None:
         """Draws the vehicle or target that the camera follows, where it is now; nothing while nobody knows."""
@@ -234,31 +254,6 @@ class MoversView:
         return centres, np.maximum(np.array(radii_m, np.float32), np.float32(_SMALLEST * self._mesh.scale_m))
 
 
-class Searches:
-    """The newest belief about each target that nobody sees."""
-
-    def __init__(self) -> None:
-        self._of: dict[str, tuple[Believed, int]] = {}
-        self.changed = False
-        """True if all of it is to be drawn."""
-
-    def hear(self, believed: Believed, now_ns: int) -> None:
-        """Takes one in; without cells the search is over."""
-        self.changed = True
-        self._of[believed.target] = (believed, now_ns)
-        if not believed.cells:
-            del self._of[believed.target]
-
-    def take_changed(self, now_ns: int) -> list[Believed] | None:
-        """What is believed; None if that is the same as before."""
-        known = len(self._of)
-        self._of = {id: told for id, told in self._of.items() if now_ns - told[1] < SILENT_NS}
-        if not self.changed and len(self._of) == known:
-            return None
-        self.changed = False
-        return [believed for believed, _ in self._of.values()]
-
-
 def searched_points(mesh: TerrainMesh, beliefs: Sequence[Believed]) -> tuple[Floats, Bytes, Floats, list[str]]:
     """Places float32 (n, 3), colours uint8 (n, 4), the likelier the less transparent, radii float32 (n,), m, and a
     sentence about each. Cells outside of the map are left out."""
@@ -275,3 +270,76 @@ def searched_points(mesh: TerrainMesh, beliefs: Sequence[Believed]) -> tuple[Flo
     opaque = _FAINT + (_FULL - _FAINT) * np.concatenate(opacities)
     colours = np.column_stack([np.tile(styles.SEARCHED_COLOUR, (len(opaque), 1)), opaque]).astype(np.uint8)
     return mesh.place_cells(np.concatenate(cells), 0.1 * mesh.scale_m), colours, np.concatenate(radii_m), sentences
+
+
+def body_details(body: Body) -> str:
+    """As `r1 of mowers: radius 2.0 m, 1.5 m/s`."""
+    return f"{body.id} of {body.group}: radius {body.radius_m:.1f} m, {body.speed_m_per_s:.1f} m/s"
+
+
+def target_details(line: TargetLine) -> str:
+    """What the table says of it, as `t3: following 16, nearest 412 m, re-plans 30, certified gap 1.05%`."""
+    title, *others = (fact for fact in TARGET_FACTS if fact.always)
+    return f"{title.shown(line)}: {', '.join(f'{fact.label} {fact.shown(line)}' for fact in others)}"
+
+
+def target_labels(
+    posed: Collection[str], lost: Collection[str], seen_age_s: Mapping[str, float]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Labels at pins and at sightings, by target. No target has two, and none that is drawn has none.
+
+    posed       targets that have a place because a tracker told it
+    lost        those of them that nobody tracks now
+    seen_age_s  targets that vehicles saw -> seconds since then
+    """
+    pins = {id: id for id in posed if id not in lost}
+    sightings = {id: f"{id} seen {age_s:.0f} s ago" for id, age_s in seen_age_s.items() if id not in pins}
+    for id in posed:
+        if id in lost and id not in sightings:
+            pins[id] = f"{id} lost"
+    return pins, sightings
+
+
+class AlarmMark(NamedTuple):
+    """A place, and what happened there."""
+
+    place_m: Place
+    text: str
+    colour: Colour
+
+
+def alarm_marks(
+    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], vehicles: VehicleColumns, grid: GridSpec
+) -> list[AlarmMark]:
+    """The alarms that have a place, and vehicles that are stranded; one at a place.
+
+    An alarm is where it says; or where its target is; or, if it is about an agent, in the middle of its vehicles.
+    """
+    marks: dict[Place, AlarmMark] = {}
+    for place_m, text, age_s in (*_placed(alarms, now_s, places_m, vehicles, grid), *_stranded(vehicles)):
+        if age_s <= FADES_S and len(marks) < _MOST_MARKS:
+            colour = mixed(ALARM_COLOUR, _FADED, max(age_s, 0.0) / FADES_S)
+            marks.setdefault(place_m, AlarmMark(place_m, text, colour))
+    return list(marks.values())
+
+
+def _placed(
+    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], vehicles: VehicleColumns, grid: GridSpec
+) -> Iterator[tuple[Place, str, float]]:
+    """Place, text, and for how many seconds it has been over."""
+    agents = np.array([agent_of(id) for id in vehicles.ids], np.str_)
+    for alarm in alarms:
+        place_m = None
+        if (cell := alarm.place(grid)) is not None:
+            place_m = (cell[1] + 0.5) * grid.resolution_m, (cell[0] + 0.5) * grid.resolution_m
+        elif alarm.target is not None:
+            place_m = places_m.get(alarm.target)
+        elif (its := agents == alarm.about.removeprefix("agent-")).any() and alarm.about.startswith("agent-"):
+            place_m = float(np.median(vehicles.east_m[its])), float(np.median(vehicles.south_m[its]))
+        if place_m is not None:
+            yield place_m, f"{alarm.label}: {alarm.about}", 0.0 if alarm.over_s is None else now_s - alarm.over_s
+
+
+def _stranded(vehicles: VehicleColumns) -> Iterator[tuple[Place, str, float]]:
+    for n in np.flatnonzero(vehicles.states == VehicleState.STRANDED)[:_MOST_MARKS].tolist():
+        yield (float(vehicles.east_m[n]), float(vehicles.south_m[n])), f"stranded: {vehicles.ids[n]}", 0.0

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes
+from launch_scripts.monitor.pen import LABEL_COLOUR, Colour
 from launch_scripts.observe import palette
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.vehicles import VehicleState
 
-Colour = tuple[int, int, int]
 Shape = Literal["ball", "box", "pin", "ring", "disc", "line", "fill", "hatch"]
 
 
@@ -38,7 +38,8 @@ SIGHTED_COLOUR: Colour = (255, 255, 255)
 SEARCHED_COLOUR: Colour = (253, 174, 107)
 ROUTE_COLOUR: Colour = (205, 212, 220)
 ALARM_COLOUR: Colour = (255, 64, 48)
-LABEL_COLOUR: Colour = (240, 243, 246)
+FOLLOWED_ENTITY = "world/followed"
+"""The vehicle or target that the camera follows: an entity whose origin moves."""
 HINT = "point at a vehicle or target to read who it is"
 _GROUPS = 4
 """Groups in the legend: more have no place there."""

@@ -14,17 +14,29 @@ from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.movers import map_lines
-from launch_scripts.monitor.movers.details import vehicle_details
-from launch_scripts.monitor.movers.map_lines import Pen, RouteNow, Trails
-from launch_scripts.monitor.movers.styles import LABEL_COLOUR, Level, Looks, RateLimit, dimmed
+from launch_scripts.monitor.movers.map_lines import RouteNow, Trails
+from launch_scripts.monitor.movers.styles import Level, Looks, RateLimit, dimmed
+from launch_scripts.monitor.pen import LABEL_COLOUR, Pen, screen
+from launch_scripts.observe.counts import percent
 from launch_scripts.observe.latest_state import LatestState, VehicleColumns
+from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
-from swarm.wire.messages.vehicles import Followed
+from swarm.wire.messages.vehicles import Followed, VehicleState
 
 _ROUTES_KEPT = 1 << 15
 """Vehicles whose routes are remembered. Beyond that all are forgotten: their agents never had so many."""
+_DOES = {
+    VehicleState.IDLE: "idle",
+    VehicleState.WAITING: "waits for a route",
+    VehicleState.FOLLOWING: "on its way",
+    VehicleState.ARRIVED: "arrived",
+    VehicleState.STRANDED: "stranded",
+    VehicleState.LOST: "goes on without its planner",
+    VehicleState.OUTDATED: "goes by an old pose",
+    VehicleState.SEARCHING: "looks for its target",
+}
 _Rows = NDArray[np.intp]
 
 
@@ -148,7 +160,7 @@ class VehiclesView:
                 self._pen.points(entity, {"vehicle": told}, **its)
         guests = positions[roll.guests]
         if self._pen.news("world/guests/frames", centres=guests):
-            sides, radii = np.full(guests.shape, 0.5 * self._mesh.scale_m, np.float32), [map_lines.screen(1.0)]
+            sides, radii = np.full(guests.shape, 0.5 * self._mesh.scale_m, np.float32), [screen(1.0)]
             boxes = rr.Boxes3D(centers=guests, half_sizes=sides, colors=[LABEL_COLOUR], radii=radii)
             self._pen.rec.log("world/guests/frames", boxes)
         if self._level.names and len(positions) <= self._level.most:
@@ -172,3 +184,24 @@ class VehiclesView:
 
     def _cell(self, vehicles: VehicleColumns, n: int) -> int:
         return map_lines.cell_at(self._mesh.grid, float(vehicles.east_m[n]), float(vehicles.south_m[n]))
+
+
+def vehicle_details(
+    vehicles: VehicleColumns, who: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
+) -> list[str]:
+    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts, walker`. What matters comes first: a
+    viewer may cut off the end.
+
+    who  vehicle -> what is said of whose it is
+    """
+    target_ids = vehicles.target_ids
+    lines = []
+    for id, state, target in zip(vehicles.ids, vehicles.states.tolist(), vehicles.targets.tolist(), strict=True):
+        chased = target_ids[target] if target >= 0 else None
+        line = f"{id}: {_DOES[state]}" if chased is None else f"{id} to {chased}: {_DOES[state]}"
+        route = routes.get(id)
+        if route is not None and route.target == chased and state != VehicleState.ARRIVED:
+            proven = "gap not proven" if route.gap is None else f"certified gap {percent(route.gap)}"
+            line += f", route {(now_ns - route.begun_ns) / NS_PER_S:.0f} s old, {proven}"
+        lines.append(f"{line}; {who.get(id, '?')}")
+    return lines

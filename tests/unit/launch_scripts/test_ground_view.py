@@ -26,8 +26,18 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
-from launch_scripts.monitor.ground.ground_view import GroundView, Scene, said_heights
-from launch_scripts.monitor.ground.legend import (
+from launch_scripts.monitor.ground.ground_view import (
+    Area,
+    GroundView,
+    Scene,
+    borders,
+    closed_cells,
+    ordered_areas,
+    scenario_areas,
+    title_places,
+)
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.monitor.live_layout import (
     COST,
     HEIGHT_PX,
     KNOWN,
@@ -38,16 +48,8 @@ from launch_scripts.monitor.ground.legend import (
     still_legend,
     to_target_legend,
 )
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.ground.zone_areas import (
-    Area,
-    borders,
-    closed_cells,
-    ordered_areas,
-    scenario_areas,
-    title_places,
-)
 from launch_scripts.monitor.movers.styles import Looks
+from launch_scripts.monitor.pen import Pen
 from shared_map.cost_map import CostMap
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
@@ -195,7 +197,7 @@ def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: i
     logged: dict[str, Any] = {}
     rec = rr.RecordingStream("margin", recording_id="r")
     rec.log = lambda path, what, static: logged.__setitem__(path, what)  # type: ignore[method-assign,assignment]
-    scene = Scene(rec, TerrainMesh(terrain))
+    scene = Scene(Pen(rec, TerrainMesh(terrain)))
     GroundView(scene, terrain, CostMap(terrain), MapReplica(terrain.grid), zoned(""))._draw_margin()
     start, end = logged["world/margin"].strips.as_arrow_array().to_pylist()[0]
     number, unit = text.split()
@@ -210,9 +212,10 @@ def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: i
 def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
     elevation_m = np.tile(np.linspace(0, 5, 50, dtype=np.float32), (40, 1))
     terrain = terrain_of_pace(np.ones((40, 50), np.float32), 10.0, elevation_m)
-    assert (said_heights(1.0), said_heights(3.24)) == ("heights to scale", "heights x 3.2")
-    for factor in (1.0, 2.5):
-        assert TerrainMesh(terrain, factor).heights_m.max() == pytest.approx(5 * factor)
+    for factor, said in ((1.0, "heights to scale"), (3.24, "heights x 3.2")):
+        mesh = TerrainMesh(terrain, factor)
+        assert mesh.heights_m.max() == pytest.approx(5 * factor)
+        assert mesh.said_heights == said
 
 
 @pytest.mark.parametrize(
@@ -236,8 +239,8 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
     rec = rr.RecordingStream("names", recording_id="r")
     rec.set_sinks(rr.FileSink(str(tmp_path / "names.rrd"), write_footer=False))
     drawn: dict[str, Any] = {}
-    view = GroundView(Scene(rec, mesh), terrain, cost_map, replica, zoned(""))
-    rec.log = drawn.__setitem__  # type: ignore[method-assign]
+    view = GroundView(Scene(Pen(rec, mesh)), terrain, cost_map, replica, zoned(""))
+    rec.log = lambda path, what, static=False: drawn.__setitem__(path, what)  # type: ignore[method-assign]
     for count, named in ((3, {"t0", "t1", "t2"}), (6, {"t5"})):
         for n in range(count):
             window = [0, 0, 30, 30] if n == 5 else [n, n, n + 3, n + 3]
@@ -258,7 +261,7 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
 def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
     terrain = flat()
     cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
-    scene = Scene(rr.RecordingStream("same", recording_id="r"), TerrainMesh(terrain), [PHOTO, COST])
+    scene = Scene(Pen(rr.RecordingStream("same", recording_id="r"), TerrainMesh(terrain)), [PHOTO, COST])
     view = GroundView(scene, terrain, cost_map, replica, zoned(""))
     logged: list[str] = []
     view._texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
@@ -277,5 +280,6 @@ def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_co
     cost_map.ground_s_per_m[3, 3] = 0.5
     assert logged_when(20) == both
     assert logged_when(30) == []
+    view._pen.forget()
     view.draw_anew()
     assert logged_when(40) == both

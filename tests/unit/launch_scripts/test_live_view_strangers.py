@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.sinks import Sinks
 from launch_scripts.web import server as web
 from launch_scripts.web.server import MOST_CONNECTIONS, Audience

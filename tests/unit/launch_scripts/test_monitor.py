@@ -32,8 +32,8 @@ from support.monitor_rig import (
 from support.target_reports import fleet
 
 from launch_scripts import parent_death
-from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
 from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain
@@ -286,17 +286,19 @@ def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
     assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies/discs"] == 4, "none, here, there, none"
 
 
-def test_where_a_target_is_believed_to_be_is_drawn_until_it_is_seen(
+def test_where_a_target_is_believed_to_be_is_drawn_until_it_is_seen_or_its_planner_is_silent(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
     rig = Rig(scenario, terrain, new_recording_path(tmp_path))
     told = Believed(
         target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
     )
-    rig.play([(NS_PER_S // 2, told), (2 * NS_PER_S, msgspec.structs.replace(told, cells=[], shares=b""))])
-    rig.run(3)
+    over = msgspec.structs.replace(told, cells=[], shares=b"")
+    rig.play([(NS_PER_S // 2, told), (2 * NS_PER_S, over), (3 * NS_PER_S, told)])
+    rig.run(8)  # its planner says no more
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/searched"] == 3, "none, there, none"
+    found = [len(row) for row in components(tmp_path / "run.rrd", "/world/searched")["positions"]]
+    assert found == [0, 2, 0, 2, 0]
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
@@ -453,7 +455,7 @@ def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
     script = f"""
 import time, numpy, pathlib
 from launch_scripts import parent_death
-from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.sinks import Sinks
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from shared_map.terrain.terrain import terrain_of_pace
@@ -481,7 +483,7 @@ import pathlib, resource, time
 import numpy
 import rerun as rr
 from launch_scripts import parent_death
-from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace

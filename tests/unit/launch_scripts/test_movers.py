@@ -14,13 +14,6 @@ from numpy.typing import NDArray
 
 from launch_scripts.launcher.options import with_follow
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.details import (
-    FADES_S,
-    alarm_marks,
-    target_details,
-    target_labels,
-    vehicle_details,
-)
 from launch_scripts.monitor.movers.map_lines import (
     RouteLines,
     RouteNow,
@@ -31,7 +24,13 @@ from launch_scripts.monitor.movers.map_lines import (
     poles,
     rings,
 )
-from launch_scripts.monitor.movers.movers_view import SILENT_NS, Searches, searched_points
+from launch_scripts.monitor.movers.movers_view import (
+    FADES_S,
+    alarm_marks,
+    searched_points,
+    target_details,
+    target_labels,
+)
 from launch_scripts.monitor.movers.styles import (
     ALARM_COLOUR,
     HUES,
@@ -42,6 +41,7 @@ from launch_scripts.monitor.movers.styles import (
     level_for,
     shaded,
 )
+from launch_scripts.monitor.movers.vehicles_view import vehicle_details
 from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.counts import CertifiedGap
 from launch_scripts.observe.latest_state import VehicleColumns
@@ -251,18 +251,6 @@ def test_the_likelier_a_target_is_somewhere_the_less_transparent_is_that_drawn_o
     ground = mesh.place(np.array([55.0, 5.0], np.float32), np.array([25.0, 105.0], np.float32), 0.1 * mesh.scale_m)
     assert np.allclose(positions, ground)
     assert len(searched_points(mesh, [])[0]) == 0
-
-
-def test_a_search_is_drawn_until_it_is_over_or_its_planner_is_silent() -> None:
-    searches = Searches()
-    assert searches.take_changed(0) is None
-    searches.hear(believed([1], [1.0]), 0)
-    searches.hear(believed([2], [1.0], "t1"), NS_PER_S)
-    assert [each.target for each in searches.take_changed(NS_PER_S) or ()] == ["t0", "t1"]
-    assert searches.take_changed(2 * NS_PER_S) is None
-    assert [each.target for each in searches.take_changed(SILENT_NS) or ()] == ["t1"]
-    searches.hear(believed([], [], "t1"), SILENT_NS)
-    assert searches.take_changed(SILENT_NS) == []
 
 
 def test_nobody_there_is_nothing_to_draw() -> None:
