@@ -21,11 +21,9 @@ WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 
 _MAP = (0.046, 0.058, 0.552, 0.776)
 """Left, bottom, width and height of the map at most, as shares of the page."""
-_LEGEND_IN, _BELOW_IN = 0.62, 1.35
-_BESIDE = ("states", "totals", "gaps", "waiting", "growing", "messages")
-_BELOW = ("shares", "timings")
-_BESIDE_TALL = ("states", "totals", "gaps", "waiting", "messages", "timings")
-"""Plots beside the map and below it; beside one that leaves no room below."""
+_BESIDE = ("states", "totals", "gaps", "waiting", "messages", "timings")
+"""Plots beside the map; the page of the run has all."""
+_COUNTS = ("captures", "marks", "reroute_requests", "routes_served")
 
 
 def save_picture(path: Path, ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> None:
@@ -41,33 +39,16 @@ def draw(ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> Fi
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), dpi=DPI, facecolor="white")
     _draw_head(figure, report)
     draw_map(figure.add_axes(_MAP), ground, tracks, report)
-    grid = tracks.grid
-    map_in = min(_MAP[2] * WIDTH_IN * grid.rows / grid.cols, _MAP[3] * HEIGHT_IN)
-    left_in = _MAP[3] * HEIGHT_IN - map_in - _LEGEND_IN
-    room_below = left_in > _BELOW_IN + 0.25
-    _draw_beside(figure, report, _BESIDE if room_below else _BESIDE_TALL)
-    if room_below:
-        high_in = min(left_in - 0.25, 1.9)
-        for n, name in enumerate(_BELOW):
-            axes = figure.add_axes((_MAP[0] + 0.292 * n, _MAP[1], 0.26, (high_in - 0.35) / HEIGHT_IN))
-            draw_plot(axes, _plot(name), report)
-    return figure
-
-
-def _draw_beside(figure: Figure, report: dict[str, Any], names: tuple[str, ...]) -> None:
     left, width, top, bottom, gap = 0.655, 0.297, 0.818, 0.058, 0.052
-    height = (top - bottom - gap * (len(names) - 1)) / len(names)
-    plots = [_plot(name) for name in names]
+    height = (top - bottom - gap * (len(_BESIDE) - 1)) / len(_BESIDE)
+    plots = [next(plot for plot in PLOTS if plot.name == name) for name in _BESIDE]
     last = max(n for n, plot in enumerate(plots) if plot.over_time)
     for n, plot in enumerate(plots):
         axes = figure.add_axes((left, top - height - n * (height + gap), width, height))
         draw_plot(axes, plot, report)
         if plot.over_time:
             axes.tick_params(axis="x", labelbottom=n == last)
-
-
-def _plot(name: str) -> Any:
-    return next(plot for plot in PLOTS if plot.name == name)
+    return figure
 
 
 def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
@@ -76,21 +57,14 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
     figure.text(0.033, 0.936, "   ·   ".join(_facts(report)), fontsize=9, color=FAINT, va="center")
     gap = report["certified_gap"]
     tiles = [
-        *(
-            (fact(name).label, count(report[name]), INK)
-            for name in ("captures", "marks", "reroute_requests", "routes_served")
-        ),
+        *((fact(name).label, count(report[name]), INK) for name in _COUNTS),
         ("certified gap, mean", percent(gap["mean"]), INK),
         ("certified gap, p95", percent(gap["p95"]), INK),
         ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), INK),
         ("route query, p99", duration(report["route_query_ms"]["p99"]), INK),
         *(
-            (label, count(report[name]), RED if report[name] else GREEN)
-            for name, label in (
-                ("collisions", "collisions"),
-                ("lethal_entries", "lethal entries"),
-                ("lost", "lost"),
-            )
+            (name.replace("_", " "), count(report[name]), RED if report[name] else GREEN)
+            for name in ("collisions", "lethal_entries", "lost")
         ),
     ]
     for y in (0.918, 0.853):
@@ -105,20 +79,15 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
 
 def _facts(report: dict[str, Any]) -> list[str]:
     seconds, scale = report["seconds"], report["time_scale"]
-    return [
-        fact
-        for fact in (
-            f"scenario {report['scenario']}",
-            f"run {report['run_id']}" if report["run_id"] else "",
-            f"seed {report['seed']}",
-            "" if seconds is None else f"{seconds:.0f} s" + (f" at {scale:g} x real motion" if scale != 1 else ""),
-            _several(report["processes"], "process", "processes"),
-            _several(report["restarts"], "restart", "restarts"),
-            "" if report["startup_s"] is None else f"all running after {report['startup_s']:.1f} s",
-        )
-        if fact
-    ]
-
-
-def _several(count: int | None, one: str, many: str) -> str:
-    return "" if count is None else f"{count} {one if count == 1 else many}"
+    facts = [f"scenario {report['scenario']}"]
+    if report["run_id"]:
+        facts.append(f"run {report['run_id']}")
+    facts.append(f"seed {report['seed']}")
+    if seconds is not None:
+        facts.append(f"{seconds:.0f} s" + (f" at {scale:g} x real motion" if scale != 1 else ""))
+    for name, one in (("processes", "process"), ("restarts", "restart")):
+        if report[name] is not None:
+            facts.append(f"{report[name]} {one if report[name] == 1 else name}")
+    if report["startup_s"] is not None:
+        facts.append(f"all running after {report['startup_s']:.1f} s")
+    return facts

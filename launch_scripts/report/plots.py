@@ -23,7 +23,6 @@ from launch_scripts.observe.palette import (
     GREEN,
     INK,
     ORANGE,
-    SKY,
     STATE_COLOURS,
     VIOLET,
 )
@@ -91,25 +90,33 @@ def _states(axes: Axes, report: Report) -> bool:
     return True
 
 
+def _line(colour: str, label: str, width: float = _WIDE, dash: Any = "solid") -> Line2D:
+    """A line of a plot and of its legend: one look for both."""
+    return Line2D([], [], color=colour, linewidth=width, linestyle=dash, label=label)
+
+
+def _look(line: Line2D) -> dict[str, Any]:
+    return {"color": line.get_color(), "linewidth": line.get_linewidth(), "linestyle": line.get_linestyle()}
+
+
 def _totals(axes: Axes, report: Report) -> bool:
-    (mark_s, marks), (capture_s, captures) = told(report, "marks"), told(report, "captures")
-    handles = []
-    if len(captures):
-        axes.step(capture_s, captures, where="post", color=GREEN, linewidth=2.0)
-        axes.set_ylim(0, max(captures.max() * 1.08, 1))
-        _whole(axes)
-        handles.append(Line2D([], [], color=GREEN, linewidth=2.0, label="captures"))
-    if len(marks):
-        right = axes.twinx()
-        right.plot(mark_s, marks, color=VIOLET, linewidth=_WIDE, linestyle=(0, (4, 1.2)))
-        right.set_ylim(0, max(marks.max() * 1.08, 1))
-        right.grid(False)
-        right.tick_params(axis="y", colors=VIOLET, length=0)
-        _whole(right)
-        right.spines[["top", "left", "right"]].set_visible(False)
-        handles.append(Line2D([], [], color=VIOLET, linewidth=_WIDE, linestyle=(0, (3, 1)), label="marks (right)"))
-    legend_above(axes, handles)
-    return bool(handles)
+    captures, marks = _line(GREEN, "captures", 2.0), _line(VIOLET, "marks (right)", dash="--")
+    right = axes.twinx()
+    right.grid(False)
+    right.tick_params(axis="y", colors=VIOLET, length=0)
+    right.spines[["top", "left", "right"]].set_visible(False)
+    shown = []
+    for name, line, where in (("captures", captures, axes), ("marks", marks, right)):
+        times, values = told(report, name)
+        if len(values):
+            where.step(times, values, where="post", **_look(line))
+            where.set_ylim(0, max(values.max() * 1.08, 1))
+            _whole(where)
+            shown.append(line)
+        elif where is right:
+            right.set_axis_off()
+    legend_above(axes, shown)
+    return bool(shown)
 
 
 def _gaps(axes: Axes, report: Report) -> bool:
@@ -117,64 +124,58 @@ def _gaps(axes: Axes, report: Report) -> bool:
     if not len(mean):
         return False
     mean, p95 = (np.maximum(values - 1, 0) * 100 for values in (mean, p95))
+    whole = report["certified_gap"]
+    lines = [
+        _line(BLUE, f"mean {percent(whole['mean'])}", 2.0),
+        _line(ORANGE, f"p95 {percent(whole['p95'])}", 1.3),
+    ]
     dots: dict[str, Any] = {"marker": "o", "markersize": 2.2} if len(mean) < 80 else {}
     axes.fill_between(time_s, mean, p95, color=ORANGE, alpha=0.2, linewidth=0)
-    axes.plot(p95_s, p95, color=ORANGE, linewidth=1.3, clip_on=False, **dots)
-    axes.plot(time_s, mean, color=BLUE, linewidth=2.0, clip_on=False, **dots)
-    show_percent(axes, float(p95.max()))
+    for line, times, values in zip(lines, (time_s, p95_s), (mean, p95), strict=True):
+        axes.plot(times, values, clip_on=False, **_look(line), **dots)
+    axes.set_ylim(0, max(float(p95.max()) * 1.12, 0.1))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
     if p95.max() < _SHOWN_PERCENT:
         _say(axes, f"all below {_SHOWN_PERCENT:g}%: as good as optimal")
-    whole = report["certified_gap"]
-    legend_above(
-        axes,
-        [
-            Line2D([], [], color=BLUE, linewidth=2.0, label=f"mean {percent(whole['mean'])}"),
-            Line2D([], [], color=ORANGE, linewidth=1.3, label=f"p95 {percent(whole['p95'])}"),
-        ],
-    )
+    legend_above(axes, lines)
+    return True
+
+
+def _courses(axes: Axes, report: Report, **lines: Line2D) -> bool:
+    """Series over time, the area below the first one filled."""
+    values = {name: told(report, name) for name in lines}
+    times, first = next(iter(values.values()))
+    if not len(first):
+        return False
+    axes.fill_between(times, first, color=next(iter(lines.values())).get_color(), alpha=0.3, linewidth=0)
+    for name, line in lines.items():
+        axes.plot(*values[name], **_look(line))
+    axes.set_ylim(0, max(max(row.max(initial=0) for _, row in values.values()) * 1.12, 1e-3))
+    _whole(axes)
+    if len(lines) > 1:
+        legend_above(axes, lines.values())
     return True
 
 
 def _waiting(axes: Axes, report: Report) -> bool:
-    (wait_s, waiting), (stand_s, standing) = told(report, "waiting_at_once"), told(report, "standing_at_once")
-    if not len(waiting):
-        return False
-    axes.fill_between(wait_s, waiting, color=ORANGE, alpha=0.35, linewidth=0)
-    axes.plot(wait_s, waiting, color=ORANGE, linewidth=_WIDE)
-    axes.plot(stand_s, standing, color=BLUE, linewidth=1.4, linestyle=(0, (4, 1.2)))
-    axes.set_ylim(0, max(waiting.max(), standing.max(), 0.9) * 1.1)
-    if not waiting.any() and not standing.any():
+    waiting, standing = _line(ORANGE, "for a route"), _line(BLUE, "with a route", 1.4, "--")
+    measured = _courses(axes, report, waiting_at_once=waiting, standing_at_once=standing)
+    if measured and axes.get_ylim()[1] < 0.1:
+        axes.set_ylim(0, 1)
         _say(axes, "nobody waited")
-    legend_above(
-        axes,
-        [
-            Line2D([], [], color=ORANGE, linewidth=_WIDE, label="for a route"),
-            Line2D([], [], color=BLUE, linewidth=1.4, linestyle=(0, (3, 1)), label="with a route"),
-        ],
-    )
-    return True
+    return measured
 
 
 def _growing(axes: Axes, report: Report) -> bool:
-    time_s, growth_ms = told(report, "growth_ms_mean")
-    if not len(growth_ms):
-        return False
-    axes.plot(time_s, growth_ms, color=GREEN, linewidth=_WIDE)
-    axes.set_ylim(0, max(growth_ms.max() * 1.15, 1e-3))
+    measured = _courses(axes, report, growth_ms_mean=_line(GREEN, "growth"))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _tick_ms(value) if value else "0"))
-    return True
+    return measured
 
 
 def _messages(axes: Axes, report: Report) -> bool:
-    time_s, rate = told(report, "messages_per_s")
-    if not len(rate):
-        return False
-    axes.fill_between(time_s, rate, color=SKY, alpha=0.35, linewidth=0)
-    axes.plot(time_s, rate, color=BLUE, linewidth=_WIDE)
-    axes.set_ylim(0, rate.max() * 1.12 or 1)
-    _whole(axes)
-    return True
+    return _courses(axes, report, messages_per_s=_line(BLUE, "messages"))
 
 
 # --- of all -----------------------------------------------------------------------------------------------------
@@ -188,12 +189,10 @@ def _shares(axes: Axes, report: Report) -> bool:
     if not routes:
         return False
     least, most = 0.01, 100.0
-    edges = np.concatenate(
-        [[least], np.clip(100 * excess[:, 0], least, None), [max(most, 100 * excess[:, 0].max(initial=0))]]
-    )
+    above = np.clip(100 * excess[:, 0], least, None)
+    edges = np.concatenate([[least], above, [above.max(initial=most)]])
     below = np.concatenate([[0.0], np.cumsum(excess[:, 1]), [excess[:, 1].sum()]]) / routes * 100
-    at_least = below[edges <= least][-1]
-    below[edges <= least] = at_least
+    below[edges <= least] = below[edges <= least][-1]
     axes.set_xscale("log")
     axes.fill_between(edges, below, step="post", color=BLUE, alpha=0.2, linewidth=0)
     axes.step(edges, below, where="post", color=BLUE, linewidth=2.0)
@@ -204,7 +203,7 @@ def _shares(axes: Axes, report: Report) -> bool:
     axes.xaxis.set_major_locator(LogLocator(numticks=6))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    legend_above(axes, [Line2D([], [], color=BLUE, linewidth=2.0, label=f"of {routes:,.0f} routes")])
+    legend_above(axes, [_line(BLUE, f"of {routes:,.0f} routes", 2.0)])
     return True
 
 
@@ -259,50 +258,21 @@ _BUCKET = math.log(1.04)
 
 PLOTS = (
     Plot("states", "Vehicles", "What the vehicles were doing.", _states),
-    Plot(
-        "totals",
-        "Captures and marks",
-        "Captures of all targets, and what vehicles found that the map did not know.",
-        _totals,
-    ),
-    Plot(
-        "gaps",
-        "Certified gap",
-        "How far above the optimum the routes that vehicles began can be at most: each comes with a proven lower "
-        "bound.",
-        _gaps,
-    ),
-    Plot(
-        "waiting",
-        "Waiting",
-        "How many vehicles waited at the same time: for a route, or with one, as where others pass.",
-        _waiting,
-    ),
+    Plot("totals", "Captures and marks",
+         "Captures of all targets, and what vehicles found that the map did not know.", _totals),
+    Plot("gaps", "Certified gap",
+         "How far above the optimum the routes that vehicles began can be at most: each comes with a proven lower "
+         "bound.", _gaps),
+    Plot("waiting", "Waiting",
+         "How many vehicles waited at the same time: for a route, or with one, as where others pass.", _waiting),
     Plot("growing", "Growing a tree", "Time of the last growth of a tree, mean over targets.", _growing),
     Plot("messages", "Messages per second", "Of all processes together.", _messages),
-    Plot(
-        "shares",
-        "Routes within a gap",
-        "Share of the routes that are proven to be at most so far above the optimum.",
-        _shares,
-        over_time=False,
-    ),
-    Plot(
-        "timings",
-        "How long it takes",
-        "Distributions on a logarithmic scale; the line is the median.",
-        _timings,
-        over_time=False,
-    ),
-)
+    Plot("shares", "Routes within a gap",
+         "Share of the routes that are proven to be at most so far above the optimum.", _shares, over_time=False),
+    Plot("timings", "How long it takes",
+         "Distributions on a logarithmic scale; the line is the median.", _timings, over_time=False),
+)  # fmt: skip
 """All plots, in the order in which they are shown."""
-
-
-def show_percent(axes: Axes, most: float) -> None:
-    """A vertical axis of percentages from 0 to a little above the largest."""
-    axes.set_ylim(0, max(most * 1.12, 0.1))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
 
 
 def legend_above(axes: Axes, handles: Iterable[Any]) -> None:
@@ -321,15 +291,11 @@ def legend_above(axes: Axes, handles: Iterable[Any]) -> None:
 
 def _whole(axes: Axes) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    axes.yaxis.set_major_formatter(FuncFormatter(compact))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda n, _: f"{n / 1000:g}k" if abs(n) >= 1000 else f"{n:g}"))
 
 
 def _say(axes: Axes, text: str) -> None:
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=FAINT, fontsize=9)
-
-
-def compact(value: float, _: object = None) -> str:
-    return f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"
 
 
 def _tick_ms(value: float, _: object = None) -> str:
