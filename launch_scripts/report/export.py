@@ -159,20 +159,17 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
             f"--out: a {path.suffix} needs pyogrio and shapely: pip install 'terrain-swarm[vectors]'"
         ) from error
     degrees = form.degrees and frame.grid.crs != "local"
-    fields, name, options = dict(layer.fields), layer.name, {"DESCRIPTION": layer.about or layer.name}
+    options, more = {"DESCRIPTION": layer.about or layer.name}, dict[str, tuple[FieldKind, Value]]()
     match form.driver:
         case "GeoJSON":
-            layer = _with_names(layer)
-            fields = {"layer": "text", **fields, **({"times": "json"} if _is_timed(layer) else {})}
+            more = {"layer": ("text", layer.name), **({"times": ("json", None)} if _is_timed(layer) else {})}
             options["COORDINATE_PRECISION"] = "8" if degrees else "3"
         case "LIBKML":
-            layer = _with_names(layer)
-            fields = {**fields, "tessellate": "flag", "altitudeMode": "text"}
-            options = {}
+            more, options = {"tessellate": ("flag", 1), "altitudeMode": ("text", "clampToGround")}, {}
         case "GPX":
-            layer = _gpx_points(layer)
-            fields, name = dict(layer.fields), layer.name
-            options = {}
+            layer, options = _gpx_points(layer), {}
+    fields = {name: kind for name, (kind, _) in more.items()} | dict(layer.fields)
+    columns = [_column(layer, name, kind, more.get(name, ("text", None))[1]) for name, kind in fields.items()]
     made = {"Point": shapely.points, "LineString": shapely.linestrings, "Polygon": shapely.polygons}[layer.shape]
     shapes = np.empty(len(layer.features), object)
     for n, feature in enumerate(layer.features):
@@ -196,9 +193,9 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
                 path,
                 # Borders against the clock, holes with it, as RFC 7946 has it.
                 shapely.to_wkb(shapely.orient_polygons(shapes), output_dimension=3 if high else 2),
-                [_column(layer, name, kind) for name, kind in fields.items()],
+                columns,
                 list(fields),
-                layer=name,
+                layer=layer.name,
                 driver=form.driver,
                 geometry_type=f"{layer.shape} Z" if high else layer.shape,
                 crs=crs,
@@ -214,20 +211,6 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
 
 def _is_timed(layer: Layer) -> bool:
     return any(each.time_ns is not None for each in layer.features)
-
-
-def _with_names(layer: Layer) -> Layer:
-    """The layer with what GeoJSON and KML have beside its fields: its name, times, and how KML lays it down."""
-    more: dict[str, Value] = {"layer": layer.name, "tessellate": 1, "altitudeMode": "clampToGround"}
-    features = [
-        Feature(
-            each.parts,
-            {**each.values, **more, "times": None if each.time_ns is None else list(map(iso_time, each.time_ns))},
-            each.time_ns,
-        )
-        for each in layer.features
-    ]
-    return Layer(layer.name, layer.shape, layer.fields, features, layer.about)
 
 
 def _gpx_points(layer: Layer) -> Layer:
@@ -269,8 +252,10 @@ def _places_of(layer: Layer) -> Layer:
     return points
 
 
-def _column(layer: Layer, name: str, kind: FieldKind) -> NDArray[Any]:
-    values = [feature.values.get(name) for feature in layer.features]
+def _column(layer: Layer, name: str, kind: FieldKind, default: Value) -> NDArray[Any]:
+    values: list[Any] = [feature.values.get(name, default) for feature in layer.features]
+    if name == "times":
+        values = [None if each.time_ns is None else list(map(iso_time, each.time_ns)) for each in layer.features]
     match kind:
         case "text":
             return np.array(values, object)

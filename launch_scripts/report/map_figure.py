@@ -18,6 +18,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import (
@@ -194,7 +195,8 @@ def _draw_coordinates(axes: Axes, grid: GridSpec) -> None:
         (axes.set_xticks, east_km, lon, "EW"),
         (axes.set_yticks, south_km[::-1], lat[::-1], "NS"),
     ):
-        ticks = _round_steps(float(degrees.min()), float(degrees.max()), 4)
+        low, high = float(degrees.min()), float(degrees.max())
+        ticks = [tick for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high]
         texts = [_degrees(value, names) for value in ticks]
         set_ticks(np.interp(ticks, degrees, km), texts, fontsize=7.5)
     axes.tick_params(axis="both", length=2.5, width=0.7, pad=2, labelsize=7.5)
@@ -205,13 +207,6 @@ def _draw_coordinates(axes: Axes, grid: GridSpec) -> None:
 def _degrees(value: float, names: str) -> str:
     value = (value + 180) % 360 - 180
     return f"{abs(value):.6g}° {names[0] if value >= 0 else names[1]}"
-
-
-def _round_steps(low: float, high: float, many: int) -> list[float]:
-    """About so many round values from low to high."""
-    step = round_length((high - low) / many * 1.6)
-    first = math.ceil(low / step)
-    return [n * step for n in range(first, math.floor(high / step) + 1)]
 
 
 def draw_scale_bar(axes: Axes, width: float, height: float, unit_m: float = 1000.0) -> None:

@@ -36,9 +36,10 @@ from launch_scripts.report.map_figure import (
 )
 from launch_scripts.report.plots import PLOTS, draw_plot
 from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, read_tracks
-from launch_scripts.report.write_report import TABLES
+from launch_scripts.report.write_report import TABLES, flat
 from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.errors import StoreError
+from swarm.grid import GridSpec
 
 PAGE_FILE = "report.html"
 _NOTES_SHOWN = 400
@@ -158,21 +159,19 @@ def _timing(report: Mapping[str, Any], name: str, label: str, meaning: str) -> C
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     """What went wrong, the serious first: a line, whether it is serious, and the lines that it stands for."""
-    places: dict[int, str] = {}
-    told: list[Alarm] = []
-    for row in report.get("alarms") or []:
-        alarm = Alarm(row["kind"], row["about"], row["text"], row["since_s"], row["over_s"], target=row["target"])
-        places[id(alarm)] = "" if row["row"] is None else f"row {row['row']}, col {row['col']}"
-        told.append(alarm)
-
-    def line(alarm: Alarm) -> str:
-        parts = (f"{alarm.label}: {alarm.text}", places[id(alarm)], alarm.when)
-        return ", ".join(part for part in parts if part)
-
+    size = report.get("terrain") or {}
+    grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
+    told = [
+        Alarm(
+            row["kind"], row["about"], row["text"], row["since_s"], row["over_s"],
+            None if row["row"] is None else row["row"] * grid.cols + row["col"], row["target"],
+        )
+        for row in report.get("alarms") or []
+    ]  # fmt: skip
     groups = [
-        (together(group), group[0].serious, [line(alarm) for alarm in group])
+        (together(group), group[0].serious, [alarm.line(grid) for alarm in group])
         if len(group) > 1
-        else (line(group[0]), group[0].serious, [])
+        else (group[0].line(grid), group[0].serious, [])
         for group in grouped(told)
     ]
     return sorted(groups, key=lambda group: not group[1])
@@ -200,10 +199,10 @@ _COLUMNS = {
     "distance_m": "driven, km",
     "waiting_s": "waited, s",
     "standing_s": "stood, s",
-    "gap_mean": "gap, mean",
-    "gap_p95": "gap, p95",
-    "gap_max": "gap, max",
-    "unproven": "unproven",
+    "certified_gap_mean": "gap, mean",
+    "certified_gap_p95": "gap, p95",
+    "certified_gap_max": "gap, max",
+    "certified_gap_unproven": "unproven",
     "growths": "growths",
     "window_growths": "windows",
     "chased_by_at_end": "chased by, at the end",
@@ -215,7 +214,7 @@ _TEXTS = ("group", "class", "state_at_end", "target_at_end")
 
 
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:
-    rows = {id: _row(row) for id, row in (report.get(section) or {}).items()}
+    rows = {id: flat(id, row) for id, row in (report.get(section) or {}).items()}
     columns = [name for name in _COLUMNS if any(name in row for row in rows.values())]
     shown = list(rows.items())[:_ROWS_SHOWN]
     return {
@@ -227,21 +226,11 @@ def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, A
     }
 
 
-def _row(row: Mapping[str, Any]) -> dict[str, Any]:
-    gap = row.get("certified_gap") or {}
-    flat = {name: value for name, value in row.items() if name != "certified_gap"}
-    return {
-        **flat,
-        **{f"gap_{name}": gap.get(name) for name in ("mean", "p95", "max")},
-        "unproven": gap.get("unproven"),
-    }
-
-
 def _cell(name: str, value: Any) -> tuple[str, Any]:
     """Its text, and what it is sorted by."""
     if value is None:
         return "–", ""
-    if name.startswith("gap_"):
+    if name in ("certified_gap_mean", "certified_gap_p95", "certified_gap_max"):
         return percent(value), value
     if name == "distance_m":
         return f"{value / 1000:,.2f}", value
