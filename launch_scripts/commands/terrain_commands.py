@@ -392,8 +392,7 @@ def classify(
 
 
 def _compare(terrain: Terrain, path: Path) -> None:
-    from shared_map.importers.classify import class_readings, confusion, held_out
-    from shared_map.importers.labels import read_labels
+    from shared_map.importers.cover.classify import class_readings, confusion, held_out, read_labels
 
     labels = read_labels(path, terrain.grid)
     inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)

@@ -96,7 +96,7 @@ def add(
     checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
 
     def of_file(frame: MapFrame) -> Iterable[ZoneOrder]:
-        from shared_map.importers.vector_shapes import outlines_of
+        from shared_map.importers.zones.vector_shapes import outlines_of
 
         outlines = outlines_of(file, frame.grid, layer, crs, MOST_CORNERS)
         several = len(outlines) > 1 and name

@@ -41,7 +41,7 @@ from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, TABLE
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.prepared_classes import prepare_classes
-from shared_map.terrain.store import load_prepared_homes, load_terrain, load_truth, prepare, scenario_key
+from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
@@ -170,7 +170,7 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
-        homes = load_prepared_homes(self._run_dir, scenario_key(self._scenario))
+        homes = load_beside(self._run_dir, "homes", scenario_key(self._scenario))
         check_places(self._scenario, self._terrain, self._truth, homes)
         self.begun = True
         records = self._options.records

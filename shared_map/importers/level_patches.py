@@ -174,20 +174,13 @@ def _labelled(
 
 
 def _connected(count: int, one: NDArray[np.int32], other: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Of each of `count` runs the least number of those that it is connected with, over pairs that touch.
+    """Of each of `count` runs the number of its patch, by pairs of runs that touch; patches come as their first
+    runs do."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
-    Roots are hooked onto lower ones and paths are halved, as Shiloach and Vishkin do it (1982): scipy's function
-    takes a matrix of the pairs, both ways.
-    """
-    root = np.arange(count, dtype=np.int32)
-    while one.size:
-        low, high = root[one], root[other]
-        apart = low != high
-        one, other, low, high = one[apart], other[apart], low[apart], high[apart]
-        np.minimum.at(root, np.maximum(low, high), np.minimum(low, high))
-        while not np.array_equal(root, halved := root[root]):
-            root = halved
-    return root
+    pairs = coo_array((np.ones(one.size, np.bool_), (one, other)), shape=(count, count))
+    return np.asarray(connected_components(pairs.tocsr(), directed=False)[1], np.int32)
 
 
 def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -16,22 +16,21 @@ from typing import Any
 import numpy as np
 
 from shared_map.arrays import Bools, Floats
-from shared_map.importers.cover_codes import TABLES, legend_of, some
-from shared_map.importers.cover_meaning import (
+from shared_map.importers.cover.cover_codes import TABLES, legend_of, some
+from shared_map.importers.cover.cover_meaning import (
     evidence_of,
     meaning_of,
     recognise,
     sampled_codes,
     sampled_colours,
 )
+from shared_map.importers.cover.land_cover import read_cover
 from shared_map.importers.encoded_heights import TITLES, Encoding, encodings_of, heights_decoded
-from shared_map.importers.georeference import crs_of, grows, overruled, plan_grid, warped
-from shared_map.importers.land_cover import read_cover
-from shared_map.importers.level_ground import MOST_SAMPLED, looked_at
-from shared_map.importers.metric_grids import nearest
+from shared_map.importers.georeference import crs_of, overruled, plan_grid
+from shared_map.importers.level_ground import MOST_SAMPLED, looked_at, without
+from shared_map.importers.onto_grid import grows, nearest, warped
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
-from shared_map.importers.source import Source
-from shared_map.importers.voids import without
+from shared_map.importers.sources import Source
 from shared_map.terrain.row_bands import Progress, bands
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError

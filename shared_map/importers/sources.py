@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
-from msgspec.structs import replace
 
-from shared_map.arrays import Bools, Floats
-from shared_map.importers.metric_grids import from_degrees, from_metres, nearest
+from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.importers.onto_grid import from_degrees, from_metres, nearest
 from shared_map.importers.raster_files import is_raster
-from shared_map.importers.source import Source, classified, with_photo, with_water, without_voids
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
@@ -22,6 +22,34 @@ from swarm.grid import GridSpec
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
 SYNTHETIC_RESOLUTION_M = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Everything known about the ground on one grid.
+
+    elevation_m  float32 (rows, cols), m; NaN is a void
+    classes      uint8 (rows, cols), TerrainClass
+    readings     uint8 (rows, cols), which classes an unknown cell may be, bits of `layers.READABLE`; 0 where none
+                 is known; None if nobody looked
+    photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
+    drawn        that the photo's own pixels are those of a drawn map, for people; None if they may be a photo's
+    factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
+    level        bool (rows, cols), level ground as the file has it, before any resampling; None if nobody looked
+    notes        where it comes from and what was done to it, for people
+    """
+
+    grid: GridSpec
+    elevation_m: Floats
+    classes: Bytes
+    _: KW_ONLY
+    readings: Bytes | None = None
+    photo: Bytes | None = None
+    seen: Bools | None = None
+    drawn: str | None = None
+    factor: Floats | None = None
+    level: Bools | None = None
+    notes: tuple[str, ...] = ()
 
 
 def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
@@ -68,7 +96,7 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
     source = with_water(source, config)
     if config.cover is not None:
-        from shared_map.importers.land_cover import with_cover
+        from shared_map.importers.cover.land_cover import with_cover
 
         source = with_cover(source, config, progress)
     return source
@@ -76,11 +104,15 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
 
 def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
     """The settings with a photo that is a drawn map of land cover named as such."""
-    from shared_map.importers.cover_meaning import is_drawn
+    from shared_map.importers.cover.cover_meaning import is_drawn
 
     if config.photo is None or config.cover is not None or config.labels is not None:
         return config
-    return replace(config, photo=None, cover=config.photo) if is_drawn(Path(config.photo), config) else config
+    return (
+        msgspec.structs.replace(config, photo=None, cover=config.photo)
+        if is_drawn(Path(config.photo), config)
+        else config
+    )
 
 
 # --- built in -----------------------------------------------------------------------------------------------
@@ -177,8 +209,7 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _looked_at(stored: Floats, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.importers.level_ground import looked_at
-    from shared_map.importers.voids import without
+    from shared_map.importers.level_ground import looked_at, without
 
     scale = config.height_scale or 1.0
     voids, level, told = looked_at(stored, config, scale)
@@ -241,3 +272,83 @@ FILE_KINDS = ", ".join(_READERS)
 def is_terrain(path: Path) -> bool:
     """Whether a file is named as one that holds a terrain, or begins as a raster."""
     return path.suffix.lower() in _READERS or is_raster(path)
+
+
+# --- what covers the ground ---------------------------------------------------------------------------------
+
+
+def without_voids(source: Source, config: TerrainConfig) -> Source:
+    """Voids counted, and filled if asked for; nothing is done in silence."""
+    from shared_map.importers.level_ground import fill_voids, voids_of
+
+    elevation_m = source.elevation_m
+    if not elevation_m.flags.writeable:
+        elevation_m = elevation_m.copy()
+    count = voids_of(elevation_m)
+    if count == 0:
+        return replace(source, elevation_m=elevation_m)
+    share = count / elevation_m.size
+    if share == 1.0:
+        raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
+    if config.nodata == "fill":
+        note = f"{count} voids ({share:.1%}) filled from their surroundings"
+        return replace(source, elevation_m=fill_voids(elevation_m), notes=(*source.notes, note))
+    hint = "; crop the file, or set terrain.nodata = 'fill'" if share > 0.05 else ""
+    note = f"{count} voids ({share:.1%} of the cells) are lethal{hint}"
+    return replace(source, elevation_m=elevation_m, notes=(*source.notes, note))
+
+
+def with_water(source: Source, config: TerrainConfig) -> Source:
+    """What is level in the file, or lower than the scenario says, is water where nothing else shows what it is."""
+    water = np.zeros(source.classes.shape, np.bool_)
+    if source.level is not None and config.level_is == "water":
+        water |= source.level
+    notes = source.notes
+    if config.water_below_m is not None:
+        with np.errstate(invalid="ignore"):
+            low = source.elevation_m < np.float32(config.water_below_m)
+        water |= low
+        notes = (*notes, f"{low.mean():.1%} of the cells are lower than {config.water_below_m:g} m: water")
+    classes = source.classes.copy()
+    classes[water & (classes == TerrainClass.UNKNOWN)] = TerrainClass.WATER
+    return replace(source, classes=classes, notes=notes)
+
+
+def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    from shared_map.importers.cover.photos import read_photo
+
+    photo = read_photo(path, source.grid, config.crs, progress)
+    notes = (*source.notes, str(path), *photo.notes)
+    return replace(source, photo=photo.rgb, seen=photo.seen, drawn=photo.drawn, notes=notes)
+
+
+def classified(source: Source, config: TerrainConfig, progress: Progress) -> Source:
+    from shared_map.importers.cover.classify import class_readings, learnt
+    from shared_map.importers.cover.photos import why_not_true_colour
+
+    assert source.photo is not None
+    inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
+    seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
+    other = source.drawn or why_not_true_colour(source.photo, seen)
+    if config.labels is None and other is not None:
+        note = (
+            f"the photo is {other}; no classes are read from it: give a true-colour one, terrain.labels, or its"
+            " codes as terrain.cover"
+        )
+        return replace(source, notes=(*source.notes, note))
+    readings = None
+    if config.labels is None:
+        classes, readings = class_readings(*inputs, source.seen, progress)
+        doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
+        note = (
+            f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
+            " exposed a little differently, is unknown and costs what the dearest of these classes does: see"
+            " terrain.labels and cost.class_factor.unknown"
+        )
+    else:
+        from shared_map.importers.cover.classify import read_labels
+
+        labels = read_labels(Path(config.labels), source.grid)
+        classes = learnt(*inputs, labels.classes, source.seen, progress)
+        note = f"classes from the photo, learnt from {labels.count} labels"
+    return replace(source, classes=classes, readings=readings, notes=(*source.notes, note))

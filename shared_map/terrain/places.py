@@ -69,11 +69,6 @@ def middles_of(grid: GridSpec, cells: ArrayLike) -> NDArray[np.float64]:
     return np.array([x_m, y_m], np.float64)
 
 
-def latitudes_of(grid: GridSpec, cells: ArrayLike) -> NDArray[np.float64]:
-    """float64 (2, n): latitude and longitude of the middles of cells, degrees. The terrain has a place."""
-    return MapFrame(grid).to_degrees(*middles_of(grid, cells))
-
-
 def _moved(source: Any, target: Any, xs: ArrayLike, ys: ArrayLike) -> NDArray[np.float64]:
     """float64 (2, n): NaN where a system says that there is no such place."""
     from rasterio._err import CPLE_BaseError

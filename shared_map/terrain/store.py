@@ -153,22 +153,14 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
     )
 
 
-def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
-    """The truth beside a prepared terrain; None if there is none."""
+def load_beside(folder: Path, name: str, key: str = "") -> NDArray[Any] | None:
+    """The "truth", or "homes" (`homes_of` terrain and truth), that `save_prepared` left beside a terrain, mapped
+    read-only; None if it is not there."""
     meta = read_meta(folder / _META, key)
-    if meta is None:
+    if meta is None or name not in meta["arrays"]:
         return None
     grid = GridSpec(**meta["grid"])
-    return read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
-
-
-def load_prepared_homes(folder: Path, key: str = "") -> Bools | None:
-    """`homes_of` a prepared terrain and its truth, mapped read-only; None if they are not there."""
-    meta = read_meta(folder / _META, key)
-    if meta is None or "homes" not in meta["arrays"]:
-        return None
-    grid = GridSpec(**meta["grid"])
-    return read_array(folder, "homes", (grid.rows, grid.cols), np.bool_)
+    return read_array(folder, name, (grid.rows, grid.cols), np.bool_ if name == "homes" else np.float32)
 
 
 def read_meta(meta_file: Path, key: str) -> dict[str, Any] | None:
@@ -209,21 +201,19 @@ def load_terrain(setup: RoleSetup) -> Terrain:
 
 
 def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
-    """The truth of a run, as `load_terrain`."""
-    if setup.run_dir is not None:
-        truth = load_prepared_truth(setup.run_dir, scenario_key(setup.scenario))
-        if truth is not None:
-            return truth
-    return build_truth(setup.scenario, terrain)
+    """The truth of a run, as `load_terrain`. The caller must not write to it."""
+    found = _beside(setup, "truth")
+    return build_truth(setup.scenario, terrain) if found is None else found
 
 
 def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
-    """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
-    if setup.run_dir is not None:
-        homes = load_prepared_homes(setup.run_dir, scenario_key(setup.scenario))
-        if homes is not None:
-            return homes
-    return homes_of(terrain.pace_s_per_m, truth)
+    """`homes_of` the terrain and truth of a run, as `load_terrain`. The caller must not write to it."""
+    found = _beside(setup, "homes")
+    return homes_of(terrain.pace_s_per_m, truth) if found is None else found
+
+
+def _beside(setup: RoleSetup, name: str) -> NDArray[Any] | None:
+    return None if setup.run_dir is None else load_beside(setup.run_dir, name, scenario_key(setup.scenario))
 
 
 def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
@@ -237,7 +227,7 @@ def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) 
         give_back_memory()
         if kept is not None:
             keep(kept, [folder / _META, *folder.glob("*.npy")])
-    mapped, truth = load_prepared(folder, key), load_prepared_truth(folder, key)
+    mapped, truth = load_prepared(folder, key), load_beside(folder, "truth", key)
     if mapped is None or truth is None:
         raise TerrainError(f"the prepared terrain in {folder} has gone: it is another run's; start again")
     return mapped, truth

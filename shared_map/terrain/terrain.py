@@ -40,7 +40,7 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
-    from shared_map.importers.source import Source
+    from shared_map.importers.sources import Source
 
 FORMAT = 5
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""

@@ -20,7 +20,7 @@ from swarm.places import corners_of, extent_of
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
-    from shared_map.importers.zone_files import Burnt, FileFacts
+    from shared_map.importers.zones.zone_files import Burnt, FileFacts
 
 PREFERRED_FACTOR = np.float32(0.5)
 ROUGH_FACTOR = np.float32(2.0)
@@ -89,20 +89,8 @@ class ZoneFacts:
             "lethal_share": round(self.lethal / cells, 6),
         }
         if self.file is not None:
-            file = self.file
-            facts |= {
-                "file": file.file,
-                "layer": file.layer,
-                "crs": file.crs,
-                "features": file.features,
-                "used": file.used,
-                "outside": file.outside,
-                "skipped": dict(file.skipped),
-                "skipped_ids": file.named,
-                "mended_ids": file.mended,
-                "bridges": file.bridges,
-                "classes": dict(file.classes),
-            }
+            named = {"named": "skipped_ids", "mended": "mended_ids"}
+            facts |= {named.get(name, name): value for name, value in vars(self.file).items()}
         return facts
 
 
@@ -181,7 +169,7 @@ class _Painter:
     def read(self, zone: ZoneConfig, where: str) -> _Painted:
         """What a zone covers."""
         if zone.file is not None:
-            from shared_map.importers.zone_files import burn_zone
+            from shared_map.importers.zones.zone_files import burn_zone
 
             burnt = burn_zone(zone, self._grid, f"{where} {zone.called!r}")
             cells = int((~np.isnan(burnt.values[1])).sum()) + int(burnt.lethal[1].sum())

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from shared_map.importers.labels import read_labels
+from shared_map.importers.cover.classify import read_labels
 from shared_map.importers.sources import load_source
 from shared_map.keeper.export import from_json
 from swarm.config.ground import TerrainConfig

@@ -14,7 +14,7 @@ from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial
 from shared_map.class_grounds import class_grounds
-from shared_map.terrain.air_floor import clearance_floor
+from shared_map.terrain.air import clearance_floor
 from swarm.config.load import parse_scenario
 from swarm.wire.messages.orders import ZoneOrder
 from vehicle_agent.service import AgentService

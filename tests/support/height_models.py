@@ -9,8 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from shared_map.arrays import Floats
-from shared_map.importers.source import Source
-from shared_map.importers.sources import load_source
+from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig
 

@@ -386,7 +386,7 @@ def _cells_of(zone: ZoneConfig, grid: GridSpec) -> NDArray[np.int64]:
     path = Path(zone.file)
     if zone.kind == "road" or not path.exists() or path.stat().st_size > _LARGEST_FILE:
         return np.empty(0, np.int64)
-    from shared_map.importers.zone_files import burn_zone
+    from shared_map.importers.zones.zone_files import burn_zone
 
     burnt = burn_zone(zone, grid, f"zone {zone.called!r}")
     inside = np.zeros((grid.rows, grid.cols), np.bool_)

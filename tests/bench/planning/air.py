@@ -15,7 +15,7 @@ from bench.harness import Seed, benchmark, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.arrays import Floats
-from shared_map.terrain.air_floor import AirGround, Flight, air_ground, clearance_floor, grade_of
+from shared_map.terrain.air import AirGround, Flight, air_ground, clearance_floor, grade_of
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import PlannerConfig, Scenario

@@ -13,11 +13,9 @@ from scipy import ndimage
 from skimage.draw import line
 
 from shared_map.arrays import Bytes, Floats
-from shared_map.importers.classify import class_readings, confusion, held_out, learnt
-from shared_map.importers.labels import Labels, read_labels
-from shared_map.importers.photo_rules import box_sum
-from shared_map.importers.source import Source
-from shared_map.importers.sources import load_source
+from shared_map.importers.cover.classify import Labels, class_readings, confusion, held_out, learnt, read_labels
+from shared_map.importers.cover.photo_rules import box_sum
+from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import counted, looked_up
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo

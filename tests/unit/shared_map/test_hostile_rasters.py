@@ -12,9 +12,8 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from shared_map.importers.level_ground import level_ground
+from shared_map.importers.level_ground import level_ground, undeclared_voids
 from shared_map.importers.sources import load_source
-from shared_map.importers.voids import undeclared_voids
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 

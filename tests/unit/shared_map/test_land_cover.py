@@ -12,8 +12,15 @@ import rasterio
 from rasterio.transform import from_origin
 from support.height_models import SIDE, hills, load, written
 
-from shared_map.importers.cover_codes import NO_COLOUR, NOTHING, SAME_COLOUR, TABLES, legend_codes, read_cover_table
-from shared_map.importers.land_cover import read_cover
+from shared_map.importers.cover.cover_codes import (
+    NO_COLOUR,
+    NOTHING,
+    SAME_COLOUR,
+    TABLES,
+    legend_codes,
+    read_cover_table,
+)
+from shared_map.importers.cover.land_cover import read_cover
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig

@@ -14,7 +14,7 @@ from rasterio.transform import Affine, from_origin
 from rasterio.warp import transform as to_crs
 from support.zone_shapes import UTM, feature, geojson, middles, painted, written
 
-from shared_map.importers.vector_shapes import outlines_of
+from shared_map.importers.zones.vector_shapes import outlines_of
 from shared_map.terrain.layers import polygon_mask
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError

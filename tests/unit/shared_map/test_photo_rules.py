@@ -11,11 +11,16 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.importers import photo_rules
-from shared_map.importers.classify import class_readings
-from shared_map.importers.photo_roads import line_strength
-from shared_map.importers.photo_rules import CLASS_OF_READINGS, EXPOSURES, Features, ground_readings
-from shared_map.importers.source import Source, classified
+from shared_map.importers.cover import photo_rules
+from shared_map.importers.cover.classify import class_readings
+from shared_map.importers.cover.photo_rules import (
+    CLASS_OF_READINGS,
+    EXPOSURES,
+    Features,
+    ground_readings,
+    line_strength,
+)
+from shared_map.importers.sources import Source, classified
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from shared_map.importers.plain_grids import read_pgm
-from shared_map.importers.source import Source
-from shared_map.importers.sources import load_source
+from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario

@@ -10,7 +10,7 @@ import pytest
 from shared_map import class_grounds as module
 from shared_map.class_grounds import class_grounds, class_terrains, class_truths
 from shared_map.prepared_classes import load_classes, prepare_classes
-from shared_map.terrain.store import load_prepared_homes, prepare, scenario_key
+from shared_map.terrain.store import load_beside, prepare, scenario_key
 from swarm.config.load import parse_scenario
 from swarm.errors import TerrainError
 from swarm.runtime.role import RoleSetup
@@ -39,8 +39,8 @@ def test_what_is_prepared_is_what_would_be_made(
     monkeypatch.setattr(module, "build_terrain", None)  # nothing is built twice
     load_classes(RoleSetup(scenario, "run", "agent", "a0", 1, 1, run_dir=tmp_path), again)
     found = class_grounds(scenario, again, truth_again)
-    assert np.array_equal(load_prepared_homes(tmp_path, scenario_key(scenario)), made["ground"].homes)
-    assert load_prepared_homes(tmp_path, "another") is None
+    assert np.array_equal(load_beside(tmp_path, "homes", scenario_key(scenario)), made["ground"].homes)
+    assert load_beside(tmp_path, "homes", "another") is None
     assert list(found) == list(made) == ["ground", "walker"]
     for name, ground in found.items():
         for array in ("truth", "homes"):

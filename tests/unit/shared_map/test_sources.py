@@ -14,8 +14,7 @@ from rasterio.transform import Affine, from_origin
 
 from launch_scripts.commands.terrain_commands import info
 from shared_map.importers.georeference import metres_per_degree
-from shared_map.importers.source import Source
-from shared_map.importers.sources import FILE_KINDS, load_source
+from shared_map.importers.sources import FILE_KINDS, Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.explain import meanings

@@ -14,8 +14,8 @@ from scipy import ndimage
 
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.store import (
+    load_beside,
     load_prepared,
-    load_prepared_truth,
     load_terrain,
     load_truth,
     prepare,
@@ -74,7 +74,7 @@ def test_a_prepared_terrain_is_the_same_and_loads_in_a_blink(tmp_path: Path) -> 
     assert (again.grid, again.digest, again.notes) == (terrain.grid, terrain.digest, terrain.notes)
     for name in ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(terrain, name))
-    np.testing.assert_array_equal(load_prepared_truth(tmp_path / "run"), truth)
+    np.testing.assert_array_equal(load_beside(tmp_path / "run", "truth"), truth)
     assert again.vehicle_radius_m == 40.0
     assert (terrain.ground_s_per_m != terrain.pace_s_per_m).any()
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 from support.effort import few
 
-from shared_map.terrain.places import MapFrame, latitudes_of
+from shared_map.terrain.places import MapFrame, middles_of
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import zone_mask
 from swarm.client.frame import Frame
@@ -198,7 +198,7 @@ def test_a_scenario_takes_places_and_says_which_is_none() -> None:
     assert [cell_of(place, ALPS, "cells") for place in scenario.groups[0].cells] == [82, 244, 1539]
     (zone,) = scenario.cost.zones
     inside = zone_mask(zone, ALPS.grid)
-    lat, lon = latitudes_of(ALPS.grid, np.arange(ALPS.grid.cells)).reshape(2, 60, 80)
+    lat, lon = MapFrame(ALPS.grid).to_degrees(*middles_of(ALPS.grid, np.arange(ALPS.grid.cells))).reshape(2, 60, 80)
     expected = (lat <= 46.95) & (lon <= 9.01) & (lat >= 46.95 - (lon - 9.0) / 2)
     assert inside.sum() > 400
     assert (inside != expected).sum() <= 3

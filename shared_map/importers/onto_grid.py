@@ -1,17 +1,120 @@
-"""Heights in an array, put on a square metric grid without rasterio: the demo builds its ground in a second."""
+"""Rasters and arrays of heights brought onto the square metric grid of a terrain."""
 
 from __future__ import annotations
 
 import math
+import os
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
-from shared_map.importers.georeference import equidistant, metres_per_degree
+from shared_map.importers.georeference import bounds_in, crs_name, crs_of, equidistant, metres_per_degree, pixel_m
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
+
+# --- rasters ------------------------------------------------------------------------------------------------
+
+
+def transform_of(grid: GridSpec, row0: int = 0) -> Any:
+    """The affine transform from (col, row) of a grid, counted from a row on, to metres."""
+    from rasterio.transform import from_origin
+
+    north = grid.north_m - row0 * grid.resolution_m
+    return from_origin(grid.west_m, north, grid.resolution_m, grid.resolution_m)
+
+
+def grows(dataset: Any, transform: Any, crs: Any, grid: GridSpec, target: Any) -> bool:
+    """True if the grid is at least half as coarse again as the file: then its cells are averaged or counted."""
+    width, height = pixel_m(transform, dataset.height, dataset.width, crs, target)
+    return grid.resolution_m >= 1.5 * max(width, height)
+
+
+def warped(
+    source: Any, onto: NDArray[Any], grid: GridSpec, crs: Any, target: Any, how: str, row0: int = 0, **given: Any
+) -> NDArray[Any]:
+    """Brings a raster onto rows of a grid, in place.
+
+    Parameters
+    ----------
+    source : rasterio.Band or array (rows, cols)
+        An array needs its `src_transform`.
+    onto : array (rows, grid.cols)
+        Cells that the source does not reach become `dst_nodata`, or stay as they are.
+    crs, target : rasterio.CRS
+        Of the source and of the grid.
+    how : str
+        The name of one of rasterio's resamplings.
+    row0 : int
+        Row of the grid that is the first of `onto`.
+    **given
+        For `rasterio.warp.reproject`.
+    """
+    from rasterio.warp import Resampling, reproject
+
+    place = {"src_crs": crs, "dst_crs": target, "dst_transform": transform_of(grid, row0)}
+    reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=os.cpu_count() or 1)
+    return onto
+
+
+def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str) -> tuple[Any, Any, float]:
+    """How a file comes onto the terrain's grid.
+
+    Returns
+    -------
+    crs, target : rasterio.CRS or None
+        Of the file and of the grid; None, None if its pixels are the terrain's cells.
+    share : float
+        Share of the terrain within the file's frame.
+
+    Raises TerrainError if one of the two has no place on Earth and they differ in size, the file does not say in
+    which system it is (nor does `given`), or does not overlap the terrain.
+    """
+    import rasterio
+
+    same_shape = (dataset.height, dataset.width) == (grid.rows, grid.cols)
+    if not (dataset.crs or not dataset.transform.is_identity) or grid.crs == "local":
+        if not same_shape:
+            raise TerrainError(
+                f"{what} has {dataset.height} x {dataset.width} pixels and no place in common with the terrain of"
+                f" {grid.rows} x {grid.cols} cells; georeference both, or make them the same size"
+            )
+        return None, None, 1.0
+    crs = crs_of(dataset.crs, given if not dataset.crs else None, what)
+    target = rasterio.CRS.from_user_input(grid.crs)
+    share = overlap(dataset, crs, target, grid, what)
+    if crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3):
+        return None, None, share
+    return crs, target, share
+
+
+def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+    """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+    except (RasterioError, CPLE_BaseError) as error:
+        names = crs_name(crs), crs_name(target)
+        raise TerrainError(
+            f"{what} is in {names[0]}, from which no way leads to the terrain's {names[1]}"
+        ) from error
+    grid_east = grid.west_m + grid.cols * grid.resolution_m
+    grid_south = grid.north_m - grid.rows * grid.resolution_m
+    wide = min(east, grid_east) - max(west, grid.west_m)
+    high = min(north, grid.north_m) - max(south, grid_south)
+    if wide <= 0 or high <= 0:
+        raise TerrainError(
+            f"{what} does not overlap the terrain: it covers x {west:.7g}..{east:.7g}, y {south:.7g}..{north:.7g},"
+            f" the terrain x {grid.west_m:.7g}..{grid_east:.7g}, y {grid_south:.7g}..{grid.north_m:.7g}"
+        )
+    return wide * high / (grid.rows * grid.cols * grid.resolution_m**2)
+
+
+# --- arrays, without rasterio: the demo builds its ground in a second ------------------------------------------
+
 
 Steps = tuple[float, float]
 """Width and height of a cell."""

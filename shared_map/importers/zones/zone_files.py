@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from shared_map.arrays import Bools, Floats
-from shared_map.importers.burn import Drawing, burn, burn_mask
-from shared_map.importers.raster_files import is_raster
-from shared_map.importers.vector_files import (
+from shared_map.importers.georeference import crs_name, system_named
+from shared_map.importers.onto_grid import grows, overlap, warped
+from shared_map.importers.raster_files import is_raster, opened
+from shared_map.importers.zones.burn import Drawing, burn, burn_mask
+from shared_map.importers.zones.vector_files import (
     Features,
     Layer,
     columns_of,
@@ -23,8 +26,8 @@ from shared_map.importers.vector_files import (
     open_layer,
     read_features,
 )
-from shared_map.importers.vector_shapes import Placing, Shapes
-from shared_map.importers.way_classes import (
+from shared_map.importers.zones.vector_shapes import Placing, Shapes
+from shared_map.importers.zones.way_classes import (
     COLUMNS,
     PACKED,
     TAGS,
@@ -39,7 +42,7 @@ from shared_map.importers.way_classes import (
 )
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
-from swarm.grid import GridSpec, Window
+from swarm.grid import MAX_CELLS, GridSpec, Window
 
 _WIDEST_M = 1000.0
 """Lines that run so far outside the terrain are of no use to it."""
@@ -252,7 +255,7 @@ class _Worth:
 
 def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt:
     """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
-    from shared_map.importers.friction import values_on
+    from shared_map.importers.zones.zone_files import values_on
 
     what = f"{where} {path}"
     if zone.kind not in ("pace", "factor"):
@@ -277,3 +280,46 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     window, empty = grid.window, Window(0, 0, 0, 0)
     nothing: Any = np.zeros((0, 0), np.bool_)
     return Burnt(facts, (window, values), (window, lethal), (empty, nothing))
+
+
+# --- rasters onto the grid ------------------------------------------------------------------------------------
+
+
+def values_on(path: Path, grid: GridSpec, crs: str | None, where: str) -> tuple[Floats, str]:
+    """The first band of a raster on a grid, float32, NaN where it has no value, and the name of its system. The
+    nearest cell counts, or the mean where cells of the grid are half as large again.
+
+    crs  its system, where the file does not say it; "local" is that of a terrain without a place
+
+    Raises TerrainError if it cannot be read, has several bands, or does not touch the grid.
+    """
+    import rasterio
+
+    what = f"{where} {path}"
+    with opened(path, where) as dataset:
+        if dataset.count != 1:
+            raise TerrainError(f"{what} has {dataset.count} bands, expected one")
+        if np.dtype(dataset.dtypes[0]).kind not in "iuf":
+            raise TerrainError(f"{what} holds {dataset.dtypes[0]} values, expected whole or real numbers")
+        if dataset.height * dataset.width > MAX_CELLS:
+            raise TerrainError(
+                f"{what} has {dataset.height} x {dataset.width} pixels; at most {MAX_CELLS} are read"
+            )
+        own = dataset.crs if crs in (None, "local") else system_named(str(crs), f"{what}: crs")
+        if crs == "local":
+            own = rasterio.CRS.from_epsg(3857)  # metres of the terrain's own map: which one does not matter
+        elif own is None:
+            raise TerrainError(f"{what} does not say in which coordinate system it is; set crs, or 'local'")
+        elif grid.crs == "local":
+            raise TerrainError(f"{what} is in {crs_name(own)}, and the terrain has no place; set crs = 'local'")
+        target = own if crs == "local" else rasterio.CRS.from_user_input(grid.crs)
+        overlap(dataset, own, target, grid, what)
+        stored: Floats = dataset.read(1).astype(np.float32)
+        stored[dataset.read_masks(1) == 0] = np.nan
+        stored *= np.float32(dataset.scales[0] or 1.0)
+        stored += np.float32(dataset.offsets[0] or 0.0)
+        how = "average" if grows(dataset, dataset.transform, own, grid, target) else "nearest"
+        values = np.full((grid.rows, grid.cols), np.nan, np.float32)
+        place = {"src_transform": dataset.transform, "src_nodata": math.nan, "dst_nodata": math.nan}
+        warped(stored, values, grid, own, target, how, **place)
+        return values, "local" if crs == "local" else crs_name(own)

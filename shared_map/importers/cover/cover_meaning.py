@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.importers.cover_codes import (
+from shared_map.importers.cover.cover_codes import (
     LEAST_DISTINCT,
     MOST_COLOURS,
     OTHERS,

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.importers.cover_codes import HIGHEST_CODE, NOTHING, CoverTable, joined, some
-from shared_map.importers.cover_meaning import Meaning, meaning_of, why_unknown
-from shared_map.importers.georeference import grows, place_on, warped
+from shared_map.importers.cover.cover_codes import HIGHEST_CODE, NOTHING, CoverTable, joined, some
+from shared_map.importers.cover.cover_meaning import Meaning, meaning_of, why_unknown
+from shared_map.importers.onto_grid import grows, place_on, warped
 from shared_map.importers.raster_files import READ_ROWS, opened
-from shared_map.importers.source import Source
+from shared_map.importers.sources import Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.ground import TerrainConfig

@@ -6,25 +6,37 @@ never water. So water must be level, smooth and bluish or nearly black, and is g
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.importers.photo_roads import COARSEST_M, REACH, line_strength, long_lines
-from shared_map.importers.photo_rules import (
+from shared_map.importers.cover.photo_rules import (
     CERTAIN,
     CLASS_OF_READINGS,
+    COARSEST_M,
     LIKELY,
+    REACH,
     SHORE_GRADE,
     STILL,
     ground_readings,
+    line_strength,
+    long_lines,
     tiles,
     water_signs,
 )
-from shared_map.terrain.layers import TerrainClass, spread
+from shared_map.terrain.layers import TerrainClass, polygon_mask, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
+from swarm.config.input_files import FileKind, parse_toml, read_text
+from swarm.config.values import ClassName, Point, Polygon, Section
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
 
 LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
 """Standard deviation of a lake's heights: metres of the survey, and per metre of cell for the bank in a cell at the
@@ -270,3 +282,82 @@ def confusion(true: Bytes, predicted: Bytes) -> NDArray[np.int64]:
     counts = np.zeros((max(TerrainClass) + 1,) * 2, np.int64)
     np.add.at(counts, (true, predicted), 1)
     return counts
+
+
+# --- labels ---------------------------------------------------------------------------------------------------
+
+
+class Label(Section, frozen=True, kw_only=True, rename={"kind": "class"}):
+    """A polygon, or points, of one class."""
+
+    kind: ClassName
+    polygon_m: Polygon | None = None
+    points_m: Annotated[tuple[Point, ...], Meta(max_length=10_000)] = ()
+
+
+class _File(Section, frozen=True, kw_only=True):
+    labels: Annotated[tuple[Label, ...], Meta(min_length=1, max_length=10_000)]
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Labels on a grid.
+
+    classes  uint8 (rows, cols), TerrainClass; UNKNOWN where there is no label
+    groups   int32 (rows, cols), number of the polygon or point; -1 where there is none
+    count    how many polygons and points there are
+    """
+
+    classes: Bytes
+    groups: NDArray[np.int32]
+    count: int
+
+
+def read_labels(path: Path, grid: GridSpec) -> Labels:
+    """Labels of a file on a grid; of labels that overlap, the later one counts.
+
+    Parameters
+    ----------
+    path : Path
+        TOML, as the head of this module shows it.
+    grid : GridSpec
+        Of the terrain; metres in the file count from its north-west corner.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read or is not as it must be, if a label covers no cell, or if all labels left are of
+        one class.
+    """
+    raw = parse_toml(read_text(path, FileKind.LABELS), f"labels {path}", TerrainError)
+    try:
+        found = msgspec.convert(raw, _File)
+    except msgspec.ValidationError as error:
+        raise TerrainError(f"labels {path}: {error}") from error
+    classes = np.zeros((grid.rows, grid.cols), np.uint8)
+    groups = np.full((grid.rows, grid.cols), -1, np.int32)
+    count = 0
+    for n, label in enumerate(found.labels):
+        kind = TerrainClass[label.kind.upper()]
+        covered = False
+        for place in _places(label, grid):
+            covered = covered or bool(classes[place].size)
+            classes[place], groups[place] = kind, count
+            count += 1
+        if not covered:
+            raise TerrainError(f"labels {path}: label {n} ({label.kind}) covers no cell of the terrain")
+    if len(np.unique(classes[groups >= 0])) < 2:
+        raise TerrainError(f"labels {path}: all labels are of one class; two are needed to tell them apart")
+    return Labels(classes, groups, count)
+
+
+def _places(label: Label, grid: GridSpec) -> Iterator[tuple[slice, slice] | NDArray[np.bool_]]:
+    """Indices of the cells of each point, its eight neighbours included, and of the polygon."""
+    for east_m, south_m in label.points_m:
+        col, row = int(east_m // grid.resolution_m), int(south_m // grid.resolution_m)
+        if grid.inside(row, col):
+            yield slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2)
+        else:
+            yield slice(0), slice(0)
+    if label.polygon_m is not None:
+        yield polygon_mask(label.polygon_m, grid)

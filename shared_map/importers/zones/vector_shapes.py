@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.importers.georeference import bounds_in, crs_name, is_local, system_named
-from shared_map.importers.vector_files import Features, Layer, open_layer, read_features
+from shared_map.importers.zones.vector_files import Features, Layer, open_layer, read_features
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
-from shared_map.importers.georeference import grows, place_on, warped
+from shared_map.importers.onto_grid import grows, place_on, warped
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError

@@ -101,7 +101,7 @@ def ground_of(value: CoverGround, name: str = "", colour: Rgb | None = None) -> 
 
 
 def _built_in() -> tuple[dict[str, CoverTable], dict[str, frozenset[int]]]:
-    tables = tomllib.loads((Path(__file__).parent / "tables" / "land_cover.toml").read_text(encoding="utf-8"))
+    tables = tomllib.loads((Path(__file__).parent / "land_cover.toml").read_text(encoding="utf-8"))
     others = {title: frozenset(codes) for title, codes in tables.pop("others").items()}
     grounds: dict[str, dict[int, Ground]] = {
         key: {

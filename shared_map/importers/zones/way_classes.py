@@ -29,7 +29,7 @@ class Way:
 
 
 def _built_in() -> dict[Kind, dict[str, Way]]:
-    tables = tomllib.loads((Path(__file__).parent / "tables" / "ways.toml").read_text(encoding="utf-8"))
+    tables = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
     kinds: tuple[Kind, ...] = ("road", "water")
     return {
         kind: {
