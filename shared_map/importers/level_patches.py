@@ -179,7 +179,7 @@ def _connected(count: int, one: NDArray[np.int32], other: NDArray[np.int32]) -> 
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    pairs = coo_array((np.ones(one.size, np.bool_), (one, other)), shape=(count, count))
+    pairs = coo_array((np.ones(one.size, np.uint8), (one, other)), shape=(count, count))
     return np.asarray(connected_components(pairs.tocsr(), directed=False)[1], np.int32)
 
 
