@@ -18,8 +18,8 @@ from swarm.config.explain import choice
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from launch_scripts.replay.run import Replayed
     from launch_scripts.report.compare import LeftRun
+    from launch_scripts.simulation.replay import Replayed
     from swarm.recording.replaying import Difference
 
 app = typer.Typer()
@@ -193,8 +193,8 @@ def replay(
     """
     from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_folder import find_run
-    from launch_scripts.replay.run import keep as keep_recorded
-    from launch_scripts.replay.run import other_versions, recordings_of, replay_run, unreadable
+    from launch_scripts.simulation.replay import keep as keep_recorded
+    from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
 
     logging.getLogger().addHandler(logging.NullHandler())  # what the processes logged is in their own logs
     folder = find_run(run, runs)

@@ -9,6 +9,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,9 +24,9 @@ from swarm.errors import ConfigError, StoreError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from launch_scripts.simulation.study.run import Sweep
     from launch_scripts.simulation.study.summary import Summary
-    from launch_scripts.simulation.study.trial import Result, Trial
+    from launch_scripts.simulation.study.sweep import Sweep
+    from launch_scripts.simulation.study.trials import Result, Trial
     from launch_scripts.simulation.trial import Verdict
 
 app = typer.Typer()
@@ -220,10 +221,13 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     """Runs what a study lacks, and prints its summary. True if every trial has a result and no law broke."""
     from rich.console import Console
 
-    from launch_scripts.simulation.study.needs import check_installed
     from swarm.config.input_files import quoted
 
-    check_installed()
+    for package in ("distributed", "pyarrow"):
+        if find_spec(package) is None:
+            raise ConfigError(
+                f"swarm sweep needs {package}, which is not installed: pip install 'terrain-swarm[sweep]'"
+            )
     if scheduler is not None and workers is not None:
         raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
     if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:
@@ -231,9 +235,9 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
             f"--scheduler: found {quoted(scheduler)}, expected an address such as tcp://127.0.0.1:8786"
         )
     from launch_scripts.simulation.study.cluster import cores
-    from launch_scripts.simulation.study.run import Sweep
     from launch_scripts.simulation.study.study import study_path
     from launch_scripts.simulation.study.summary import as_json as told
+    from launch_scripts.simulation.study.sweep import Sweep
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -306,8 +310,8 @@ def _print_summary(summary: Summary, folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from launch_scripts.simulation.study.page import between, number
-    from launch_scripts.simulation.study.run import PAGE, RESULTS
+    from launch_scripts.simulation.study.summary_page import between, number
+    from launch_scripts.simulation.study.sweep import PAGE, RESULTS
 
     console = Console(highlight=False, markup=False, emoji=False)
     several = len({case.scenario for case in summary.cases}) > 1

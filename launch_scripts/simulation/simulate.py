@@ -6,10 +6,12 @@ with the same versions. Only `SimulationResult.wall_s` is measured on a real clo
 
 from __future__ import annotations
 
+import contextlib
 import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from hashlib import blake2s
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -18,7 +20,6 @@ import msgspec
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED, RunObserver
 from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, planner_spec, processes_of, spec_of
-from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
 from shared_map.arrays import Floats
@@ -36,6 +37,55 @@ from swarm.wire.access import Authenticator
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
 from swarm.wire.topics import GIVE_ORDER, ZONES
+
+
+class EventLog:
+    """The event log of a simulation: a line per delivery and per fault.
+
+        0.301200000 agent-a0 > planner-t3 route 5f3a9c01
+        4.000000000 crash planner-t3
+
+    Seconds since the start, source, destination, topic, digest of the payload. Two runs are equal if their logs
+    are. Counts deliveries, and writes them if there is a file. A full disk cuts the log, not the simulation."""
+
+    def __init__(self, began_ns: int, out: TextIO | None) -> None:
+        self.deliveries = 0
+        self._began_ns = began_ns
+        self._out = out
+        self.cut: str | None = None
+        """Why the log has no end; None if it is whole."""
+
+    def delivery(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
+        self.deliveries += 1
+        if self._out is not None:
+            digest = blake2s(payload, digest_size=4).hexdigest()
+            self._write(f"{self._seconds(now_ns)} {source} > {destination} {topic} {digest}\n")
+
+    def event(self, now_ns: int, what: str, whom: str) -> None:
+        if self._out is not None:
+            self._write(f"{self._seconds(now_ns)} {what} {whom}\n")
+
+    def flush(self) -> None:
+        """Write what waits."""
+        self._write("")
+
+    def _write(self, line: str) -> None:
+        if self._out is None:
+            return
+        try:
+            self._out.write(line)
+            if not line:
+                self._out.flush()
+        except OSError as error:
+            out, self._out = self._out, None
+            self.cut = error.strerror or str(error)
+            with contextlib.suppress(OSError):  # with what it could not write
+                out.close()
+
+    def _seconds(self, now_ns: int) -> str:
+        whole, rest = divmod(now_ns - self._began_ns, NS_PER_S)
+        return f"{whole}.{rest:09d}"
+
 
 BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5

@@ -9,9 +9,8 @@ from typing import Any
 import msgspec
 
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of
-from launch_scripts.simulation.body_law import BodyLaw
 from launch_scripts.simulation.faults import FaultPlan, random_plan
-from launch_scripts.simulation.laws import Laws, Routed, Waits, missing, replica_of
+from launch_scripts.simulation.laws import BodyLaw, Laws, Routed, Waits, missing, replica_of
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import world
 from planner_service.search.target_search import LISTEN_NS

@@ -15,11 +15,9 @@ from support.small_study import STUDY, dies_of_seed_one, write_study
 
 from launch_scripts.simulation.study import cluster
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
-from launch_scripts.simulation.study.plan import plan, trials_of
-from launch_scripts.simulation.study.run import RESULTS, Sweep
-from launch_scripts.simulation.study.store import ResultStore
-from launch_scripts.simulation.study.study import load_study
-from launch_scripts.simulation.study.trial import run_trial
+from launch_scripts.simulation.study.study import load_study, plan, trials_of
+from launch_scripts.simulation.study.sweep import RESULTS, ResultStore, Sweep
+from launch_scripts.simulation.study.trials import run_trial
 from swarm.errors import BusError
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(280)]
@@ -76,7 +74,12 @@ def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_pa
     words = [*COMMAND, "sweep", str(path), "--workers", "1", "--out", str(out)]
     running = subprocess.Popen(words, stderr=subprocess.PIPE, start_new_session=True, text=True)
     try:
-        wait_until(lambda: any(out.glob("parts/*.parquet")) or running.poll() is not None)
+        wait_until(
+            lambda: (
+                ((out / "results.jsonl").exists() and (out / "results.jsonl").stat().st_size > 0)
+                or running.poll() is not None
+            )
+        )
         if number == signal.SIGINT:
             os.killpg(running.pid, number)  # as a terminal does
         else:

@@ -16,7 +16,7 @@ import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 from distributed.client import FutureCancelledError
 
-from launch_scripts.simulation.study.trial import Result, Trial, run_trial
+from launch_scripts.simulation.study.trials import Result, Trial, run_trial
 from swarm.errors import BusError
 
 AHEAD = 3
@@ -49,6 +49,10 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
+# Dask runs this text in each worker. A Ctrl-C reaches the whole process group; the sweep alone acts upon it.
+_DEAF_TO_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+
+
 @contextlib.contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """A cluster of so many processes, all on loopback. One that dies is started again; all end with the block."""
@@ -63,7 +67,7 @@ def local_client(workers: int) -> Iterator[Client]:
             memory_limit=0,  # a limit would kill what a plain loop lets run
             local_directory=folder,
             silence_logs=logging.CRITICAL,
-            preload="launch_scripts.simulation.study.worker_process",
+            preload=_DEAF_TO_CTRL_C,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):

@@ -1,19 +1,84 @@
-"""What a study found: each outcome of each case with its interval, and the trials in which a law broke."""
+"""The findings of a study: each outcome of each case with its 95 % interval, and the trials in which a law
+broke."""
 
 from __future__ import annotations
 
+import math
 import shlex
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
+from scipy import stats
 
-from launch_scripts.simulation.study import statistics
-from launch_scripts.simulation.study.plan import PlannedCase
-from launch_scripts.simulation.study.statistics import Estimate
-from launch_scripts.simulation.study.study import Study
-from launch_scripts.simulation.study.trial import Result, Trial
+from launch_scripts.simulation.study.study import PlannedCase, Study
+from launch_scripts.simulation.study.trials import Result, Trial
 from launch_scripts.simulation.trial import SECONDS
+
+LEVEL = 0.95
+MOST_BOOTSTRAPPED = 1000
+"""Of more values than this the mean is as good as normal, and Student's t says the same in no time."""
+_RESAMPLES = 9999
+_SAME = 1e-12
+"""Values that differ by less, relative to the largest, are one: rounding."""
+METHOD = (
+    f"Intervals hold with 95 %: of means BCa bootstrap ({_RESAMPLES:,} resamples; Student's t above "
+    f"{MOST_BOOTSTRAPPED:,} values), of medians order statistics, which assume nothing, of shares Wilson's. Of one "
+    "or two values, and of medians of fewer than six, there is none. Differences are of the same seeds."
+)
+
+
+class Estimate(msgspec.Struct, frozen=True):
+    """A value, and the interval that holds it; None where there are too few values to tell."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+
+def mean(values: Sequence[float]) -> Estimate:
+    """The mean. The bootstrap draws by a fixed seed: the same values give the same interval."""
+    data = np.asarray(values, np.float64)
+    middle = float(data.mean())
+    if len(data) < 3:
+        return Estimate(middle)
+    if np.ptp(data) <= _SAME * np.abs(data).max():
+        return Estimate(middle, middle, middle)
+    if len(data) > MOST_BOOTSTRAPPED:
+        low, high = stats.t.interval(LEVEL, len(data) - 1, middle, stats.sem(data))
+        return Estimate(middle, float(low), float(high))
+    # Of values at the limits of floats there is no interval.
+    with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore", category=stats.DegenerateDataWarning):
+        found = stats.bootstrap(
+            (data,),
+            np.mean,
+            n_resamples=_RESAMPLES,
+            confidence_level=LEVEL,
+            rng=np.random.default_rng(0),
+            batch=1000,
+        ).confidence_interval
+    low, high = float(found.low), float(found.high)
+    return Estimate(middle, low, high) if math.isfinite(low) and math.isfinite(high) else Estimate(middle)
+
+
+def median(values: Sequence[float]) -> Estimate:
+    """The median, between two of the values: so many ranks from either end that the binomial law says."""
+    data = np.sort(np.asarray(values, np.float64))
+    middle = float(np.median(data))
+    # Below the rank r lie r values or more, if r of n coins show heads.
+    rank = int(stats.binom.ppf((1 - LEVEL) / 2, len(data), 0.5))
+    if rank == 0 or stats.binom.cdf(rank - 1, len(data), 0.5) > (1 - LEVEL) / 2:
+        return Estimate(middle)
+    return Estimate(middle, float(data[rank - 1]), float(data[len(data) - rank]))
+
+
+def share(hits: int, count: int) -> Estimate:
+    """The share of hits, by Wilson's interval."""
+    found = stats.binomtest(hits, count).proportion_ci(LEVEL, "wilson")
+    return Estimate(hits / count, float(found.low), float(found.high))
+
 
 OUTCOMES = {False: ("captures", "marks", "routes_served"), True: ("captures", "longest_wait_s", "routed_after_s")}
 """With faults or without: what is told where a study names no outcomes."""
@@ -94,7 +159,7 @@ def summarise(
                 label=each.case.label,
                 trials=len(pairs),
                 broken=len(failures),
-                share_broken=statistics.share(len(failures), len(pairs)) if pairs else None,
+                share_broken=share(len(failures), len(pairs)) if pairs else None,
                 outcomes={
                     name: _outcome(found, None if base is values else base[name]) for name, found in values.items()
                 },
@@ -125,9 +190,9 @@ def _outcome(values: dict[int, float], base: Mapping[int, float] | None) -> Outc
     differences = [] if base is None else [value - base[seed] for seed, value in values.items() if seed in base]
     return Outcome(
         values=values,
-        mean=statistics.mean(numbers) if numbers else None,
-        median=statistics.median(numbers) if numbers else None,
-        difference=statistics.mean(differences) if differences else None,
+        mean=mean(numbers) if numbers else None,
+        median=median(numbers) if numbers else None,
+        difference=mean(differences) if differences else None,
     )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry
 from launch_scripts.simulation.world.rovers import Rovers
 from launch_scripts.simulation.world.targets import Action, Captured, Publish, TargetWorld
-from launch_scripts.simulation.world.telling import Telling
 from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
@@ -23,6 +24,35 @@ from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, TargetPose
 from swarm.wire.messages.vehicles import Body, Fleet
 from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
+
+_MOVED_CELLS = 0.25
+_AGAIN_NS = NS_PER_S // 2
+
+
+class PoseThrottle:
+    """Of the poses of each tick lets through those of targets that have come to another cell, have moved by a
+    quarter of one, were captured, or have not been told of for half a second.
+
+    Every agent hears the poses of all targets: told ten times a second they were a fifth of all that is delivered,
+    though a target needs seconds for a cell.
+    """
+
+    def __init__(self, resolution_m: float) -> None:
+        self._moved_m = _MOVED_CELLS * resolution_m
+        self._told: dict[str, TargetPose] = {}
+
+    def is_news(self, pose: TargetPose) -> bool:
+        """Whether to tell this pose; if so, later ones are compared with it."""
+        told = self._told.get(pose.target)
+        if told is not None:
+            late = not 0 <= pose.stamp_ns - told.stamp_ns < _AGAIN_NS
+            counts = (told.incarnation, told.cell, told.captures, told.jumps)
+            changed = counts != (pose.incarnation, pose.cell, pose.captures, pose.jumps)
+            if not (late or changed or math.hypot(pose.x_m - told.x_m, pose.y_m - told.y_m) >= self._moved_m):
+                return False
+        self._told[pose.target] = pose
+        return True
+
 
 TICK_HZ = 10.0
 _ASK_NS = NS_PER_S // 2
@@ -55,7 +85,7 @@ class TargetsService:
         self._anew = setup.anew
         self._heard: set[str] = set()
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
-        self._telling = Telling(terrain.grid.resolution_m)
+        self._throttle = PoseThrottle(terrain.grid.resolution_m)
         self._planners = Roster()
         self._member.needs("the orders of this run", lambda: self._obedience.known)
         self._member.needs("places of its targets", lambda: self._world.ready)
@@ -156,7 +186,7 @@ class TargetsService:
     def _perform(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
             match action:
-                case Publish(pose) if self._telling.is_news(pose):
+                case Publish(pose) if self._throttle.is_news(pose):
                     self.counters.count("poses")
                     self._bus.publish(self._topic(pose.target), pose, target=pose.target)
                 case Captured(target, vehicle, cell):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from launch_scripts.observe.run_folder import DiskWatch
-from launch_scripts.simulation.event_log import EventLog
+from launch_scripts.simulation.simulate import EventLog
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
 

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -21,13 +20,19 @@ from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
 from launch_scripts.simulation.simulate import simulate
-from launch_scripts.simulation.study import statistics
-from launch_scripts.simulation.study.plan import plan
-from launch_scripts.simulation.study.run import Sweep
-from launch_scripts.simulation.study.store import ResultStore
-from launch_scripts.simulation.study.study import Study, cases_of, load_study, parse_study, study_names, study_path
+from launch_scripts.simulation.study import summary as statistics
+from launch_scripts.simulation.study.study import (
+    Study,
+    cases_of,
+    load_study,
+    parse_study,
+    plan,
+    study_names,
+    study_path,
+)
 from launch_scripts.simulation.study.summary import Summary
-from launch_scripts.simulation.study.trial import Result, Trial, numbers, run_trial
+from launch_scripts.simulation.study.sweep import ResultStore, Sweep
+from launch_scripts.simulation.study.trials import Result, Trial, numbers, run_trial
 from launch_scripts.simulation.trial import BrokenLaw, try_seed
 from swarm.config.load import load_scenario
 from swarm.errors import ConfigError, StoreError
@@ -43,7 +48,6 @@ def finished(path: Path, out: Path, captures: dict[int, float]) -> tuple[Sweep, 
     for number, each in enumerate(sweep.planned):
         for trial in each.trials:
             sweep.store.add(result_of(trial, captures=captures[trial.seed] + number, marks=5.0))
-    sweep.store.flush()
     return sweep, sweep.finish()
 
 
@@ -275,47 +279,43 @@ def test_results_are_read_again_as_they_were_and_of_two_with_one_key_one_is_left
     second = Result(key="b", figures={"y.z": 2.0}, broken=[BrokenLaw("l", "s")], wall_s=1.0, cpu_s=0.5)
     for each in (first, second, second):
         store.add(each)
-        store.flush()
     assert ResultStore(tmp_path).results == {"a": first, "b": second}
 
 
-def test_many_parts_become_one(tmp_path):
+def test_half_a_line_is_cut_off_and_what_comes_next_is_kept(tmp_path):
     store = ResultStore(tmp_path)
-    for n in range(70):
-        store.add(Result(key=f"{n}", figures={f"f{n % 3}": float(n)}, broken=[], wall_s=1.0, cpu_s=0.5))
-        store.flush()
+    first = Result(key="a", figures={}, broken=[], wall_s=1.0, cpu_s=0.5)
+    store.add(first)
+    with store.path.open("ab") as file:
+        file.write(b'{"key":"b","figures":{"x"')
     again = ResultStore(tmp_path)
-    assert len(list(store.folder.glob("*.parquet"))) == 1
-    assert again.results == store.results
-    assert ResultStore(tmp_path).results == store.results
-
-
-def test_a_part_that_is_damaged_is_named_and_half_a_file_is_none(tmp_path):
-    store = ResultStore(tmp_path)
-    (store.folder / "1.parquet.part").write_bytes(b"half")
-    assert ResultStore(tmp_path).results == {}
-    (store.folder / "2.parquet").write_bytes(b"PAR1 no")
-    with pytest.raises(StoreError, match=r"2\.parquet is damaged; remove it"):
-        ResultStore(tmp_path)
+    assert again.results == {"a": first}
+    second = Result(key="c", figures={}, broken=[], wall_s=1.0, cpu_s=0.5)
+    again.add(second)
+    assert ResultStore(tmp_path).results == {"a": first, "c": second}
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"key": [1]},
-        {"key": pa.array([None], pa.string())},
-        {"broken": ['["abc"]']},
-        {"broken": ["[" * 100_000]},
-        {"wall_s": ["x"]},
-        {"figure.x": ["text"]},
-        {"figure.x": [[1.0]]},
+        {"key": 1},
+        {"key": None},
+        {"broken": ["abc"]},
+        {"wall_s": "x"},
+        {"figures": {"x": "text"}},
+        {"figures": [1.0]},
     ],
 )
-def test_a_part_of_another_program_is_no_result(tmp_path, wrong):
-    store = ResultStore(tmp_path)
-    row = {"key": ["a"], "broken": ["[]"], "wall_s": [1.0], "cpu_s": [1.0], **wrong}
-    pq.write_table(pa.table(row), store.folder / "1.parquet")
-    with pytest.raises(StoreError, match=r"1\.parquet is damaged; remove it"):
+def test_a_line_of_another_program_is_no_result(tmp_path, wrong):
+    row = {"key": "a", "figures": {}, "broken": [], "wall_s": 1.0, "cpu_s": 1.0, **wrong}
+    (tmp_path / "results.jsonl").write_text(json.dumps(row) + "\n", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"line 1 is damaged; remove it"):
+        ResultStore(tmp_path)
+
+
+def test_a_line_nested_too_deeply_is_no_result(tmp_path):
+    (tmp_path / "results.jsonl").write_text('{"x":' * 100_000 + "\n", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"line 1 is damaged"):
         ResultStore(tmp_path)
 
 
@@ -359,7 +359,6 @@ def test_names_are_shown_as_they_are_whatever_they_mean_elsewhere(tmp_path, caps
     sweep = Sweep(path, out)
     for trial in sweep.missing:
         sweep.store.add(Result(key=trial.key, figures={name: 1.0}, broken=[], wall_s=1.0, cpu_s=1.0))
-    sweep.store.flush()
     assert sweep_study(str(path), None, 1, out, as_json=False)
     said = capsys.readouterr()
     assert name in said.out
@@ -399,7 +398,6 @@ def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws
     told = json.loads(capsys.readouterr().out)
     assert told["cases"][0]["outcomes"]["captures"]["values"] == {"0": 1.0, "1": 2.0, "2": 6.0}
     sweep.store.add(result_of(sweep.planned[0].trials[1], (BrokenLaw("l", "it broke", 1.0),), captures=2.0))
-    sweep.store.flush()
     assert not sweep_study(str(path), None, 1, out, as_json=False)
     shown = capsys.readouterr()
     assert "6 of 6 trials are kept from before" in shown.err

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 from support.target_reports import RES, flat, fleet
 
-from launch_scripts.simulation.world.service import TargetsService
+from launch_scripts.simulation.world.service import PoseThrottle, TargetsService
 from launch_scripts.simulation.world.targets import (
     LISTEN_NS,
     PATIENCE_NS,
@@ -22,7 +22,6 @@ from launch_scripts.simulation.world.targets import (
     Publish,
     TargetWorld,
 )
-from launch_scripts.simulation.world.telling import Telling
 from launch_scripts.simulation.world.walks import Walk
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.start_cells import homes_of
@@ -325,7 +324,7 @@ def test_a_start_nobody_can_stand_on_is_refused(start: tuple[int, int], sentence
 
 
 def test_a_pose_is_told_when_the_target_has_moved_or_was_caught_and_else_twice_a_second() -> None:
-    telling = Telling(resolution_m=10.0)
+    telling = PoseThrottle(resolution_m=10.0)
     here = TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=5, x_m=0.0, y_m=0.0)
     assert telling.is_news(here)
     for changed, news in (
@@ -339,7 +338,7 @@ def test_a_pose_is_told_when_the_target_has_moved_or_was_caught_and_else_twice_a
         ({"stamp_ns": -1}, True),  # its clock was put back
         ({"target": "u"}, True),
     ):
-        telling = Telling(resolution_m=10.0)
+        telling = PoseThrottle(resolution_m=10.0)
         telling.is_news(here)
         assert telling.is_news(msgspec.structs.replace(here, **changed)) is news
 

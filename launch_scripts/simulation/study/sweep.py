@@ -2,27 +2,80 @@
 
 from __future__ import annotations
 
-import contextlib
+import io
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow as pa
-from distributed import Client
+import pyarrow.parquet as pq
 
 from launch_scripts.observe.run_folder import write_file
-from launch_scripts.simulation.study import page, plots
+from launch_scripts.simulation.study import summary_page as page
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
-from launch_scripts.simulation.study.plan import PlannedCase, plan, trials_of
-from launch_scripts.simulation.study.store import ResultStore, figure_columns, write_table
-from launch_scripts.simulation.study.study import Study, load_study
+from launch_scripts.simulation.study.study import PlannedCase, Study, load_study, plan, trials_of
 from launch_scripts.simulation.study.summary import Summary, as_json, summarise
-from launch_scripts.simulation.study.trial import Result, Trial
+from launch_scripts.simulation.study.trials import Result, Trial
 from swarm.config.explain import nearest
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
+
+FIGURE = "figure."
+"""Begins the name of a column that holds a figure."""
+KEPT = "results.jsonl"
+
+
+class ResultStore:
+    """The results in a folder, by the key of their trial: a line of JSON each, written in one piece as it comes.
+
+    A process that is killed while it writes leaves half a line, which the next one cuts off.
+
+    results  those that were there, and those that were added
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Reads what is there. Raises StoreError."""
+        self.path = folder / KEPT
+        self.results: dict[str, Result] = {}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a+b") as file:
+                file.seek(0)
+                *lines, half = file.read().split(b"\n")
+                file.truncate(file.tell() - len(half))
+        except OSError as error:
+            raise StoreError(f"cannot use {self.path}: {error.strerror or error}") from error
+        for number, line in enumerate(lines, 1):
+            try:
+                result = msgspec.json.decode(line, type=Result)
+            except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+                damaged = f"{self.path}, line {number} is damaged; remove it, and its trial is simulated again"
+                raise StoreError(damaged) from error
+            self.results[result.key] = result
+
+    def add(self, result: Result) -> None:
+        """Keep a result. Raises StoreError."""
+        self.results[result.key] = result
+        try:
+            with self.path.open("ab", buffering=0) as file:
+                file.write(msgspec.json.encode(result) + b"\n")
+        except OSError as error:
+            raise StoreError(f"cannot write results to {self.path}: {error.strerror or error}") from error
+
+
+def write_table(path: Path, rows: Iterable[Mapping[str, Any]], schema: Mapping[str, pa.DataType]) -> None:
+    """Write rows as Parquet; columns that the schema lacks are figures. Raises OSError."""
+    rows = list(rows)
+    figures = sorted({name for row in rows for name in row if name not in schema})
+    columns = {**schema, **dict.fromkeys(figures, pa.float64())}
+    table = pa.table({name: pa.array([row.get(name) for row in rows], kind) for name, kind in columns.items()})
+    content = io.BytesIO()
+    pq.write_table(table, content, compression="zstd")
+    write_file(path, content.getvalue())
+
 
 RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"
 SETTING = "set."
@@ -72,15 +125,12 @@ class Sweep:
         """
         if not self.missing:
             return
-        with _client(workers, scheduler) as client:
-            try:
-                for trial, result in run_trials(client, self.missing):
-                    if result is not None:
-                        self._look(result)
-                        self.store.add(result)
-                    told(trial, result)
-            finally:
-                self.store.flush()
+        with local_client(workers) if scheduler is None else client_of(scheduler) as client:
+            for trial, result in run_trials(client, self.missing):
+                if result is not None:
+                    self._look(result)
+                    self.store.add(result)
+                told(trial, result)
 
     def finish(self) -> Summary:
         """Write the results, scenarios and summary. Raises StoreError."""
@@ -94,9 +144,9 @@ class Sweep:
                 text = f"# {self.planned[number].case.label}\n{scenario_text(scenario, Path.cwd())}"
                 write_file(self._scenario_file(number), text.encode())
             write_table(self.folder / RESULTS, self._rows(), {**_SCHEMA, **_setting_types(self.planned)})
-            pictures = {name: plots.file_name(name) for name in plots.drawn(summary)}
+            pictures = {name: page.file_name(name) for name in page.drawn(summary)}
             for name, file in pictures.items():
-                write_file(self.folder / file, plots.draw(summary.cases, name))
+                write_file(self.folder / file, page.draw(summary.cases, name))
             write_file(self.folder / PAGE, page.document(summary, pictures).encode())
             write_file(self.folder / NUMBERS, (json.dumps(as_json(summary), indent=1) + "\n").encode())
         except OSError as error:
@@ -139,14 +189,8 @@ class Sweep:
                     "version": trial.version,
                     "key": trial.key,
                     **settings,
-                    **figure_columns(result),
+                    **{f"{FIGURE}{name}": value for name, value in result.figures.items()},
                 }
-
-
-@contextlib.contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
-    with local_client(workers) if scheduler is None else client_of(scheduler) as client:
-        yield client
 
 
 def _needs_file(each: PlannedCase) -> bool:

@@ -1,1 +1,0 @@
-"""Recorded processes of a run, fed to the services of this build."""
