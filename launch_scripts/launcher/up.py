@@ -142,8 +142,8 @@ class _Run:
         self._routed = False
         """Whether a route was served."""
         self._up_at_s: float | None = None
-        self._web_port = 0
         """When the swarm was whole, on the run's clock."""
+        self._web_port = 0
         self._known: Recorder | OwnPart | None = None
         self._take_over: TakeOver | None = None
         if options.takes_over:
