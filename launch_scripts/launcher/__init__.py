@@ -4,11 +4,11 @@ What a launcher promises:
 
 - All processes are forked by one server, which loads what they share once (`forkserver`, `preloaded`). It starts
   before the command itself is loaded, and kernels that no process has compiled yet are compiled beside it.
-- A process that crashes is started again after a wait that doubles, one whose loop stands still is killed and started
-  again, and one that refuses to run ends the run with its sentence (`local_swarm`). Each start has a higher
+- A process that crashes is started again after a wait that doubles, one whose loop stands still is killed and
+  started again, and one that refuses to run ends the run with its sentence (`local_swarm`). Each start has a higher
   incarnation than all before (`options.next_incarnation`), whatever the clock says.
-- Roles end in the order of the table of processes, each after those which still talk to it. A second Ctrl-C ends all
-  of them within a second (`signals`). No process outlives its launcher, even where that is killed.
+- Roles end in the order of the table of processes, each after those which still talk to it. A second Ctrl-C ends
+  all of them within a second (`signals`). No process outlives its launcher, even where that is killed.
 - A launcher listens only (`watcher`): it is no member of the run, and its absence changes nothing. The one that
   starts the first keeper records and reports the run, all others look after their own processes.
 - What operators order while the swarm runs is followed by planners that come and go (`ordered_planners`).
