@@ -43,7 +43,7 @@ from swarm.config.input_files import quoted
 from swarm.config.load import check_endpoint
 from swarm.config.scenario import Scenario
 from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, writing
 
 app = family_app("A plan, certificates and configurations for several machines.")
 KitName = Literal["systemd", "compose"]
@@ -338,8 +338,6 @@ def zenohd(
         plugins=None if plugins is None else str(plugins.resolve()),
         volume=volume,
     )
-    try:
+    with writing(out):
         out.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
     print(f"{out}: run `zenohd -c {out}`")

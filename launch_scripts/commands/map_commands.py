@@ -26,7 +26,7 @@ from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.places import MapFrame
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import BusError, StoreError
+from swarm.errors import BusError, StoreError, writing
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
 from swarm.runtime.operator import replies_to
@@ -127,7 +127,7 @@ def export(store: Store, out: Path) -> None:
     """
     terrain, grid, sets = _read(store)
     kind_of_file = out.suffix.lower()
-    try:
+    with writing(out):
         if kind_of_file in _TEXT:
             with KeeperStore(store, read_only=True) as kept:
                 classes = kept.classes
@@ -138,8 +138,6 @@ def export(store: Store, out: Path) -> None:
             write_layers(out, [_layer(grid, sets)], MapFrame(grid))
         else:
             raise StoreError(f"{out}: the name must end in {', '.join((*_TEXT, *_PIXELS, *FORMATS))}")
-    except OSError as error:
-        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
     if kind_of_file in _TEXT:
         print(f"{out}: {_counted(grid, sets)}")
         return

@@ -23,7 +23,7 @@ from launch_scripts.commands.shared_options import (
     Seconds,
     Walk,
 )
-from swarm.errors import BusError, ConfigError, StoreError, SwarmError
+from swarm.errors import BusError, ConfigError, SwarmError, writing
 
 if TYPE_CHECKING:
     from launch_scripts.check.findings import Finding
@@ -105,11 +105,8 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
     if is_terminal():
         choices = _asked(file, choices)
     text = _text(file, choices)
-    try:
-        with file.open("x", encoding="utf-8") as opened:
-            opened.write(text)
-    except OSError as error:
-        raise StoreError(f"cannot write {file}: {error.strerror or error}") from error
+    with writing(file), file.open("x", encoding="utf-8") as opened:
+        opened.write(text)
     typer.echo(f"{file} is written; `swarm check {file}` looks at it, `swarm up {file}` runs it")
 
 

@@ -19,7 +19,7 @@ import typer
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.declaring import RUN, command
 from launch_scripts.commands.shared_options import AsJson, Runs, Seed
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, StoreError, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -99,10 +99,10 @@ def _simulate_once(
     scenario = find_scenario(name)
     terminal = Terminal(as_json, plain=True)
     with contextlib.ExitStack() as stack:
-        try:
-            log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
-        except OSError as error:
-            raise StoreError(f"cannot write {trace}: {error.strerror or error}") from error
+        log = None
+        if trace is not None:
+            with writing(trace):
+                log = stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
         scenario = msgspec.structs.replace(
             scenario,
             seed=scenario.seed if seed is None else seed,
@@ -280,17 +280,14 @@ def _hear_stops() -> list[int]:
 
 
 def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, stops: list[int]) -> None:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from launch_scripts.launcher.console import progress
 
-    name, law = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[failed]} broke a law")
-    columns = (name, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), law)
-    failed = 0
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(sweep.study.name, total=sweep.trials, failed=0)
-        bar.update(task, completed=sweep.trials - len(sweep.missing))
+    failed, done = 0, sweep.trials - len(sweep.missing)
+    with progress() as tell:
 
         def told(trial: Trial, result: Result | None) -> None:
-            nonlocal failed
+            nonlocal failed, done
+            done += 1
             failed += bool(result is not None and result.broken)
             for law in result.broken[:1] if result is not None else ():
                 console.print(f"{trial.world} seed {trial.seed} broke a law: {law}")
@@ -298,7 +295,7 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
                 console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
             while sweep.warned:
                 console.print(sweep.warned.pop(0))
-            bar.update(task, advance=1, failed=failed)
+            tell(f"{done:,} of {sweep.trials:,} trials, {failed:,} broke a law", done / sweep.trials)
             if stops:
                 raise KeyboardInterrupt
 

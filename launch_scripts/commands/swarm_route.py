@@ -97,16 +97,11 @@ def ask_planner(
         else RouteRequest(row=row, col=col, max_cells=steps, vehicle_class=vehicle_class)
     )
     began_s = time.monotonic()
-    reply = _ask(bus, request, target, where)
-    return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
-
-
-def _ask(bus: Bus, request: CostRequest | RouteRequest, target: str, where: object) -> RouteReply | CostReply:
-    topic = COST if isinstance(request, CostRequest) else ROUTE
-    replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, target=target)
+    replies, failure = replies_to(bus, COST if cost else ROUTE, request, _TIMEOUT_S, target=target)
+    took_ms = (time.monotonic() - began_s) * 1e3
     for reply in replies:
         if isinstance(reply, RouteReply | CostReply):
-            return reply
+            return Answer(reply, frame, cell, took_ms)
     if failure is not None and failure != "timeout":
         raise ConfigError(failure)
     raise BusError(f"no planner of target {target!r} answers {where}")

@@ -33,7 +33,7 @@ from swarm.config.cost_rules import PRESETS, cost_of_preset
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.values import ElevationEncoding
-from swarm.errors import ConfigError, TerrainError
+from swarm.errors import ConfigError, writing
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -274,10 +274,8 @@ def synth(
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     if out.suffix.lower() == ".npz":
-        try:
+        with writing(out):
             np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
-        except OSError as error:
-            raise TerrainError(f"cannot write {out}: {error.strerror or error}") from error
     else:
         write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:
