@@ -319,7 +319,7 @@ def _page_section(command: str, tables: Any, notes: Iterable[str], report: dict[
     for title, headings, cells in tables:
         lines = [f"| {' | '.join(line)} |" for line in ([each or " " for each in headings], *cells)]
         lines.insert(1, "|---" * len(headings) + "|")
-        parts += [f"{title.capitalize()}:", "\n".join(lines)] if title else ["\n".join(lines)]
+        parts += [f"{title[0].upper()}{title[1:]}:", "\n".join(lines)] if title else ["\n".join(lines)]
     return "\n\n".join([*parts, *notes])
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from bench.harness import Seed, benchmark, tell
 from support.message_fuzzer import NAMES, MessageFuzzer
-from support.process_usage import Usage, usage
+from support.process_usage import usage
 from support.up_process import UpProcess
 
 from chaos.attacker import Attacker
@@ -383,7 +383,7 @@ class ChaosRun:
         return "without a word"
 
     def _sample(self) -> None:
-        some = [used for name in self._names if (used := self._used(name)) is not None]
+        some = [used for pid in self._pids.values() if (used := usage(pid)) is not None]
         if len(some) == len(self._names):
             self.results.samples.append(
                 Sample(
@@ -393,9 +393,6 @@ class ChaosRun:
                     files=sum(each.files for each in some),
                 )
             )
-
-    def _used(self, name: str) -> Usage | None:
-        return usage(self._pids[name]) if name in self._pids else None
 
 
 _LONGEST_S = 6 * 3600.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,9 +15,9 @@ from support.process_usage import cpu_s, in_session, machine_cpu_s, pss_bytes
 from support.up_process import UpProcess
 
 from bench.harness import tell
-from bench.whole_swarm.route_client import raw_answerer, route_client
 from bench.whole_swarm.size import Size, scenario_text
 from bench.whole_swarm.stats_window import StatsSpan, StatsWindow, histogram, ticks
+from bench.wire.queries import beside_raw, serve_raw
 from launch_scripts.launcher.takeover import processes
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import processes_of
@@ -24,13 +25,54 @@ from swarm.bus.bus import Heard
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import BusError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import column
+from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.topics import FLEET, STATS
+
+_EVERY_S = 0.05
+"""From one route query of the client to the next, and from one raw get."""
+
+
+def raw_answerer(network: NetworkConfig, pipe: Connection) -> None:
+    """Joins when asked to; then answers raw queries, until told to end."""
+    pipe.send("ready")
+    if pipe.recv() == "end":
+        return
+    with open_bus(network) as bus:
+        kept = serve_raw(bus)
+        pipe.send("joined")
+        pipe.recv()
+        del kept
+
+
+def route_client(network: NetworkConfig, pipe: Connection) -> None:
+    """Joins when asked to; then asks for routes, and raw, in turn.
+
+    Answers (targets, cells, route_cells, seconds, seed) with quantiles in microseconds, and ours over raw.
+    """
+    pipe.send("ready")
+    if pipe.recv() == "end":
+        return
+    with open_bus(network) as bus:
+        inbox = Inbox()
+        pipe.send("joined")
+        while (question := pipe.recv()) != "end":
+            pipe.send(beside_raw(bus, inbox, _questions(*question), _EVERY_S / 2))
+
+
+def _questions(
+    targets: list[str], cells: list[int], route_cells: int, seconds: float, seed: int
+) -> Iterator[tuple[RouteRequest, str]]:
+    chance = random.Random(seed)
+    until_s = time.monotonic() + seconds
+    while time.monotonic() < until_s:
+        yield RouteRequest(cells=[chance.choice(cells)], max_cells=route_cells), chance.choice(targets)
+
 
 UP_WITHIN_S = 240.0
 """A cold cache of kernels is compiled in it."""
@@ -286,13 +328,9 @@ class _Run:
             return [span for span in spans if span.role == role]
 
         agents_ms = histogram(of("agent"), "route_query_ms")
-        roles = sorted({span.role for span in spans})
         return {
             "ticks": {role: ticks(of(role)) for role in ("agent", "planner", "targets")},
             **{f"{name}_per_s": sum(span.per_s(name) for span in spans) if spans else None for name in _COUNTED},
-            "traffic": {
-                role: {name: sum(span.per_s(name) for span in of(role)) for name in _COUNTED} for role in roles
-            },
             "agents_route_query_p50_ms": agents_ms.quantile(0.5),
             "agents_route_query_p99_ms": agents_ms.quantile(0.99),
         }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterable
 from contextlib import closing
 from multiprocessing.connection import Connection
 from typing import Any
@@ -33,6 +34,8 @@ _SIDE = 512
 _TARGET = "t0"
 _HZ = 10.0
 _LONGEST_S = 60.0
+_ANSWER_S = 2.0
+_RAW_KEY = f"{RAW}/route"
 _SESSIONS = 10
 """Agents per sending process: forty interpreters would measure how they share two cores."""
 
@@ -41,7 +44,7 @@ _SESSIONS = 10
 
 
 def planner_peer(network: NetworkConfig, pipe: Connection, target: str = _TARGET) -> None:
-    """A planner on level terrain of 512 x 512 cells, and a raw queryable which answers with given bytes."""
+    """A planner on level terrain of 512 x 512 cells, and one who answers raw queries with as many bytes."""
     from planner_service.kernel_build import load_all
     from planner_service.service import PlannerService
 
@@ -52,50 +55,76 @@ def planner_peer(network: NetworkConfig, pipe: Connection, target: str = _TARGET
     setup = RoleSetup(scenario, "bench", "planner", target, time.time_ns(), time.time_ns())
     with open_bus(network) as bus, closing(ThreadWorker("grow-tree", inbox)) as worker:
         service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
-        payloads: list[bytes] = []
-
-        def reply(query: zenoh.Query) -> None:
-            query.payload.to_bytes()  # type: ignore[union-attr]
-            query.reply(f"{RAW}/route", payloads[-1])
-            query.drop()  # type: ignore[no-untyped-call]
-
-        queryable = bus.session.declare_queryable(f"{RAW}/route", zenoh.handlers.FifoChannel(4096))
-        kept = read_on_thread(queryable, reply)
+        kept = serve_raw(bus)
         pipe.send("ready")
-        run_service(service, inbox, pipe, payloads.append)
+        run_service(service, inbox, pipe, lambda *_: None)
         del kept
 
 
-def route_queries(far: Far, queries: int) -> dict[str, float]:
+def route_queries(far: Far, queries: int) -> dict[str, Any]:
     """Microseconds from a route request to the parsed reply, beside a raw get of the same bytes, in turn."""
-    peer = far.start(planner_peer)
-    ours_us, raw_us = [], []
-    random = np.random.default_rng(2)
+    far.start(planner_peer)
+    cells = np.random.default_rng(2).integers(_SIDE * _SIDE, size=queries).tolist()
     with open_bus(far.network) as bus:
         inbox = Inbox()
-        reply = _first_route(bus, inbox)
-        for _ in range(queries):
-            request = RouteRequest(cells=[int(random.integers(_SIDE * _SIDE))])
-            began_ns = time.monotonic_ns()
-            answered = ask_route(bus, inbox, request)
-            ours_us.append((time.monotonic_ns() - began_ns) / 1e3)
-            if answered is None:
-                raise SwarmError("the planner gave no route")
-            reply = answered
-            asked(peer, encode(reply))
-            payload = encode(request)
-            time.sleep(0.002)
-            began_ns = time.monotonic_ns()
-            [raw] = bus.session.get(f"{RAW}/route", zenoh.handlers.FifoChannel(4), payload=payload)
-            if raw.ok is None or not raw.ok.payload.to_bytes():
-                raise SwarmError("a raw query was not answered")
-            raw_us.append((time.monotonic_ns() - began_ns) / 1e3)
-            time.sleep(0.002)
+        _wait_for_route(bus, inbox)
+        found = beside_raw(bus, inbox, ((RouteRequest(cells=[cell]), _TARGET) for cell in cells), 0.002)
     far.end()
-    return {"reply_bytes": len(encode(reply)), **beside(ours_us, raw_us, "us")}
+    if found["unanswered"]:
+        raise SwarmError(f"{found['unanswered']} queries were not answered")
+    return found
 
 
-def _first_route(bus: ZenohBus, inbox: Inbox) -> RouteReply:
+def serve_raw(bus: ZenohBus) -> Any:
+    """Answers raw queries with as many bytes as each asks for, while the result is kept."""
+
+    def answer(query: zenoh.Query) -> None:
+        query.payload.to_bytes()  # type: ignore[union-attr]
+        query.reply(_RAW_KEY, bytes(int(query.parameters["bytes"] or 0)))
+        query.drop()  # type: ignore[no-untyped-call]
+
+    return read_on_thread(bus.session.declare_queryable(_RAW_KEY, zenoh.handlers.FifoChannel(64)), answer)
+
+
+def beside_raw(
+    bus: ZenohBus, inbox: Inbox, questions: Iterable[tuple[RouteRequest, str]], pause_s: float
+) -> dict[str, Any]:
+    """Quantiles of the time of route queries, us, and of raw gets which carry as many bytes both ways, in turn.
+
+    questions  each with the target that it is about
+    """
+    ours_us: list[float] = []
+    raw_us: list[float] = []
+    sizes: list[int] = []
+    unanswered = 0
+    for request, target in questions:
+        began_ns = time.monotonic_ns()
+        reply = ask_route(bus, inbox, request, target)
+        took_ns = time.monotonic_ns() - began_ns
+        time.sleep(pause_s)
+        raw_ns = None if reply is None else _raw_ns(bus, encode(request), len(encode(reply)))
+        time.sleep(pause_s)
+        if reply is None or raw_ns is None:
+            unanswered += 1
+            continue
+        ours_us.append(took_ns / 1e3)
+        raw_us.append(raw_ns / 1e3)
+        sizes.append(len(encode(reply)))
+    mean_bytes = round(float(np.mean(sizes))) if sizes else None
+    told = {"queries": len(sizes), "unanswered": unanswered, "reply_bytes": mean_bytes}
+    return {**told, **beside(ours_us, raw_us, "us")}
+
+
+def _raw_ns(bus: ZenohBus, payload: bytes, size: int) -> int | None:
+    began_ns = time.monotonic_ns()
+    answers = bus.session.get(
+        f"{_RAW_KEY}?bytes={size}", zenoh.handlers.FifoChannel(4), payload=payload, timeout=_ANSWER_S
+    )
+    sizes = [len(each.ok.payload.to_bytes()) for each in answers if each.ok is not None]
+    return time.monotonic_ns() - began_ns if sizes == [size] else None
+
+
+def _wait_for_route(bus: ZenohBus, inbox: Inbox) -> None:
     deadline_s = time.monotonic() + _LONGEST_S
     cell = _SIDE * _SIDE // 2 + _SIDE // 2
     pose = TargetPose(target=_TARGET, incarnation=1, seq=1, stamp_ns=time.time_ns(), cell=cell, x_m=0.0, y_m=0.0)
@@ -103,27 +132,23 @@ def _first_route(bus: ZenohBus, inbox: Inbox) -> RouteReply:
         bus.publish(POSE, pose, target=_TARGET)
         reply = ask_route(bus, inbox, RouteRequest(cells=[0]))
         if reply is not None and reply.routes[0].status is RouteStatus.OK:
-            return reply
+            return
         time.sleep(0.1)
     raise SwarmError("the planner was not ready in time")
 
 
-def ask_route(
-    bus: ZenohBus, inbox: Inbox, request: RouteRequest, target: str = _TARGET, timeout_s: float = 2.0
-) -> RouteReply | None:
+def ask_route(bus: ZenohBus, inbox: Inbox, request: RouteRequest, target: str = _TARGET) -> RouteReply | None:
     """A planner's answer; None if there is none in time."""
     asked_as = str(time.monotonic_ns())
-    bus.ask(ROUTE, request, inbox.post, tag=asked_as, timeout_s=timeout_s, target=target)
-    found: RouteReply | None = None
-    while found is None:
-        match inbox.take(timeout_s + 3.0):
+    bus.ask(ROUTE, request, inbox.post, tag=asked_as, timeout_s=_ANSWER_S, target=target)
+    while True:
+        match inbox.take(_ANSWER_S + 3.0):
             case Replied(tag=tag, message=RouteReply() as reply) if tag == asked_as and reply.routes:
-                found = reply
+                return reply
             case AskEnded(tag=tag) if tag == asked_as:
                 return None
             case None:
                 return None
-    return found
 
 
 # --- positions ----------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import zenoh
 from numpy.typing import NDArray
 from support.made_up_swarm import GRID, some_set
 
+from bench.harness import cpu_ms
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.replica import MapReplica
@@ -166,42 +167,22 @@ def _serve_raw(bus: ZenohBus, key: str, payloads: list[bytes]) -> Any:
     return read_on_thread(bus.session.declare_queryable(key, zenoh.handlers.FifoChannel(16)), answer)
 
 
-def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
-    """Measures memory and times of a replica of a 4096 x 4096 map with a million marks."""
+def replica_cost() -> dict[str, Any]:
+    """Memory and digest of a replica of a 4096 x 4096 map with a million marks."""
     grid = GridSpec(4096, 4096, 1.0)
     replica = MapReplica(grid)
     replica.merge([some_set(tile, 0, 61) for tile in range(16)])
     replica.held.ledger.held()
     before = psutil.Process().memory_info().rss
-    cpu_s = time.process_time()
     for tile in range(grid.tiles):
         replica.merge([some_set(tile, 1, 61, f"a{tile % 8}.1")])
-    one_by_one_s = time.process_time() - cpu_s
     held = psutil.Process().memory_info().rss - before
-    marks = grid.tiles * 61
-    began_s = time.perf_counter()
-    digest = replica.held.ledger.held()
-    first_ms = (time.perf_counter() - began_s) * 1e3
+    first_ms = cpu_ms(replica.held.ledger.held)
     replica.merge([some_set(7, 2, 61, "a7.1")])
-    began_s = time.perf_counter()
-    replica.held.ledger.held()
-    again_ms = (time.perf_counter() - began_s) * 1e3
-    again = [some_set(tile, 3, 61, f"a{tile % 8}.1") for tile in range(grid.tiles)]
-    cpu_s = time.process_time()
-    for first in range(0, len(again), 1024):
-        replica.merge(again[first : first + 1024])
-    together_s = time.process_time() - cpu_s
-    pipe.send("ready")
-    pipe.recv()
-    pipe.send(
-        {
-            "marks": marks,
-            "sets": grid.tiles,
-            "bytes_per_mark": round(held / marks, 1),
-            "digest_ms": round(max(first_ms, again_ms), 2),
-            "digest_bytes": sum(map(len, digest.values())),
-            "made_and_merged_cpu_us_per_set": round(one_by_one_s / grid.tiles * 1e6, 1),
-            "merged_together_cpu_us_per_set": round(together_s / grid.tiles * 1e6, 1),
-        }
-    )
-    pipe.recv()
+    again_ms = cpu_ms(replica.held.ledger.held)
+    return {
+        "sets": grid.tiles,
+        "bytes_per_mark": round(held / (grid.tiles * 61), 1),
+        "digest_ms": round(max(first_ms, again_ms), 2),
+        "digest_bytes": sum(map(len, replica.held.ledger.held().values())),
+    }
