@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -119,9 +118,6 @@ def _over(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
     """What is wrong with the classes of a scenario, one sentence each."""
     names = [each.name for each in scenario.classes]
-    doubled = [name for name, times in Counter(names).items() if times > 1]
-    if doubled:
-        yield f"{source}: classes: two classes are called {doubled[0]!r}; rename one"
     if GROUND in names:
         yield f"{source}: classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
     for n, each in enumerate(scenario.classes):

@@ -10,7 +10,8 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal
 
@@ -161,8 +162,8 @@ def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario
             value = value.get(step) if isinstance(value, dict) else None
         elif isinstance(value, dict):  # msgspec tells no key of a table that the user names
             hint = _item_type(hint)
-            key, value = _refused_item(value, hint)
-            name += f".{key}"
+            key = next((key for key, each in value.items() if _is_refused(each, hint)), "...")
+            name, value = f"{name}.{key}", value.get(key)
         else:
             name += "[...]" if step < 0 else f"[{step}]"
             hint = _item_type(hint)
@@ -176,25 +177,20 @@ def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario
     return _wrong(name or whole, value, hint)
 
 
-def _refused_item(values: dict[str, Any], hint: Any) -> tuple[str, Any]:
-    for key, value in values.items():
-        try:
-            msgspec.convert(value, hint)
-        except msgspec.ValidationError:
-            return key, value
-    return "...", None
+def _is_refused(value: Any, hint: Any) -> bool:
+    try:
+        msgspec.convert(value, hint)
+    except msgspec.ValidationError:
+        return True
+    return False
 
 
 def _refused_key(values: dict[str, Any], hint: Any) -> str:
-    for key in values:
-        try:
-            msgspec.convert(key, hint)
-        except msgspec.ValidationError:
-            allowed = (
-                list(map(str, typing.get_args(bare(hint)))) if typing.get_origin(bare(hint)) is Literal else []
-            )
-            return f"{key!r}{choice(key, allowed)}" if allowed else f"{key!r}, expected {expected(hint)}"
-    return "of a kind that is not allowed"
+    """The key of a table that the user names which is not of its type, and what it may be."""
+    key = next((key for key in values if _is_refused(key, hint)), "")
+    if typing.get_origin(bare(hint)) is Literal:
+        return f"{key!r}{choice(key, list(map(str, typing.get_args(bare(hint)))))}"
+    return f"{key!r}, expected {expected(hint)}"
 
 
 def located(reason: str) -> tuple[str, list[str | int]]:
@@ -212,6 +208,14 @@ def nearest(word: str, allowed: Sequence[str]) -> str:
     if not close and len(word) >= 3:
         close = [each for each in allowed if each.startswith(word)][:1]
     return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def doubled(names: Iterable[str], what: str) -> Iterator[str]:
+    """A sentence if two settings have one name, such as "targets: two targets are called 'x'; rename one"."""
+    for name, times in Counter(names).items():
+        if times > 1:
+            yield f"{what}: two {what} are called {name!r}; rename one"
+            return
 
 
 def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
@@ -237,8 +241,8 @@ def _unknown(key: str, name: str, section: Any, root: type) -> str:
     if where in _MEANT:
         return f"unknown key {where}; {_MEANT[where]}"
     near = nearest(key, allowed)
-    elsewhere = [place for place, other in _places(root) if other is not section and key in _keys(other)]
-    if elsewhere and not _is_near(key, allowed):
+    elsewhere = [place for place, other in _places(root) if other is not section and _holds(other, key)]
+    if elsewhere and not difflib.get_close_matches(key, allowed, n=1, cutoff=0.75):
         return f"unknown key {where}; {key} stands {' or '.join(elsewhere[:3])}"
     every = _allowed_here(allowed)
     return f"unknown key {where}{near}" + (f"; {every}" if not near or len(every) <= _LONGEST_LIST else "")
@@ -248,13 +252,9 @@ def _allowed_here(allowed: Sequence[str]) -> str:
     return f"allowed here: {', '.join(allowed)}"
 
 
-def _is_near(key: str, allowed: Sequence[str]) -> bool:
-    return bool(difflib.get_close_matches(key, allowed, n=1, cutoff=0.75))
-
-
-def _keys(section: Any) -> list[str]:
-    """The keys of a section that hold values."""
-    return [key for key, hint in hints_of(section).items() if not section_in(hint)]
+def _holds(section: Any, key: str) -> bool:
+    """True if a section has a setting of this name which is no section itself."""
+    return key in (hints := hints_of(section)) and not section_in(hints[key])
 
 
 def _places(root: type) -> Iterator[tuple[str, Any]]:
@@ -282,7 +282,8 @@ def _wrong(name: str, value: Any, hint: Any) -> str:
     if is_section(kind):
         return f"{name}: found {quoted(value)}, expected a table: [{table}] with its keys below"
     if typing.get_origin(kind) is tuple and isinstance(value, str | int | float):
-        shape = f"{key} = [{_as_toml(value)}]" if typing.get_args(kind)[-1] is Ellipsis else expected(hint)
+        item = f'"{value}"' if isinstance(value, str) else str(value)
+        shape = f"{key} = [{item}]" if typing.get_args(kind)[-1] is Ellipsis else expected(hint)
         return f"{name}: found {quoted(value)}, expected a list: {shape}"
     if typing.get_origin(kind) is Literal:
         return f"{name}: found {quoted(value)}{choice(str(value), list(map(str, typing.get_args(kind))))}"
@@ -312,10 +313,6 @@ def _meant_number(key: str, value: Any, kind: Any) -> str:
         return f" without quotes: {key} = {number:g}"
     factor = next(units for ending, units in _UNITS if key.endswith(ending)).get(unit.lower())
     return ", without its unit" if factor is None else f" without its unit: {key} = {number * factor:.6g}"
-
-
-def _as_toml(value: Any) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def _field_type(section: Any, key: str) -> Any:

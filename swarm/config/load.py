@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import ipaddress
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
@@ -15,7 +14,7 @@ import msgspec
 
 from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
-from swarm.config.explain import choice, explain, located, nearest
+from swarm.config.explain import choice, doubled, explain, located, nearest
 from swarm.config.ground import CostConfig, HiddenConfig, ZoneConfig
 from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
 from swarm.config.plugin_names import check_name, plugins_of
@@ -121,21 +120,16 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     if count > MOST_TARGETS:
         yield f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}"
     ids = scenario.target_ids
-    doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
-    if doubled:
-        yield f"{source}: targets: two targets are called {doubled[0]!r}; give them other names"
-    rovers = Counter(id for rover in scenario.rovers for id in ids_of(rover))
-    if rovers and rovers.most_common(1)[0][1] > 1:
-        yield f"{source}: rovers: two rovers are called {rovers.most_common(1)[0][0]!r}; rename one"
+    rovers = (id for rover in scenario.rovers for id in ids_of(rover))
+    classes, groups = (each.name for each in scenario.classes), (each.name for each in scenario.groups)
+    named = {"targets": ids, "rovers": rovers, "classes": classes, "groups": groups}
+    yield from (f"{source}: {each}" for what, names in named.items() for each in doubled(names, what))
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
             yield f"{source}: targets: {id!r} is what a standby of another target is called; rename it"
-    for key, zones in (
-        ("cost.zones", scenario.cost.zones),
-        ("terrain.hidden.zones", scenario.terrain.hidden.zones),
-    ):
-        for n, zone in enumerate(zones):
-            yield from _complaint(_check_zone, zone, f"{source}: {key}[{n}]")
+    for key, section in (("cost", scenario.cost), ("terrain.hidden", scenario.terrain.hidden)):
+        for n, zone in enumerate(section.zones):
+            yield from _complaint(_check_zone, zone, f"{source}: {key}.zones[{n}]")
     for n, target in enumerate(scenario.targets):
         if target.start is not None:
             yield from _complaint(read_place, target.start, f"{source}: targets[{n}].start")
@@ -157,9 +151,8 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
         yield f"{source}: monitor.show_target is {marked!r}, which is no target{known}"
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
-            yield from _complaint(
-                check_endpoint, endpoint, scenario.network.tls is not None, f"{source}: network.{key}"
-            )
+            has_tls = scenario.network.tls is not None
+            yield from _complaint(check_endpoint, endpoint, has_tls, f"{source}: network.{key}")
 
 
 def _complaint(check: Callable[..., object], *of: object) -> Iterator[str]:
@@ -172,9 +165,6 @@ def _complaint(check: Callable[..., object], *of: object) -> Iterator[str]:
 
 def _group_faults(scenario: Scenario, source: str) -> Iterator[str]:
     ids, names = scenario.target_ids, [group.name for group in scenario.groups]
-    doubled = [name for name, times in Counter(names).items() if times > 1]
-    if doubled:
-        yield f"{source}: groups: two groups are called {doubled[0]!r}; rename one"
     for name in names:
         if name.split(".")[0] == RESERVED_GROUP:
             yield f"{source}: groups: {name!r} is not free: zones of operators are marks of that name"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from typing import Any, TypeVar, cast
 
 from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
@@ -244,17 +245,10 @@ class _Replay:
             boundary.raised(error)
         except Exception as error:
             boundary.raised(error)
-        for recorded, replayed in zip(step.outputs, boundary.outputs, strict=False):
-            if recorded != replayed.output:
-                return self._difference(step, recorded, _described_output(replayed))
-        done = min(len(step.outputs), len(boundary.outputs))
-        if stray is not None:
-            return self._difference(step, step.outputs[done] if done < len(step.outputs) else None, stray)
-        if len(step.outputs) > done:
-            return self._difference(step, step.outputs[done], None)
-        if len(boundary.outputs) > done:
-            return self._difference(step, None, _described_output(boundary.outputs[done]))
-        return None
+        for recorded, replayed in zip_longest(step.outputs, boundary.outputs):
+            if recorded is None or replayed is None or recorded != replayed.output:
+                return self._difference(step, recorded, stray if replayed is None else _described_output(replayed))
+        return None if stray is None else self._difference(step, None, stray)
 
     def _call(self, call: Call | None) -> None:
         if call is None:
