@@ -10,35 +10,17 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from support.command import Swarm
 
 from launch_scripts import ports
-from launch_scripts.cli import main
 from launch_scripts.launcher import options
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
 
 
-def swarm(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str
-) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["swarm", *arguments])
-    monkeypatch.setenv("COLUMNS", "120")
-    try:
-        code = main()
-    except SystemExit as end:
-        code = int(end.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
-    return lambda *arguments: swarm(capsys, monkeypatch, *arguments)
-
-
-def test_help_teaches_with_examples(run) -> None:  # type: ignore[no-untyped-def]
-    code, out, _ = run("--help")
+def test_help_teaches_with_examples(swarm: Swarm) -> None:
+    code, out, _ = swarm("--help")
     assert code == 0
     assert "swarm route --target t3 --row 40 --col 200" in out
     for command in ("demo", "up", "router", "keeper", "planner", "agent", "targets", "monitor", "route", "status"):
@@ -49,14 +31,14 @@ def test_help_teaches_with_examples(run) -> None:  # type: ignore[no-untyped-def
     "command",
     ["demo", "up", "simulate", "route", "status", "router", "keeper", "planner", "agent", "targets", "monitor"],
 )
-def test_every_command_explains_itself(run, command: str) -> None:  # type: ignore[no-untyped-def]
-    code, out, _ = run(command, "--help")
+def test_every_command_explains_itself(swarm: Swarm, command: str) -> None:
+    code, out, _ = swarm(command, "--help")
     assert code == 0
     assert f"Usage: swarm {command}" in out
 
 
-def test_the_version_is_the_packages(run) -> None:  # type: ignore[no-untyped-def]
-    assert run("--version") == (0, f"swarm {version('terrain-swarm')}\n", "")
+def test_the_version_is_the_packages(swarm: Swarm) -> None:
+    assert swarm("--version") == (0, f"swarm {version('terrain-swarm')}\n", "")
 
 
 def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
@@ -69,17 +51,17 @@ def test_the_launcher_never_imports_numba_or_rerun() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_an_unknown_scenario_gets_the_nearest_name(run) -> None:  # type: ignore[no-untyped-def]
-    code, out, err = run("up", "jaksboro")
+def test_an_unknown_scenario_gets_the_nearest_name(swarm: Swarm) -> None:
+    code, out, err = swarm("up", "jaksboro")
     assert code == 2
     assert all(line.startswith("loading") for line in out.splitlines())  # as it says where a second has passed
     assert err.startswith("swarm: no scenario 'jaksboro'; did you mean 'jacksboro'?")
 
 
-def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(swarm: Swarm, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("[vehicles]\nsense_rnge_m = 3\n")
-    code, _, err = run("up", str(path))
+    code, _, err = swarm("up", str(path))
     assert code == 2
     assert str(path) in err
     assert "vehicles.sense_rnge_m" in err
@@ -87,51 +69,51 @@ def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(run, tmp_path
     assert err.count("\n") == 1
 
 
-def test_a_scenario_file_that_is_not_there(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    code, _, err = run("up", str(tmp_path / "gone.toml"))
+def test_a_scenario_file_that_is_not_there(swarm: Swarm, tmp_path: Path) -> None:
+    code, _, err = swarm("up", str(tmp_path / "gone.toml"))
     assert (code, err.count("\n")) == (2, 1)
     assert "No such file" in err
 
 
-def test_an_unknown_role_is_refused(run) -> None:  # type: ignore[no-untyped-def]
-    code, _, err = run("up", "synthetic", "--only", "driver")
+def test_an_unknown_role_is_refused(swarm: Swarm) -> None:
+    code, _, err = swarm("up", "synthetic", "--only", "driver")
     roles = "'router', 'keeper', 'monitor', 'planner', 'targets', 'agent'"
     assert (code, err) == (2, f"swarm: --only: no role 'driver'; the roles are {roles}\n")
 
 
-def test_a_planner_for_a_target_that_the_scenario_does_not_have(run) -> None:  # type: ignore[no-untyped-def]
-    code, _, err = run("planner", "--target", "t9", "synthetic")
+def test_a_planner_for_a_target_that_the_scenario_does_not_have(swarm: Swarm) -> None:
+    code, _, err = swarm("planner", "--target", "t9", "synthetic")
     assert (code, err) == (2, "swarm: scenario synthetic has no planner 't9'; it has t0, t1\n")
 
 
-def test_a_port_that_is_taken_is_named_with_the_way_out(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_port_that_is_taken_is_named_with_the_way_out(swarm: Swarm, tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        code, _, err = run("up", "synthetic", "--port", str(port), "--runs", str(tmp_path / "runs"))
+        code, _, err = swarm("up", "synthetic", "--port", str(port), "--runs", str(tmp_path / "runs"))
     assert code == 4
     assert f"port {port}, which the router needs, is taken; choose others with --port N" in err
     assert not (tmp_path / "runs").exists()
 
 
-def test_runs_where_nobody_may_write(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_runs_where_nobody_may_write(swarm: Swarm, tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file in the way")
-    code, _, err = run("up", "synthetic", "--port", "0", "--runs", str(tmp_path / "runs"))
+    code, _, err = swarm("up", "synthetic", "--port", "0", "--runs", str(tmp_path / "runs"))
     assert code == 6
     assert err.startswith(f"swarm: cannot make a run folder in {tmp_path / 'runs'}")
     assert "Traceback" not in err
 
 
-def test_nobody_there_to_ask(run) -> None:  # type: ignore[no-untyped-def]
+def test_nobody_there_to_ask(swarm: Swarm) -> None:
     (port,) = ports.free_ports(1)
-    code, _, err = run("status", "--connect", f"tcp/127.0.0.1:{port}")
+    code, _, err = swarm("status", "--connect", f"tcp/127.0.0.1:{port}")
     assert code == 4
     assert err.startswith(f"swarm: cannot reach a router at tcp/127.0.0.1:{port}")
 
 
-def test_an_endpoint_beyond_this_machine_needs_tls(run) -> None:  # type: ignore[no-untyped-def]
-    code, _, err = run("status", "--connect", "tcp/10.1.2.3:7447")
+def test_an_endpoint_beyond_this_machine_needs_tls(swarm: Swarm) -> None:
+    code, _, err = swarm("status", "--connect", "tcp/10.1.2.3:7447")
     assert code == 2
     assert "use tls/10.1.2.3:7447" in err
 
@@ -188,8 +170,10 @@ def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> No
         options.make_run_dir(Path("/proc/nowhere"), "x")
 
 
-def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    code, out, _ = run("simulate", "synthetic", "--seconds", "2", "--seed", "9", "--runs", str(tmp_path), "--json")
+def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(swarm: Swarm, tmp_path: Path) -> None:
+    code, out, _ = swarm(
+        "simulate", "synthetic", "--seconds", "2", "--seed", "9", "--runs", str(tmp_path), "--json"
+    )
     assert code == 0
     printed = json.loads(out)
     assert printed["scenario"] == "synthetic"

@@ -14,11 +14,11 @@ import pytest
 import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine
 from launch_scripts.check.scenario_check import places, plots
-from launch_scripts.cli import main
 from launch_scripts.commands.scenario_commands import Choices, _asked
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
@@ -43,46 +43,36 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_taken", lambda host, port: False)
 
 
-def swarm(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["swarm", *line.split()])
-    code = main()
-    return code, *capsys.readouterr()
-
-
 # --- swarm new --------------------------------------------------------------------------------------------
 
 
 def test_what_new_writes_is_what_was_chosen_and_check_accepts_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
 ) -> None:
     monkeypatch.setattr(machine, "this_machine", lambda runs: ROOMY)
     line = "new my.toml --terrain synthetic --vehicles 7 --targets 2 --walk evade --preset hiker --seconds 12"
-    code, out, err = swarm(line, monkeypatch, capsys)
+    code, out, err = swarm(line)
     assert (code, err) == (0, "")
     assert "swarm check my.toml" in out
     scenario = load_scenario(tmp_path / "my.toml")
     assert (scenario.name, scenario.vehicle_count, scenario.seconds) == ("my", 7, 12.0)
     assert (scenario.target_ids, scenario.targets[0].walk) == (["t0", "t1"], "evade")
     assert (scenario.cost.preset, scenario.cost.slope_rule) == ("hiker", "tobler")
-    code, out, err = swarm("check my.toml", monkeypatch, capsys)
+    code, out, err = swarm("check my.toml")
     assert (code, err) == (0, "")
     assert out.startswith("my.toml can run, no warnings: vehicles 7, targets 2, processes 7")
 
 
-def test_new_shares_many_vehicles_out_over_few_agents(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_new_shares_many_vehicles_out_over_few_agents(tmp_path: Path, swarm: Swarm) -> None:
     for vehicles, agents in ((20, 1), (200, 8), (1000, 8), (10_000, 10)):
         name = f"my{vehicles}.toml"
-        assert swarm(f"new {name} --vehicles {vehicles}", monkeypatch, capsys)[0] == 0
+        assert swarm(f"new {name} --vehicles {vehicles}")[0] == 0
         assert len(plan_agents(load_scenario(tmp_path / name))) == agents
 
 
-def test_every_key_that_new_writes_stands_below_its_meaning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_key_that_new_writes_stands_below_its_meaning(tmp_path: Path, swarm: Swarm) -> None:
     """The meanings are those of which the reference is made."""
-    assert swarm("new my.toml --terrain jacksboro", monkeypatch, capsys)[0] == 0
+    assert swarm("new my.toml --terrain jacksboro")[0] == 0
     lines = (tmp_path / "my.toml").read_text().splitlines()
     assert max(map(len, lines)) <= 110
     comment: list[str] = []
@@ -111,25 +101,23 @@ def _sections() -> list[type[typing.Any]]:
 
 
 def test_files_are_named_from_where_the_scenario_lies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
 ) -> None:
     monkeypatch.setattr(machine, "this_machine", lambda runs: ROOMY)
     (tmp_path / "mine").mkdir()
     np.savez(tmp_path / "hill.npz", elevation=np.ones((24, 24), np.float32), resolution_m=10.0)
-    assert swarm("new mine/a.toml --terrain hill.npz --vehicles 3", monkeypatch, capsys)[0] == 0
+    assert swarm("new mine/a.toml --terrain hill.npz --vehicles 3")[0] == 0
     assert tomllib.loads((tmp_path / "mine/a.toml").read_text())["terrain"]["source"] == "../hill.npz"
-    code, out, _ = swarm("check mine/a.toml --json", monkeypatch, capsys)
+    code, out, _ = swarm("check mine/a.toml --json")
     assert code == 0
     assert (json.loads(out)["rows"], json.loads(out)["resolution_m"]) == (24, 10.0)
 
 
-def test_nothing_is_written_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_written_over(tmp_path: Path, swarm: Swarm) -> None:
     (tmp_path / "my.toml").write_text("seed = 5\n")
-    assert swarm("new my.toml", monkeypatch, capsys)[0] == 2
+    assert swarm("new my.toml")[0] == 2
     assert (tmp_path / "my.toml").read_text() == "seed = 5\n"
-    assert swarm("new other.toml --walk fly", monkeypatch, capsys)[0] == 2
+    assert swarm("new other.toml --walk fly")[0] == 2
     assert not (tmp_path / "other.toml").exists()
 
 
@@ -159,15 +147,13 @@ def test_new_asks_for_what_is_not_given_and_again_for_what_cannot_be(
     assert "--seconds: found -1.0" in said
 
 
-def test_who_breaks_off_gets_no_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_who_breaks_off_gets_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm) -> None:
     def leave(*question: object, **options: object) -> object:
         raise typer.Abort
 
     monkeypatch.setattr("launch_scripts.commands.scenario_commands._asked", leave)
     monkeypatch.setattr("launch_scripts.commands.scenario_commands.is_terminal", lambda: True)
-    code, _, err = swarm("new my.toml", monkeypatch, capsys)
+    code, _, err = swarm("new my.toml")
     assert (code, err) == (1, "swarm: stopped; nothing is written\n")
     assert not (tmp_path / "my.toml").exists()
 
@@ -203,7 +189,7 @@ def test_a_commented_scenario_is_read_as_what_was_written(
 
 
 def test_check_says_all_at_once_in_the_order_of_weight(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
 ) -> None:
     monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Machine(1, 1 << 20, 1 << 10))
     (tmp_path / "s.toml").write_text(
@@ -211,7 +197,7 @@ def test_check_says_all_at_once_in_the_order_of_weight(
         "[[targets]]\nname = 'a'\nstart = [99, 1]\n[[targets]]\nname = 'b'\nstart = [1, 99]\n"
         "[[groups]]\nvehicles = 20\n[monitor]\ngrpc_port = 7000\nweb_port = 7000\n"
     )
-    code, out, _ = swarm("check s.toml", monkeypatch, capsys)
+    code, out, _ = swarm("check s.toml")
     assert code == 1
     lines = out.splitlines()
     begins = [line.partition(" is ")[0].partition(": found")[0] for line in lines]
@@ -222,7 +208,7 @@ def test_check_says_all_at_once_in_the_order_of_weight(
     assert "disk" in lines[3]
     assert lines[4].startswith("warning: s.toml: memory: about ")
     assert lines[5:] == ["4 failures, 1 warning"]
-    code, out, _ = swarm("check s.toml --json", monkeypatch, capsys)
+    code, out, _ = swarm("check s.toml --json")
     told = json.loads(out)
     assert (code, told["ok"], len(told["findings"])) == (1, False, len(lines) - 1)
     assert told["findings"][0]["level"] == "failure"

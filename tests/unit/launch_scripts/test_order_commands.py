@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
-
-from launch_scripts.cli import main
+from support.command import Swarm
 
 
 @pytest.mark.parametrize(
@@ -40,27 +37,8 @@ from launch_scripts.cli import main
         ("set time_scale 5 --as-scenario", "set: give either a value or --as-scenario"),
     ],
 )
-def test_what_is_no_order_is_refused_with_the_option(
-    words: str, says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["swarm", *words.split()])
-    assert main() == 2
-    out, err = capsys.readouterr()
-    assert out == ""
+def test_what_is_no_order_is_refused_with_the_option(words: str, says: str, swarm: Swarm) -> None:
+    code, out, err = swarm(words)
+    assert (code, out) == (2, "")
     assert says in err
     assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "command", ["zone", "target", "vehicle", "zone add", "target move", "pause", "group", "set"]
-)
-def test_every_command_explains_itself(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["swarm", *command.split(), "--help"])
-    try:
-        code = main()
-    except SystemExit as end:
-        code = int(end.code or 0)
-    assert code == 0
-    assert f"Usage: swarm {command}" in capsys.readouterr().out
