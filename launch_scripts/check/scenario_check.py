@@ -31,24 +31,26 @@ from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY, Plots, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 
-def files_named(scenario: Scenario) -> Iterator[Finding]:
-    """Files of terrain and zones that are not there, or are no files."""
+def files_of(scenario: Scenario) -> dict[str, str]:
+    """Key of the scenario -> the file that it names: of the terrain, and of zones."""
     terrain = scenario.terrain
-    if terrain.source not in BUILT_IN_TERRAINS:
-        yield from _of_source(terrain.source)
-    codes = None if terrain.cover_codes in COVER_TABLES else terrain.cover_codes
     named = {
+        "terrain.source": None if terrain.source in BUILT_IN_TERRAINS else terrain.source,
         "terrain.photo": terrain.photo,
         "terrain.labels": terrain.labels,
         "terrain.cover": terrain.cover,
-        "terrain.cover_codes": codes,
+        "terrain.cover_codes": None if terrain.cover_codes in COVER_TABLES else terrain.cover_codes,
     }
     for key, zones in (("cost.zones", scenario.cost.zones), ("terrain.hidden.zones", terrain.hidden.zones)):
         for n, zone in enumerate(zones):
             named |= {f"{key}[{n}].mask": zone.mask, f"{key}[{n}].file": zone.file}
-    for key, name in named.items():
-        if name is not None:
-            yield from _of_file(key, Path(name))
+    return {key: name for key, name in named.items() if name is not None}
+
+
+def files_named(scenario: Scenario) -> Iterator[Finding]:
+    """Files of terrain and zones that are not there, or are no files."""
+    for key, name in files_of(scenario).items():
+        yield from _of_source(name) if key == "terrain.source" else _of_file(key, Path(name))
 
 
 def _of_source(name: str) -> Iterator[Finding]:

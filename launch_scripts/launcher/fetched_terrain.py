@@ -8,6 +8,7 @@ import logging
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+from launch_scripts.check.scenario_check import files_of
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.process_table import TABLE
 from shared_map.keeper.base_map import NEEDED
@@ -16,7 +17,6 @@ from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
 from shared_map.terrain.terrain import build_truth
 from swarm.bus.zenoh_bus import open_bus
-from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
@@ -28,13 +28,9 @@ log = logging.getLogger(__name__)
 
 def missing_files(scenario: Scenario) -> list[str]:
     """Files of the terrain which are missing on this machine, and cost layers whose module is."""
-    terrain = scenario.terrain
-    source = None if terrain.source in BUILT_IN_TERRAINS else terrain.source
-    zones = [zone.mask or zone.file for zone in scenario.cost.zones]
-    codes = None if terrain.cover_codes in COVER_TABLES else terrain.cover_codes
-    named = [source, terrain.photo, terrain.labels, terrain.cover, codes, *zones]
+    named = [name for key, name in files_of(scenario).items() if not key.startswith("terrain.hidden")]
     layers = [each.name for each in cost_layers_of(scenario) if not source_of(each, scenario.plugin_folder)]
-    return [*(name for name in named if name is not None and not Path(name).is_file()), *layers]
+    return [*(name for name in named if not Path(name).is_file()), *layers]
 
 
 def find_members(scenario: Scenario) -> list[RunInfo]:

@@ -136,7 +136,7 @@ class WarmUp:
     def _probe(self) -> None:
         """The forkserver answers once it has loaded everything; its child tells what is missing."""
         found, tell = self._context.Pipe(duplex=False)
-        self._start(_find_missing if self._scenario else _find_nothing, tell, self._scenario).join()
+        self._start(_find_missing, tell, self._scenario).join()
         tell.close()
         first, others = found.recv()
         self._first, self._left, self._all = set(first), {*first, *others}, {*first, *others}
@@ -177,20 +177,19 @@ class WarmUp:
         return process
 
 
-def _find_nothing(tell: Connection, _: None) -> None:
-    _say(tell, ((), ()))
+def _find_missing(tell: Connection, scenario: Scenario | None) -> None:
+    """Tell the names of kernels that are not compiled: of those for a first route, and of the others. Without a
+    scenario there are none."""
+    first: list[str] = []
+    others: list[str] = []
+    if scenario is not None:
+        from planner_service.kernel_build import can_build, missing, name_of, needed_kernels
 
-
-def _find_missing(tell: Connection, scenario: Scenario) -> None:
-    """Tell the names of kernels that are not compiled: of those for a first route, and of the others."""
-    from planner_service.kernel_build import can_build, missing, name_of, needed_kernels
-
-    if not can_build():
-        _say(tell, ((), ()))
-        return
-    needed = needed_kernels(scenario)
-    first, others = missing(needed.first), missing((*needed.classes, *needed.later))
-    _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
+        if can_build():
+            needed = needed_kernels(scenario)
+            first = list(map(name_of, missing(needed.first)))
+            others = list(map(name_of, missing((*needed.classes, *needed.later))))
+    _say(tell, (first, others))
 
 
 def _build(tell: Connection, scenario: Scenario) -> None:
