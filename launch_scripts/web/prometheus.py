@@ -18,13 +18,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from prometheus_client.exposition import choose_encoder
-from prometheus_client.metrics_core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-    HistogramMetricFamily,
-    InfoMetricFamily,
-    Metric,
-)
+from prometheus_client.metrics_core import CounterMetricFamily as Counter
+from prometheus_client.metrics_core import GaugeMetricFamily as Gauge
+from prometheus_client.metrics_core import HistogramMetricFamily as HistogramOf
+from prometheus_client.metrics_core import InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from launch_scripts.observe.counts import Counts
@@ -47,29 +44,11 @@ _TAKEN = ("_total", "_count", "_sum", "_bucket", "_created", "_info", "_gcount",
 _UNITS = {"_ms": ("_seconds", 1e-3), "_us": ("_seconds", 1e-6), "_ns": ("_seconds", 1e-9)}
 """Ending of our names -> ending that Prometheus has for the unit, and what one is worth in it."""
 _SPLIT = {
-    "vehicles_": ("vehicles", "state", "Vehicles in each state"),
-    THROTTLED: (
-        "author_throttled",
-        "author",
-        "1 while a keeper delays the marks of an author that exceeds its quota",
-    ),
-    LEARNED: (
-        "learned_pace_ratio",
-        "ground",
-        "What the prior pace of a class of ground is multiplied by, as vehicles have measured",
-    ),
+    "vehicles_": ("vehicles", "state"),
+    THROTTLED: ("author_throttled", "author"),
+    LEARNED: ("learned_pace_ratio", "ground"),
 }
-"""Beginning of our gauges' names -> their family, the label that holds the rest of the name, help."""
-_STATUS: tuple[tuple[str, str, Callable[[PlannerStatus], float | None]], ...] = (
-    ("vehicles_following", "Vehicles on a route to the target", lambda status: status.following),
-    (
-        "tree_age_seconds",
-        "Age of the planner's tree when it last said so",
-        lambda status: status.tree_age_ms * 1e-3,
-    ),
-    ("pose_age_seconds", "Time since the target's last pose", lambda status: status.pose_age_s),
-    ("lost", "1 while nobody tracks the target", lambda status: float(status.tracker_lost)),
-)
+"""Beginning of our gauges' names -> their family, and the label that holds the rest of the name."""
 _SCRAPE_WAITS_S = 5.0
 """Prometheus gives up after 10 s."""
 
@@ -109,12 +88,16 @@ class _Families:
     def __init__(self) -> None:
         self.made: dict[str, tuple[str, Any]] = {}
 
-    def add(self, kind: Any, name: str, text: str, labels: Mapping[str, str], *value: object, of: str = "") -> None:
+    def add(
+        self, kind: Any, name: str, labels: Mapping[str, str], *value: object, text: str = "", of: str = ""
+    ) -> None:
         """Adds a sample.
 
         value  as `kind.add_metric` takes it
+        text   the help; of families of ours that of the table
         of     the name on the wire; empty for families of ours
         """
+        text = text or _TABLES["families"][name]
         first = (of, kind(f"swarm_{name}", text, labels=tuple(labels)))
         owner, family = self.made.setdefault(name, first)
         if owner == of and type(family) is kind:
@@ -126,9 +109,8 @@ def families(figures: Figures) -> list[Metric]:
     made = _Families()
     if figures.run is not None:
         told = {"run_id": figures.run.run_id, "scenario": figures.run.scenario}
-        made.add(InfoMetricFamily, "run", "The run that all other figures are of", {}, told)
-        text = "When the run began, in seconds of Unix time"
-        made.add(GaugeMetricFamily, "run_start_time_seconds", text, {}, figures.run.started_ns / NS_PER_S)
+        made.add(InfoMetricFamily, "run", {}, told)
+        made.add(Gauge, "run_start_time_seconds", {}, figures.run.started_ns / NS_PER_S)
     _add_targets(made, figures)
     _add_processes(made, figures)
     return [family for _, (_, family) in sorted(made.made.items(), key=lambda item: item[0])]
@@ -136,49 +118,45 @@ def families(figures: Figures) -> list[Metric]:
 
 def _add_targets(made: _Families, figures: Figures) -> None:
     for target, count in figures.counts.counts_by(CAPTURES_OF).items():
-        text = "Times that the target was captured"
-        made.add(CounterMetricFamily, "target_captures", text, {"target": target}, count)
+        made.add(Counter, "target_captures", {"target": target}, count)
     for target, gaps in figures.counts.histograms_by(GAPS_TO).items():
-        text = "Proven distance from the optimum of routes that vehicles began, as a share of the optimum"
-        labels = {"target": target}
-        made.add(HistogramMetricFamily, "target_certified_gap_ratio", text, labels, *_buckets(gaps.buckets, 1.0))
+        made.add(HistogramOf, "target_certified_gap_ratio", {"target": target}, *_buckets(gaps.buckets, 1.0))
     for target, status in sorted(figures.status.items()):
-        for name, text, value in _STATUS:
-            if (told := value(status)) is not None:
-                made.add(GaugeMetricFamily, f"target_{name}", text, {"target": target}, told)
+        for name, value in {
+            "vehicles_following": status.following,
+            "tree_age_seconds": status.tree_age_ms * 1e-3,
+            "pose_age_seconds": status.pose_age_s,
+            "lost": float(status.tracker_lost),
+        }.items():
+            if value is not None:
+                made.add(Gauge, f"target_{name}", {"target": target}, value)
 
 
 def _add_processes(made: _Families, figures: Figures) -> None:
     newest = {key: ({"role": key[0], "id": key[1]}, stats) for key, stats in figures.counts.newest().items()}
     for role, id in sorted({*figures.up, *newest}):
-        text, alive = "1 while the process is alive", float((role, id) in figures.up)
-        made.add(GaugeMetricFamily, "process_up", text, {"role": role, "id": id}, alive)
+        made.add(Gauge, "process_up", {"role": role, "id": id}, float((role, id) in figures.up))
     for process, stats in newest.values():
-        text = "When the process began, in seconds of Unix time"
-        made.add(GaugeMetricFamily, "process_start_time_seconds", text, process, stats.incarnation / NS_PER_S)
-        text = "When the process told its figures last, in seconds of Unix time by its own clock"
-        made.add(GaugeMetricFamily, "process_reported_timestamp_seconds", text, process, stats.stamp_ns / NS_PER_S)
-    for kind, field in (
-        (CounterMetricFamily, "counts"),
-        (GaugeMetricFamily, "gauges"),
-        (HistogramMetricFamily, "histograms"),
-    ):
+        made.add(Gauge, "process_start_time_seconds", process, stats.incarnation / NS_PER_S)
+        made.add(Gauge, "process_reported_timestamp_seconds", process, stats.stamp_ns / NS_PER_S)
+    for kind, field in ((Counter, "counts"), (Gauge, "gauges"), (HistogramOf, "histograms")):
         told = [(process, getattr(stats, field)) for process, stats in newest.values()]
         for wire in sorted({name for _, values in told for name in values}):
-            name, worth, text = named(wire)
-            split = next((start for start in _SPLIT if field == "gauges" and wire.startswith(start)), None)
-            for process, values in told:
-                if wire not in values:
-                    continue
-                value = values[wire]
-                if split is not None:
-                    family, label, about = _SPLIT[split]
-                    rest = {label: wire.removeprefix(split)}
-                    made.add(kind, family, about, {**process, **rest}, value, of=split)
-                elif field == "histograms":
-                    made.add(kind, name, text, process, *_buckets(value, worth), of=wire)
-                else:
-                    made.add(kind, name, text, process, value * worth, of=wire)
+            _add_counted(made, kind, wire, [(each, values[wire]) for each, values in told if wire in values])
+
+
+def _add_counted(made: _Families, kind: Any, wire: str, told: Iterable[tuple[dict[str, str], Any]]) -> None:
+    """Adds what processes count under one name, which may be any text."""
+    name, worth, text = named(wire)
+    split = next((start for start in _SPLIT if kind is Gauge and wire.startswith(start)), None)
+    for process, value in told:
+        if split is not None:
+            family, label = _SPLIT[split]
+            made.add(kind, family, {**process, label: wire.removeprefix(split)}, value, of=split)
+        elif kind is HistogramOf:
+            made.add(kind, name, process, *_buckets(value, worth), text=text, of=wire)
+        else:
+            made.add(kind, name, process, value * worth, text=text, of=wire)
 
 
 def named(wire: str) -> tuple[str, float, str]:

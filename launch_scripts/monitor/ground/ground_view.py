@@ -277,16 +277,13 @@ class GroundView:
         length_m = round_length(_BAR_SHARE * mesh.width_m)
         south, beneath = -mesh.depth_m - 3 * unit, -mesh.depth_m - 4.5 * unit
         east = mesh.width_m - unit
-        ends = [[(0, south, 0), (length_m, south, 0)]]
-        bar = rr.LineStrips3D(ends, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
-        self._pen.rec.log("world/margin", bar, static=True)
-        arrow = rr.Arrows3D(
-            origins=[(east, south - 2.5 * unit, 0)],
-            vectors=[(0, 4 * unit, 0)],
-            colors=[_MARGIN_COLOUR],
-            radii=[0.15 * unit],
-        )
-        self._pen.rec.log("world/margin/north", arrow, static=True)
+        shapes = [[(0, south), (length_m, south)]]
+        shapes += [[(x, south - unit / 2), (x, south + unit / 2)] for x in (0, length_m / 2, length_m)]
+        tip = (east, south + 1.5 * unit)
+        shapes += [[(east, south - 2.5 * unit), tip], [(east - 0.8 * unit, south), tip, (east + 0.8 * unit, south)]]
+        lines = [np.pad(np.array(shape, np.float32), ((0, 0), (0, 1))) for shape in shapes]
+        margin = rr.LineStrips3D(lines, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
+        self._pen.rec.log("world/margin", margin, static=True)
         texts = {
             "0": (0, beneath),
             said_length(length_m): (length_m, beneath),
