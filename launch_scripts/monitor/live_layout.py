@@ -1,4 +1,5 @@
-"""What the view looks like: the layers between which a person switches, their legends, and where all of it stands.
+"""What the view looks like: the layers between which a person switches, their legends, the figures beside them, and
+where all of it stands.
 
 A layer is a tab with the same swarm on other ground. A legend is a picture, as a text panel of the viewer can show
 neither colours nor pictures.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,12 +20,17 @@ from PIL import Image, ImageDraw, ImageFont
 from rerun.blueprint.encodings import TextLogColumn
 
 from launch_scripts.monitor.ground import ground_colours as colours
-from launch_scripts.monitor.ground.cost_to_go import unit_of
+from launch_scripts.monitor.ground.ground_colours import unit_of
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Look, level_for
-from launch_scripts.monitor.pen import Colour, screen
-from launch_scripts.observe import palette
+from launch_scripts.monitor.sinks import Colour, Pen, in_markdown, screen, shown
+from launch_scripts.observe import facts, palette
+from launch_scripts.observe.alarms import KINDS
+from launch_scripts.observe.history import Sample
+from launch_scripts.observe.state import RunState
 from swarm.config.scenario import Scenario
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.vehicles import VehicleState
 
 BACKGROUND = (17, 22, 28)
 WIDTH_PX, HEIGHT_PX = 1840, 156
@@ -40,6 +47,9 @@ ZONE_COLOURS: dict[str, Colour] = {
     "quick": colours.FAST_MARK,
     "pace": palette.rgb(palette.PINK),
 }
+_WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside", "teleported")
+_SHOWN_TARGETS = 12
+_SHOWN_ALARMS = 8
 
 
 class Layer(NamedTuple):
@@ -313,3 +323,66 @@ def _log() -> rrb.TextLogView:
         name="Log",
         columns=rrb.TextLogColumns(text_log_columns=columns, timeline_columns=["sim_time"]),
     )
+
+
+class FiguresPanel:
+    """Logs plots, the summary and notes."""
+
+    def __init__(self, pen: Pen, target_ids: Sequence[str]) -> None:
+        self._pen = pen
+        self._target_ids = list(target_ids)
+
+    def begin(self) -> None:
+        """Logs what never changes: the styles."""
+        targets = [HUES[n % len(HUES)] for n in range(len(self._target_ids))]
+        states = [state.name.lower() for state in VehicleState]
+        for chart, names, hues in (
+            ("states", states, HUES[: len(states)]),
+            ("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)]),
+            ("gap", self._target_ids, targets),
+            ("growth_ms", self._target_ids, targets),
+            ("messages", ["all processes"], [(86, 180, 233)]),
+        ):
+            self._pen.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=hues, widths=1.5), static=True)
+
+    def plots(self, sample: Sample) -> None:
+        """Logs a point of each line whose value is known."""
+        excess = {id: (gap - 1) * 100 for id, gap in sample.gaps.items()}
+        charts: dict[str, Sequence[float | None]] = {
+            "states": [float(n) for n in sample.states],
+            "captures_and_marks": [sample.captures, None if sample.marks is None else sample.marks / 100],
+            "gap": [excess.get(id) for id in self._target_ids],
+            "growth_ms": [sample.growth_ms.get(id) for id in self._target_ids],
+            "messages": [sample.messages_per_s],
+        }
+        for chart, values in charts.items():
+            if any(value is not None for value in values):
+                numbers = np.array([math.nan if value is None else value for value in values])
+                self._pen.log(f"plots/{chart}", rr.Scalars(numbers))
+
+    def summary(self, markdown: str) -> None:
+        """Logs the text beside the view."""
+        self._pen.log("summary", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def note(self, text: str, level: str) -> None:
+        """Logs a line, at a level as rerun names it."""
+        self._pen.log("log", rr.TextLog(shown(text), level=level))
+
+
+def level_of(kind: str) -> str:
+    """Log level of a note, as rerun names it."""
+    return "WARN" if kind in KINDS or any(word in kind for word in _WARNINGS) else "INFO"
+
+
+def summary_markdown(setup: RoleSetup, state: RunState) -> str:
+    """The state of a run, as Markdown."""
+    time = facts.fact("elapsed_s")
+    lines = [f"**{in_markdown(setup.scenario.name)}**, {time.label} {time.shown(state)}  "]
+    lines += [f"{line}  " for line in facts.lines(state)]
+    lines += [f"**{in_markdown(line)}**  " for line in facts.alarm_lines(state, _SHOWN_ALARMS)]
+    labels, rows = facts.table(state)
+    lines += ["", f"| {' | '.join(labels)} |", f"|{'---|' * len(labels)}"]
+    lines += [f"| {' | '.join(map(in_markdown, row))} |" for row in rows[:_SHOWN_TARGETS]]
+    if len(rows) > _SHOWN_TARGETS:
+        lines.append(f"\n{len(rows) - _SHOWN_TARGETS} more targets")
+    return "\n".join(lines)

@@ -11,13 +11,17 @@ import logging
 from collections.abc import Callable
 from functools import partial
 
-from launch_scripts.monitor.figures_panel import FiguresPanel, level_of, summary_markdown
 from launch_scripts.monitor.ground.ground_view import GroundView, Scene, scenario_areas
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.live_layout import make_blueprint, shown_layers
+from launch_scripts.monitor.live_layout import (
+    FiguresPanel,
+    level_of,
+    make_blueprint,
+    shown_layers,
+    summary_markdown,
+)
 from launch_scripts.monitor.movers.movers_view import MoversView
-from launch_scripts.monitor.pen import Pen
-from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.sinks import Pen, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.web.server import Audience
@@ -97,7 +101,7 @@ class MonitorService:
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        self._panel = FiguresPanel(scene.pen.rec, scenario.target_ids)
+        self._panel = FiguresPanel(scene.pen, scenario.target_ids)
         self._movers = MoversView(scene.pen, scenario, self.figures, self.counters, replica.filter)
         self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
         self._observer = RunObserver(bus, post, self.figures, _READ)
@@ -128,7 +132,7 @@ class MonitorService:
         self._observer.ask_gone()
         self.figures.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)
-        self._panel.set_time(0, 0.0)
+        self._pen.set_time(0, 0.0)
         self._begin_drawing()
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -231,7 +235,7 @@ class MonitorService:
             self._hear(heard, now_ns)
         self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
-        self._panel.set_time(self._frame, self.at_s)
+        self._pen.set_time(self._frame, self.at_s)
         self._watch_recording(now_ns)
         if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
             self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
@@ -245,7 +249,7 @@ class MonitorService:
         self._movers.tick(now_ns, self._watched)
         self._draw_plots(now_ns)
         if self._watched:
-            self._pen.rec.flush(timeout_sec=0)  # else rerun packs what is logged within a second together
+            self._pen.flush()
 
     def _draw_plots(self, now_ns: int) -> None:
         sample = self.figures.samples.last

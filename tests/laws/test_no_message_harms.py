@@ -22,8 +22,8 @@ from support.wire_strategies import types_of_the_wire
 from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.pen import Pen
 from launch_scripts.monitor.service import MonitorService
+from launch_scripts.monitor.sinks import Pen
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.service import PlannerService
 from shared_map.arrays import Floats
@@ -183,7 +183,7 @@ class Lied(SwarmModel):
                     self.stores.append(KeeperStore(":memory:"))
                     return KeeperService(setup, terrain, bus, post, self.stores[-1])
                 case "monitor":
-                    scene = Scene(Pen(rr.RecordingStream("lied"), TerrainMesh(terrain)))
+                    scene = Scene(Pen([rr.RecordingStream("lied")], TerrainMesh(terrain)))
                     return MonitorService(setup, terrain, bus, post, scene)
                 case "planner":
                     return PlannerService(setup, terrain, bus, post, InlineWorker(self.scheduler))

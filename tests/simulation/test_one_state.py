@@ -17,8 +17,8 @@ from launch_scripts.launcher.tables import live_table
 from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.vehicles_view import _DOES
-from launch_scripts.monitor.pen import Pen
 from launch_scripts.monitor.service import MonitorService
+from launch_scripts.monitor.sinks import Pen
 from launch_scripts.observe import facts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.state import RunState
@@ -163,7 +163,7 @@ class Watched:
         def post(event: Event) -> None:
             self.monitor.handle(event, clock.now_ns())
 
-        scene = Scene(Pen(self.logged, TerrainMesh(terrain)))  # type: ignore[arg-type]
+        scene = Scene(Pen([self.logged], TerrainMesh(terrain)))  # type: ignore[arg-type]
         self.monitor = MonitorService(setup, terrain, bus, post, scene)
         self.watching = True
         simulation.scheduler.after(1, self._start)

@@ -17,12 +17,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from launch_scripts.monitor import live_layout
-from launch_scripts.monitor.ground.cost_to_go import CostSamples, TargetPictures
-from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW, GroundColours
+from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW, CostSamples, GroundColours, TargetPictures
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
 from launch_scripts.monitor.live_layout import COST, KNOWN, LEARNED, NEAREST, PHOTO, Layer
 from launch_scripts.monitor.movers.styles import Look
-from launch_scripts.monitor.pen import Pen, even, screen
+from launch_scripts.monitor.sinks import Pen, even, screen
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zones import cells_of_zones
@@ -157,13 +156,13 @@ class GroundView:
 
     def begin(self) -> None:
         """Draws all of it. What never changes is static: the shape of the ground, legends, the scenario's zones."""
-        self._pen.rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._pen.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         tiled = [each.layer for each in self._layers]
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
         for layer in self._shown:
             for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in tiled else whole):
-                self._pen.rec.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
+                self._pen.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
             self._legend(layer, live_layout.still_legend(layer, self._colours, self._target_ids, self._movers))
         self._pen.style("world/windows", _LINE_PX, WINDOW)
         self._pen.label_style("world/windows/names", WINDOW)
@@ -243,18 +242,18 @@ class GroundView:
         form = rr.components.ImageFormat(width=width, height=height, color_model="RGB", channel_datatype="U8")
         pixels = np.ascontiguousarray(image).tobytes()
         texture = rr.Mesh3D.from_fields(albedo_texture_buffer=pixels, albedo_texture_format=form)
-        self._pen.rec.log(f"{entity}/{tile}", texture)
+        self._pen.log(f"{entity}/{tile}", texture)
 
     def _legend(self, layer: Layer, picture: bytes | None) -> None:
         if picture is not None:
             image = rr.EncodedImage(contents=picture, media_type="image/png")
-            self._pen.rec.log(f"legend/{layer.name}", image, static=True)
+            self._pen.log(f"legend/{layer.name}", image, static=True)
 
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
         self._texture(layer.entity, 0, self._pictures.to_target(target))
         lines, radii = self._pictures.tree(target)
-        self._pen.rec.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
+        self._pen.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
             self._legend(layer, live_layout.to_target_legend(target, self._pictures.full_s, self._movers))
 
@@ -264,7 +263,7 @@ class GroundView:
         per_zone = np.array([live_layout.ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         path = f"world/zones/{whose}"
-        self._pen.rec.log(path, rr.LineStrips3D(strips, colors=colours, radii=[screen(_LINE_PX)]), static=static)
+        self._pen.log(path, rr.LineStrips3D(strips, colors=colours, radii=[screen(_LINE_PX)]), static=static)
         named = zones[:_NAMES_SHOWN]
         pale = (per_zone[:_NAMES_SHOWN].astype(np.uint16) + 2 * 255) // 3  # on their own hatches names would drown
         titles, places = [area.title for area in named], title_places(self._mesh, named)
@@ -283,7 +282,7 @@ class GroundView:
         shapes += [[(east, south - 2.5 * unit), tip], [(east - 0.8 * unit, south), tip, (east + 0.8 * unit, south)]]
         lines = [np.pad(np.array(shape, np.float32), ((0, 0), (0, 1))) for shape in shapes]
         margin = rr.LineStrips3D(lines, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
-        self._pen.rec.log("world/margin", margin, static=True)
+        self._pen.log("world/margin", margin, static=True)
         texts = {
             "0": (0, beneath),
             said_length(length_m): (length_m, beneath),

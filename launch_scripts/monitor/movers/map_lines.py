@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.monitor.pen import Strips, even, ragged
+from launch_scripts.monitor.sinks import Strips, even, ragged
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 Cells = NDArray[np.int64]

@@ -18,7 +18,7 @@ from launch_scripts.monitor.movers import styles
 from launch_scripts.monitor.movers.map_lines import feet, poles, rings
 from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY, mixed
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.pen import LABEL_COLOUR, Colour, Pen, screen, shown
+from launch_scripts.monitor.sinks import LABEL_COLOUR, Colour, Pen, screen, shown
 from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.facts import TARGET_FACTS
 from launch_scripts.observe.latest_state import VehicleColumns
@@ -110,14 +110,14 @@ class MoversView:
         self._pen.style("world/targets/sighted", 1.2, styles.SIGHTED_COLOUR)
         self._pen.style("world/alarms/poles", 1.8)
         balls = rr.Points3D.from_fields(radii=[screen(5.0)], show_labels=True)
-        self._pen.rec.log("world/alarms/marks", balls, static=True)
+        self._pen.log("world/alarms/marks", balls, static=True)
         for entity in ("world/targets/names", "world/targets/sighted/names"):
             self._pen.label_style(entity)
         self.draw_anew()
         if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
             px = self._level.radius_px + 2.5
             halo = rr.Points3D([(0, 0, 0)], colors=[LABEL_COLOUR], radii=[screen(px)])
-            self._pen.rec.log(f"{FOLLOWED_ENTITY}/halo", halo, static=True)
+            self._pen.log(f"{FOLLOWED_ENTITY}/halo", halo, static=True)
             self._log_followed((self._mesh.width_m / 2, self._mesh.depth_m / 2))
 
     def draw_anew(self) -> None:
@@ -217,7 +217,7 @@ class MoversView:
         if self._pen.news("world/bodies/discs", centres=centres, sizes=sizes):
             colours = [styles.BODY_COLOUR]
             discs = rr.Ellipsoids3D(centers=centres, half_sizes=sizes, colors=colours, fill_mode="solid")
-            self._pen.rec.log("world/bodies/discs", discs)
+            self._pen.log("world/bodies/discs", discs)
         tops = centres + sizes * np.array([0, 0, 1], np.float32)
         white = np.full((len(tops), 3), 225, np.uint8)
         told = {"body": [body_details(each) for each in bodies]}
@@ -245,7 +245,7 @@ class MoversView:
 
     def _log_followed(self, place_m: Place) -> None:
         [place] = self._pen.placed([place_m], 0.1)
-        self._pen.rec.log(FOLLOWED_ENTITY, rr.Transform3D.from_fields(translation=place))
+        self._pen.log(FOLLOWED_ENTITY, rr.Transform3D.from_fields(translation=place))
 
     def _discs(self, there: Sequence[Sighted | Body], radii_m: list[float], above: float) -> tuple[Floats, Floats]:
         """Centres float32 (n, 3), and radii float32 (n,), m, that are seen."""

@@ -16,7 +16,7 @@ from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMes
 from launch_scripts.monitor.movers import map_lines
 from launch_scripts.monitor.movers.map_lines import RouteNow, Trails
 from launch_scripts.monitor.movers.styles import Level, Looks, RateLimit, dimmed
-from launch_scripts.monitor.pen import LABEL_COLOUR, Pen, screen
+from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, screen
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.latest_state import LatestState, VehicleColumns
 from swarm.clock import NS_PER_S
@@ -162,7 +162,7 @@ class VehiclesView:
         if self._pen.news("world/guests/frames", centres=guests):
             sides, radii = np.full(guests.shape, 0.5 * self._mesh.scale_m, np.float32), [screen(1.0)]
             boxes = rr.Boxes3D(centers=guests, half_sizes=sides, colors=[LABEL_COLOUR], radii=radii)
-            self._pen.rec.log("world/guests/frames", boxes)
+            self._pen.log("world/guests/frames", boxes)
         if self._level.names and len(positions) <= self._level.most:
             above = np.array([0, 0, 0.8 * self._mesh.scale_m], np.float32)
             self._pen.points("world/vehicles/names", positions=positions + above, labels=vehicles.ids)

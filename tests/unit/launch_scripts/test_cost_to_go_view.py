@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from skimage.graph import MCP_Geometric
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.ground.cost_to_go import (
+from launch_scripts.monitor.ground.ground_colours import (
+    UNREACHED,
     CostSamples,
+    GroundColours,
     TargetPictures,
     coarse_tree,
     full_scale_s,
     nearest_target,
     unit_of,
 )
-from launch_scripts.monitor.ground.ground_colours import UNREACHED, GroundColours
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Asked, Event

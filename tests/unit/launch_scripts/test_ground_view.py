@@ -49,7 +49,7 @@ from launch_scripts.monitor.live_layout import (
     to_target_legend,
 )
 from launch_scripts.monitor.movers.styles import Looks
-from launch_scripts.monitor.pen import Pen
+from launch_scripts.monitor.sinks import Pen
 from shared_map.cost_map import CostMap
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
@@ -197,7 +197,7 @@ def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: i
     logged: dict[str, Any] = {}
     rec = rr.RecordingStream("margin", recording_id="r")
     rec.log = lambda path, what, static: logged.__setitem__(path, what)  # type: ignore[method-assign,assignment]
-    scene = Scene(Pen(rec, TerrainMesh(terrain)))
+    scene = Scene(Pen([rec], TerrainMesh(terrain)))
     GroundView(scene, terrain, CostMap(terrain), MapReplica(terrain.grid), zoned(""))._draw_margin()
     lines = logged["world/margin"].strips.as_arrow_array().to_pylist()
     start, end = lines[0]
@@ -240,7 +240,7 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
     rec = rr.RecordingStream("names", recording_id="r")
     rec.set_sinks(rr.FileSink(str(tmp_path / "names.rrd"), write_footer=False))
     drawn: dict[str, Any] = {}
-    view = GroundView(Scene(Pen(rec, mesh)), terrain, cost_map, replica, zoned(""))
+    view = GroundView(Scene(Pen([rec], mesh)), terrain, cost_map, replica, zoned(""))
     rec.log = lambda path, what, static=False: drawn.__setitem__(path, what)  # type: ignore[method-assign]
     for count, named in ((3, {"t0", "t1", "t2"}), (6, {"t5"})):
         for n in range(count):
@@ -262,7 +262,7 @@ def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
 def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
     terrain = flat()
     cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
-    scene = Scene(Pen(rr.RecordingStream("same", recording_id="r"), TerrainMesh(terrain)), [PHOTO, COST])
+    scene = Scene(Pen([rr.RecordingStream("same", recording_id="r")], TerrainMesh(terrain)), [PHOTO, COST])
     view = GroundView(scene, terrain, cost_map, replica, zoned(""))
     logged: list[str] = []
     view._texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]

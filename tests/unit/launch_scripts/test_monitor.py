@@ -513,8 +513,9 @@ limit(300_000)
 for second in range(110):
     if second == 90:
         limit(hard)
-    sinks.streams.set_time("tick", sequence=second)
-    sinks.streams.log("a", rr.Points3D(numpy.random.rand(2000, 3)))
+    for stream in sinks.streams:
+        stream.set_time("tick", sequence=second)
+        stream.log("a", rr.Points3D(numpy.random.rand(2000, 3)))
     time.sleep(0.12)  # in which what is logged is written
     sentence, begun = watch.check(second * 10**9)
     if sentence:
@@ -543,8 +544,9 @@ sinks, watch = open_recording({str(tmp_path)!r})
 for second in range(20):
     if second == 8:
         limit(hard)
-    sinks.streams.set_time("tick", sequence=second)
-    sinks.streams.log("a", rr.Scalars(second))
+    for stream in sinks.streams:
+        stream.set_time("tick", sequence=second)
+        stream.log("a", rr.Scalars(second))
     sentence, begun = watch.check(second * 10**9)
     if sentence:
         print(second, begun, sentence, flush=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.ground.ground_colours import LETHAL_MARK, GroundColours
 from launch_scripts.monitor.ground.ground_view import window_outlines
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.monitor.live_layout import level_of, summary_markdown
 from launch_scripts.observe.recorder import Recorder
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario

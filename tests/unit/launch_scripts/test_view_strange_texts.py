@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from support.monitor_rig import Rig, little_scenario, little_terrain
 
-from launch_scripts.monitor.pen import in_markdown, shown
+from launch_scripts.monitor.sinks import in_markdown, shown
 from swarm.wire.messages.planning import PlannerStatus
 
 
