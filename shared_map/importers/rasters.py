@@ -16,14 +16,8 @@ from typing import Any
 import numpy as np
 
 from shared_map.arrays import Bools, Floats
+from shared_map.importers.cover import cover_meaning
 from shared_map.importers.cover.cover_codes import TABLES, legend_of, some
-from shared_map.importers.cover.cover_meaning import (
-    evidence_of,
-    meaning_of,
-    recognise,
-    sampled_codes,
-    sampled_colours,
-)
 from shared_map.importers.cover.land_cover import read_cover
 from shared_map.importers.encoded_heights import TITLES, Encoding, encodings_of, heights_decoded
 from shared_map.importers.georeference import crs_of, overruled, plan_grid
@@ -124,7 +118,7 @@ def _of_colours(dataset: Any, what: str) -> Contents:
     settings = " or ".join(f"terrain.elevation_encoding = {encoding!r}" for encoding in TITLES)
     if fitting:
         raise TerrainError(f"{what} may be heights of Terrain-RGB or of Terrarium; set {settings}")
-    if legend_of(sampled_colours(dataset), what) is not None:
+    if legend_of(cover_meaning.sampled_colours(dataset), what) is not None:
         return Contents(is_cover=True)
     raise TerrainError(
         f"{what} has {dataset.count} bands: a photo? Name it in terrain.photo; of heights stored as colours"
@@ -144,7 +138,7 @@ def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
     gappy = {key: [*table.grounds, *table.nothing] for key, table in TABLES.items() if table.gappy}
     if not has_palette and not any(np.isin(values, codes).all() for codes in gappy.values()):
         return Contents()
-    sample = sampled_codes(dataset, what)
+    sample = cover_meaning.sampled_codes(dataset, what)
     codes = np.unique(sample)
     if not 0 < codes.size <= _MOST_CODES:
         return Contents()
@@ -152,7 +146,7 @@ def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
         "terrain.cover_codes = {} if it is land cover, terrain.elevation_encoding = 'metres' if it has heights"
     )
     if has_palette:
-        if meaning_of(dataset, what, config) is not None:
+        if cover_meaning.meaning_of(dataset, what, config) is not None:
             return Contents(is_cover=True)
         raise TerrainError(
             f"{what} has a palette, and its codes ({some(codes.tolist())}) are those of no built-in table; set "
@@ -161,9 +155,9 @@ def _of_numbers(dataset: Any, what: str, config: TerrainConfig) -> Contents:
     fits = [TABLES[key] for key, known in gappy.items() if np.isin(codes, known).all()]
     if not fits:
         return Contents()
-    found = evidence_of(dataset, sample)
+    found = cover_meaning.evidence_of(dataset, sample)
     if found.names or any(word in found.text for table in fits for word in table.words):
-        return Contents(is_cover=recognise(found, what) is not None)
+        return Contents(is_cover=cover_meaning.recognise(found, what) is not None)
     if all(np.isin(codes, list(table.grounds)).sum() < _LEAST_CODES for table in fits):
         return Contents()
     titles = " and of ".join(table.title for table in fits)
@@ -312,18 +306,11 @@ def _level_on(dataset: Any, mask: Bools, place: _Place, grid: GridSpec, target: 
 
 
 def _read_straight(dataset: Any, row0: int, row1: int, band: Floats, voids: Sequence[float]) -> None:
-    from rasterio.enums import MaskFlags
     from rasterio.windows import Window
 
     window = Window(0, row0, dataset.width, row1 - row0)
-    raw = dataset.read(1, window=window)
-    np.copyto(band, raw, casting="unsafe")
-    flags = dataset.mask_flag_enums[0]
-    if dataset.nodata is not None and MaskFlags.nodata in flags:
-        if not math.isnan(dataset.nodata):
-            band[raw == np.asarray(dataset.nodata).astype(raw.dtype)] = np.nan
-    elif MaskFlags.all_valid not in flags:
-        band[dataset.read_masks(1, window=window) == 0] = np.nan
+    np.copyto(band, dataset.read(1, window=window), casting="unsafe")
+    band[dataset.read_masks(1, window=window) == 0] = np.nan
     if voids:
         band[:] = without(band, voids)
 

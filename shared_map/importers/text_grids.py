@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,6 @@ from swarm.grid import MAX_CELLS
 
 _KIND = FileKind.POINTS
 _CHUNK_BYTES = 4 << 20
-_MOST_KEPT = 1 << 22
-"""Of more points than these the file is read twice, instead of being held."""
 _MOST_STEPS = 1 << 20
 """More places along one axis are no grid."""
 _SAME = 1e-6
@@ -39,8 +37,7 @@ _DEGREES = ("lon", "long", "lng", "longitude", "lat", "latitude")
 Points = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class _Layout:
+class _Layout(NamedTuple):
     """How a text is laid out.
 
     delimiter      between numbers; None is any blank
@@ -105,8 +102,7 @@ def _layout(path: Path) -> _Layout:
     trailing = delimiter is not None and data.rstrip(" \r").endswith(delimiter)
     header = [word.strip(" \"'\r").lower() for word in (first.strip("#").split(delimiter))]
     if has_header:
-        found = [next((header.index(name) for name in names if name in header), None) for names in (_X, _Y, _Z)]
-        x, y, z = found
+        x, y, z = (next((header.index(name) for name in names if name in header), None) for names in (_X, _Y, _Z))
         if x is None or y is None or z is None:
             raise TerrainError(
                 f"terrain {path}, line 1: {first[:60]!r} are no numbers, and name no x, y, z or lon, lat, z"
@@ -215,9 +211,8 @@ def _rows_of_heights(path: Path, layout: _Layout) -> PlainGrid:
     cells = 0
     for part in _numbers(path, layout):
         if parts and part.shape[1] != parts[0].shape[1]:
-            raise TerrainError(
-                f"terrain {path} is ragged: it has lines of {parts[0].shape[1]} and of {part.shape[1]} heights"
-            )
+            both = f"{parts[0].shape[1]} and of {part.shape[1]}"
+            raise TerrainError(f"terrain {path} is ragged: it has lines of {both} heights")
         cells += part.size
         if cells > MAX_CELLS:
             raise TerrainError(f"terrain {path} has more than {MAX_CELLS} heights; crop it")
@@ -230,19 +225,17 @@ def _rows_of_heights(path: Path, layout: _Layout) -> PlainGrid:
 # --- points -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Axis:
+class _Axis(NamedTuple):
     """Middles of cells along x or y: the first, the last, how far apart, how many."""
 
     first: float
     last: float
     step: float
-    count: int
+    cells: int
 
 
 def _points(path: Path, layout: _Layout) -> PlainGrid:
     xs = ys = np.zeros(0)
-    kept: list[Points] | None = []
     total = 0
     for part in _numbers(path, layout):
         xs, ys = (np.unique(np.concatenate((known, part[:, n]))) for n, known in ((0, xs), (1, ys)))
@@ -251,22 +244,18 @@ def _points(path: Path, layout: _Layout) -> PlainGrid:
         total += len(part)
         if max(len(xs), len(ys)) > _MOST_STEPS:
             raise _irregular(path, f"x and y have more than {_MOST_STEPS} different values")
-        if kept is not None:
-            kept.append(part)
-        if total > _MOST_KEPT:
-            kept = None
     across, down = _axis(xs, "x", path), _axis(ys, "y", path)
-    cells = down.count * across.count
+    cells = down.cells * across.cells
     if total < _LEAST_FILLED * cells:
         raise _irregular(
             path, f"{total} points are {total / cells:.1%} of a grid of {across.step:g} x {down.step:g}"
         )
-    check_cells(down.count, across.count, path)
+    check_cells(down.cells, across.cells, path)
     heights = np.full(cells, np.nan, np.float32)
-    for part in _numbers(path, layout) if kept is None else kept:
+    for part in _numbers(path, layout):  # a second time: to hold the points would take ten times their grid
         col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
         row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
-        at, z = row * across.count + col, _heights(part[:, 2])
+        at, z = row * across.cells + col, _heights(part[:, 2])
         before = heights[at]
         heights[at] = z
         other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))
@@ -277,15 +266,9 @@ def _points(path: Path, layout: _Layout) -> PlainGrid:
     notes = [f"{total} points x, y, z, {across.step:g} x {down.step:g} apart, the middles of cells"]
     if missing:
         notes.append(f"{missing} points of the grid ({missing / cells:.1%}) are missing or have no height: voids")
-    return PlainGrid(
-        heights.reshape(down.count, across.count),
-        None,
-        (across.step, down.step),
-        across.first - across.step / 2,
-        down.last + down.step / 2,
-        degrees=layout.degrees,
-        notes=tuple(notes),
-    )
+    west, north = across.first - across.step / 2, down.last + down.step / 2
+    grid, steps = heights.reshape(down.cells, across.cells), (across.step, down.step)
+    return PlainGrid(grid, None, steps, west, north, degrees=layout.degrees, notes=tuple(notes))
 
 
 def _axis(values: NDArray[np.float64], name: str, path: Path) -> _Axis:

@@ -18,21 +18,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.importers.cover.cover_codes import (
-    LEAST_DISTINCT,
-    MOST_COLOURS,
-    OTHERS,
-    SAME_COLOUR,
-    TABLES,
-    CoverTable,
-    Rgb,
-    joined,
-    legend_codes,
-    legend_of,
-    own_grounds,
-    some,
-    table_named,
-)
+from shared_map.importers.cover import cover_codes
+from shared_map.importers.cover.cover_codes import TABLES, CoverTable, joined, legend_codes, legend_of, some
 from shared_map.importers.raster_files import middle_of, opened, thinned
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
@@ -66,8 +53,8 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None
 
     Raises TerrainError if it holds no codes, or if several tables fit.
     """
-    own = own_grounds(config.cover_classes)
-    given = None if config.cover_codes is None else table_named(config.cover_codes)
+    own = cover_codes.own_grounds(config.cover_classes)
+    given = None if config.cover_codes is None else cover_codes.table_named(config.cover_codes)
     said = f"as terrain.cover_codes = {config.cover_codes!r} says"
     if dataset.count >= 3:
         how = "drawn in the colours of its legend" if given is None else f"drawn in its colours, {said}"
@@ -113,7 +100,7 @@ class Evidence:
     """
 
     counts: Mapping[int, int]
-    palette: Mapping[int, Rgb]
+    palette: Mapping[int, cover_codes.Rgb]
     names: Mapping[int, str]
     text: str
     middle: tuple[float, float] | None
@@ -207,7 +194,7 @@ def sampled_colours(dataset: Any) -> NDArray[np.int32]:
     if any(dtype != "uint8" for dtype in dataset.dtypes[:3]):
         return none
     middle = joined(dataset.read((1, 2, 3), window=middle_of(dataset, _LOOK_CELLS)))
-    if np.unique(middle).size > MOST_COLOURS:
+    if np.unique(middle).size > cover_codes.MOST_COLOURS:
         return none
     every = _every(dataset)
     shown = thinned(lambda _, **window: dataset.dataset_mask(**window), dataset, None, every) > 0
@@ -242,7 +229,7 @@ def recognise(found: Evidence, what: str) -> tuple[CoverTable, str] | None:
         ("its name or metadata", [table for table in fits if any(word in found.text for word in table.words)]),
         ("its codes", by_codes),
     ):
-        others = [title for title, codes in OTHERS.items() if how == "its codes" and there <= codes]
+        others = [title for title, codes in cover_codes.OTHERS.items() if how == "its codes" and there <= codes]
         near = [table for table in chosen if _is_there(found, table)]
         if len(chosen) == 1 and not others:
             return chosen[0], how
@@ -261,11 +248,11 @@ def recognise(found: Evidence, what: str) -> tuple[CoverTable, str] | None:
 def _has_its_colours(found: Evidence, table: CoverTable) -> bool:
     """True if the codes that are there have the colours of the published legend."""
     alike = [
-        max(abs(a - b) for a, b in zip(found.palette[code], ground.colour, strict=True)) <= SAME_COLOUR
+        max(abs(a - b) for a, b in zip(found.palette[code], ground.colour, strict=True)) <= cover_codes.SAME_COLOUR
         for code, ground in table.grounds.items()
         if code in found.counts and code in found.palette and ground.colour is not None
     ]
-    return _most(alike, min(LEAST_DISTINCT, len(found.counts)))
+    return _most(alike, min(cover_codes.LEAST_DISTINCT, len(found.counts)))
 
 
 def _has_its_names(found: Evidence, table: CoverTable) -> bool:

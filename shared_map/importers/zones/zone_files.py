@@ -16,30 +16,11 @@ from shared_map.arrays import Bools, Floats
 from shared_map.importers.georeference import crs_name, system_named
 from shared_map.importers.onto_grid import grows, overlap, warped
 from shared_map.importers.raster_files import is_raster, opened
+from shared_map.importers.zones import vector_files, way_classes
 from shared_map.importers.zones.burn import Drawing, burn, burn_mask
-from shared_map.importers.zones.vector_files import (
-    Features,
-    Layer,
-    columns_of,
-    is_vector,
-    number,
-    open_layer,
-    read_features,
-)
+from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layer, read_features
 from shared_map.importers.zones.vector_shapes import Placing, Shapes
-from shared_map.importers.zones.way_classes import (
-    COLUMNS,
-    PACKED,
-    TAGS,
-    Kind,
-    Way,
-    class_of,
-    is_bridge,
-    is_tunnel,
-    unpacked,
-    way_of,
-    width_of,
-)
+from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec, Window
@@ -186,13 +167,13 @@ class _Worth:
                 of = f"{self._layer.what}: feature {id} of a {zone.kind} zone"
                 raise TerrainError(f"{of} cannot be used: {why}; mend or remove it")
             facts.skip(why, id)
-        rows = columns_of(features, self.columns)
+        rows = vector_files.columns_of(features, self.columns)
         ways = {}
         for n in sorted(set(placed.of.tolist())):
-            tags = unpacked(rows[n])
+            tags = way_classes.unpacked(rows[n])
             way = self._way(tags, features.ids[n])
             if way is not None:
-                bridge = self._kind == "road" and is_bridge(tags)
+                bridge = self._kind == "road" and way_classes.is_bridge(tags)
                 facts.bridges += bridge
                 ways[n] = way, bridge
         for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
@@ -207,7 +188,7 @@ class _Worth:
             self._facts.skip("without a class")
             return None
         if name:
-            way = way_of(kind, name, zone.classes)
+            way = way_classes.way_of(kind, name, zone.classes)
             if way is None:
                 self._facts.skip(f"of class {name[:40]}", id)
         elif zone.kind in ("pace", "factor") and zone.attribute is not None:
@@ -216,22 +197,24 @@ class _Worth:
             way = Way(0.0, zone.value or 1.0)
         if way is None:
             return None
-        if kind is not None and is_tunnel(tags):
+        if kind is not None and way_classes.is_tunnel(tags):
             self._facts.skip("below the ground", id)
             return None
         if name:
             self._facts.classes[name] += 1
         closes = zone.kind == "forbidden" or (kind == "water" and not name)
-        return Way(width_of(tags) or zone.width_m or way.width_m, None if closes else way.factor)
+        return Way(way_classes.width_of(tags) or zone.width_m or way.width_m, None if closes else way.factor)
 
     def _class_of(self, tags: dict[str, str]) -> str | None:
         attribute = self._zone.attribute
-        return tags.get(attribute or "") if self._kind is None else class_of(self._kind, tags, attribute)
+        return (
+            tags.get(attribute or "") if self._kind is None else way_classes.class_of(self._kind, tags, attribute)
+        )
 
     def _stated(self, tags: dict[str, str], id: str) -> Way | None:
         """The value that a feature's own attribute states."""
         name, kind = self._zone.attribute or "", self._zone.kind
-        value = number(tags.get(name))
+        value = vector_files.number(tags.get(name))
         if value is None or not _LEAST <= value <= _MOST:
             shown = tags.get(name, "nothing")[:40]
             self._facts.skip(f"whose {name} is no {kind} of {_LEAST:g} to {_MOST:g}", f"{id} ({shown})")

@@ -162,8 +162,7 @@ def test_what_is_no_text_or_has_no_lines_is_refused(tmp_path: Path) -> None:
             read_text_grid(path)
 
 
-def test_many_points_are_read_twice_instead_of_being_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_map.importers.text_grids._MOST_KEPT", 10)
+def test_points_are_read_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared_map.importers.text_grids._CHUNK_BYTES", 300)
     plain = read_text_grid(wrote(tmp_path / "a.csv", text_of(POINTS, ",", "x,y,z")))
     np.testing.assert_array_equal(plain.heights, GROUND)
