@@ -23,14 +23,24 @@ def hills(seed: int, relief_m: float, smooth_cells: float = 12.0) -> Floats:
     return np.asarray(rough / rough.max() * relief_m, np.float32)
 
 
-def written(path: Path, heights: Any, dtype: str = "float32", **profile: Any) -> Path:
+def written(path: Path, bands: Any, dtype: str | None = "float32", **profile: Any) -> Path:
+    """A raster of a band, (rows, cols), or of several; `dtype` None is that of the array."""
     import rasterio
     from rasterio.transform import from_origin
 
-    place = {"crs": "EPSG:32632", "transform": from_origin(500_000, 5_000_000, 20, 20), **profile}
-    rows, cols = heights.shape
-    with rasterio.open(path, "w", driver="GTiff", height=rows, width=cols, count=1, dtype=dtype, **place) as file:
-        file.write(heights.astype(dtype), 1)
+    bands = (bands if bands.ndim == 3 else bands[None]).astype(dtype or bands.dtype)
+    place = {
+        "driver": "GTiff",
+        "crs": "EPSG:32632",
+        "transform": from_origin(500_000, 5_000_000, 20, 20),
+        **profile,
+    }
+    later = {name: place.pop(name) for name in ("scales", "offsets") if name in place}
+    shape = dict(zip(("count", "height", "width"), bands.shape, strict=True))
+    with rasterio.open(path, "w", dtype=bands.dtype, **shape, **place) as file:
+        file.write(bands)
+        for name, values in later.items():
+            setattr(file, name, values)
     return path
 
 

@@ -29,12 +29,8 @@ def encoded(heights: Any, encoding: str) -> Any:
     return np.stack([number >> 16, number >> 8 & 255, number & 255]).astype(np.uint8)
 
 
-def tile(path: Path, image: Any, driver: str = "GTiff", **profile: Any) -> Path:
-    count, rows, cols = image.shape
-    shape = {"height": rows, "width": cols, "count": count, "dtype": "uint8"}
-    with rasterio.open(path, "w", driver=driver, **shape, **profile) as file:
-        file.write(image)
-    return path
+def tile(path: Path, image: Any, driver: str = "GTiff", crs: Any = None, transform: Any = None, **how: Any) -> Path:
+    return written(path, image, None, driver=driver, crs=crs, transform=transform, **how)
 
 
 def test_the_published_examples() -> None:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import from_origin
+from support.height_models import load, written
 
 from shared_map.importers.level_ground import level_ground, undeclared_voids
-from shared_map.importers.sources import load_source
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
@@ -26,23 +26,20 @@ VRT = (
 )
 
 
-def written(path: Path, heights=HEIGHTS, crs="EPSG:32632", where=(500_000.0, 5_000_000.0)) -> Path:
-    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": "float32"}
-    with rasterio.open(path, "w", driver="GTiff", crs=crs, transform=from_origin(*where, 30, 30), **shape) as file:
-        file.write(heights, 1)
-    return path
+def dem(path: Path, heights=HEIGHTS, crs="EPSG:32632", where=(500_000.0, 5_000_000.0)) -> Path:
+    return written(path, heights, crs=crs, transform=from_origin(*where, 30, 30))
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
 def test_a_zip_with_damaged_bytes_is_refused_in_one_sentence(tmp_path: Path, method: int) -> None:
     path = tmp_path / "dem.zip"
     with zipfile.ZipFile(path, "w", method) as archive:
-        archive.write(written(tmp_path / "dem.tif"), "dem.tif")
+        archive.write(dem(tmp_path / "dem.tif"), "dem.tif")
     whole = bytearray(path.read_bytes())
     whole[40:140] = bytes(7 * n % 256 for n in range(100))
     path.write_bytes(bytes(whole))
     with pytest.raises(TerrainError, match=r"dem\.zip") as refused:
-        load_source(TerrainConfig(source=str(path)), 1)
+        load(path)
     assert "\n" not in str(refused.value)
 
 
@@ -52,9 +49,9 @@ def test_a_vrt_names_ordinary_files_only(tmp_path: Path, name: str) -> None:
     path = tmp_path / "dem.vrt"
     path.write_text(VRT.format(name), encoding="utf-8")
     with pytest.raises(TerrainError, match="expected a file that lies on this machine"):
-        load_source(TerrainConfig(source=str(path)), 1)
-    path.write_text(VRT.format(written(tmp_path / "dem.tif").name), encoding="utf-8")
-    assert np.array_equal(load_source(TerrainConfig(source=str(path)), 1).elevation_m, HEIGHTS)
+        load(path)
+    path.write_text(VRT.format(dem(tmp_path / "dem.tif").name), encoding="utf-8")
+    assert np.array_equal(load(path).elevation_m, HEIGHTS)
 
 
 def test_a_file_of_several_variables_is_refused_with_their_names(tmp_path: Path) -> None:
@@ -67,7 +64,7 @@ def test_a_file_of_several_variables_is_refused_with_their_names(tmp_path: Path)
         for name in ("height", "snow"):
             file.createVariable(name, "f4", ("y", "x"))[:] = HEIGHTS
     with pytest.raises(TerrainError, match=r"several rasters .*height.*snow"):
-        load_source(TerrainConfig(source=str(path)), 1)
+        load(path)
 
 
 def test_a_slope_too_gentle_to_see_between_two_cells_is_no_lake() -> None:
@@ -96,13 +93,13 @@ def test_a_file_of_one_code_only_has_no_heights() -> None:
 
 
 def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
-    path = written(tmp_path / "fiji.tif", crs="EPSG:3832", where=(3_339_000.0, -1_800_000.0))
-    raster = load_source(TerrainConfig(source=str(path)), 1)
+    path = dem(tmp_path / "fiji.tif", crs="EPSG:3832", where=(3_339_000.0, -1_800_000.0))
+    raster = load(path)
     assert raster.grid.rows in range(37, 42)
     assert raster.grid.cols in range(37, 42)
-    path = written(tmp_path / "edge.tif", crs="EPSG:3857", where=(20_037_000.0, -1_800_000.0))
+    path = dem(tmp_path / "edge.tif", crs="EPSG:3857", where=(20_037_000.0, -1_800_000.0))
     with pytest.raises(TerrainError, match="beyond the edge of EPSG:3857"):
-        load_source(TerrainConfig(source=str(path)), 1)
+        load(path)
 
 
 def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
@@ -118,26 +115,26 @@ def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(m
 
 
 def test_a_vrt_that_paints_the_same_pixels_many_times_is_refused(tmp_path: Path) -> None:
-    written(tmp_path / "dem.tif")
+    dem(tmp_path / "dem.tif")
     head, _, rest = VRT.partition("<SimpleSource>")
     source = "<SimpleSource>" + rest[: rest.index("</VRTRasterBand>")].format("dem.tif")
     path = tmp_path / "dem.vrt"
     path.write_text(head + source * 30 + rest[rest.index("</VRTRasterBand>") :], encoding="utf-8")
-    assert np.array_equal(load_source(TerrainConfig(source=str(path)), 1).elevation_m, HEIGHTS)
+    assert np.array_equal(load(path).elevation_m, HEIGHTS)
     other = tmp_path / "other.vrt"
     other.write_text(VRT.format("dem.vrt"), encoding="utf-8")
-    assert np.array_equal(load_source(TerrainConfig(source=str(other)), 1).elevation_m, HEIGHTS)
+    assert np.array_equal(load(other).elevation_m, HEIGHTS)
     path.write_text(head + source * 40 + rest[rest.index("</VRTRasterBand>") :], encoding="utf-8")
     for file in (path, other):
         with pytest.raises(TerrainError, match="paints its pixels 40 times over"):
-            load_source(TerrainConfig(source=str(file)), 1)
+            load(file)
 
 
 def test_a_vrt_that_names_itself_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "dem.vrt"
     path.write_text(VRT.format("dem.vrt"), encoding="utf-8")
     with pytest.raises(TerrainError, match="more than 4 deep"):
-        load_source(TerrainConfig(source=str(path)), 1)
+        load(path)
 
 
 def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
@@ -148,12 +145,12 @@ def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
         file.write(
             np.add.outer(np.arange(256.0), np.arange(256.0)).astype(np.float32)[None], window=((0, 256), (256, 512))
         )
-    found = load_source(TerrainConfig(source=str(path)), 1).elevation_m
+    found = load(path).elevation_m
     assert np.isnan(found).mean() == 0.75
     assert found[0, 256:].tolist() == list(range(256))
     path.write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(TerrainError, match="is truncated"):
-        load_source(TerrainConfig(source=str(path)), 1)
+        load(path)
 
 
 @pytest.mark.parametrize(
@@ -166,11 +163,11 @@ def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
         ("cm.", 0.01),
     ],
 )
-def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, metres: float) -> None:
-    path = written(tmp_path / "dem.tif")
+def test_units_are_known_however_they_are_dem(tmp_path: Path, unit: str, metres: float) -> None:
+    path = dem(tmp_path / "dem.tif")
     with rasterio.open(path, "r+") as file:
         file.units = (unit,)
-    raster = load_source(TerrainConfig(source=str(path)), 1)
+    raster = load(path)
     np.testing.assert_allclose(raster.elevation_m, HEIGHTS * metres, rtol=1e-6)
     assert not any("unknown" in note for note in raster.notes)
 
@@ -180,20 +177,17 @@ def test_a_sea_floor_is_doubted(tmp_path: Path) -> None:
     from shared_map.terrain.terrain_report import doubts_about, facts_of
     from swarm.config.scenario import Scenario
 
-    path = str(written(tmp_path / "deep.tif", HEIGHTS * 8 - 600))
+    path = str(dem(tmp_path / "deep.tif", HEIGHTS * 8 - 600))
     for water_below_m, told in ((None, 1), (0.0, 0)):
         terrain = build_terrain(Scenario(terrain=TerrainConfig(source=path, water_below_m=water_below_m)))
         assert sum("a sea floor" in doubt for doubt in doubts_about(facts_of(terrain))) == told
 
 
 def test_a_setting_that_contradicts_the_file_is_said_aloud(tmp_path: Path) -> None:
-    path = written(tmp_path / "dem.tif")
+    path = dem(tmp_path / "dem.tif")
     said = "terrain.crs = 'EPSG:32633' counts, though the file says EPSG:32632: every place follows from it"
-    notes = {
-        crs: load_source(TerrainConfig(source=str(path), crs=crs), 1).notes
-        for crs in (None, "EPSG:32632", "EPSG:32633")
-    }
+    notes = {crs: load(path, crs=crs).notes for crs in (None, "EPSG:32632", "EPSG:32633")}
     assert {crs for crs, told in notes.items() if said in told} == {"EPSG:32633"}
-    bare = written(tmp_path / "bare.tif", crs=None)
-    told = load_source(TerrainConfig(source=str(bare), crs="EPSG:32633"), 1).notes
+    bare = dem(tmp_path / "bare.tif", crs=None)
+    told = load(bare, crs="EPSG:32633").notes
     assert not any("counts" in note for note in told)

@@ -45,10 +45,7 @@ def drawn(path: Path, codes: Any, key: str, driver: str = "GTiff") -> Path:
     image = np.full((*codes.shape, 3), 255, np.uint8)
     for code, ground in TABLES[key].grounds.items():
         image[codes == code] = ground.colour
-    shape = {"height": SIDE, "width": SIDE, "count": 3, "dtype": "uint8"}
-    with rasterio.open(path, "w", driver=driver, crs=EUROPE, transform=PLACE, **shape) as file:
-        file.write(np.moveaxis(image, -1, 0))
-    return path
+    return written(path, np.moveaxis(image, -1, 0), None, driver=driver)
 
 
 def expected(codes: Any, key: str) -> tuple[Any, Any]:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 import shapely
 from rasterio.transform import Affine, from_origin
 from rasterio.warp import transform as to_crs
+from support import height_models
 from support.zone_shapes import UTM, feature, geojson, middles, painted, written
 
 from shared_map.importers.zones.vector_shapes import outlines_of
@@ -148,21 +148,7 @@ def test_a_geopackage_of_several_layers_asks_which_and_views_are_no_layers(tmp_p
 
 
 def raster(path: Path, values: np.ndarray, where: Affine, crs: str | None, nodata: float | None = -1.0) -> str:
-    high, wide = values.shape
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        height=high,
-        width=wide,
-        count=1,
-        dtype=values.dtype,
-        crs=crs,
-        transform=where,
-        nodata=nodata,
-    ) as file:
-        file.write(values, 1)
-    return str(path)
+    return str(height_models.written(path, values, None, transform=where, crs=crs, nodata=nodata))
 
 
 def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> None:

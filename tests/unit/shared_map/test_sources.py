@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
+from support.height_models import written
 
 from launch_scripts.commands.terrain_commands import info
 from shared_map.importers.georeference import metres_per_degree
@@ -33,15 +34,7 @@ def heights(rows: int = 40, cols: int = 50) -> np.ndarray:
 
 
 def write(path: Path, bands: np.ndarray, transform: Affine = UTM, crs: Any = "EPSG:32632", **profile: Any) -> Path:
-    bands = bands if bands.ndim == 3 else bands[None]
-    scales = profile.pop("scales", None)
-    offsets = profile.pop("offsets", None)
-    size = {"count": bands.shape[0], "height": bands.shape[1], "width": bands.shape[2], "dtype": bands.dtype}
-    with rasterio.open(path, "w", driver="GTiff", crs=crs, transform=transform, **size, **profile) as file:
-        file.write(bands)
-        if scales:
-            file.scales, file.offsets = scales, offsets
-    return path
+    return written(path, bands, None, transform=transform, crs=crs, **profile)
 
 
 def load(source: Path | str, **settings: Any) -> Source:
