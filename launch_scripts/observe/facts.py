@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.counts import CertifiedGap, gap_text, percent
@@ -19,9 +19,12 @@ NONE = "-"
 """What is shown where nothing is known."""
 
 
+Of = TypeVar("Of", RunState, TargetLine)
+
+
 @dataclass(frozen=True, slots=True)
-class Fact:
-    """One fact of a run.
+class Fact(Generic[Of]):
+    """One fact of a run, or of each target: then it is a column.
 
     name     in the report, and for programs
     label    what people call it
@@ -29,38 +32,20 @@ class Fact:
     of       its value at an instant; None where it is not known
     text     the value in words
     meaning  what it says, in a sentence
+    always   whether every table of targets has it; else `swarm status` alone
     """
 
     name: str
     label: str
     unit: str
-    of: Callable[[RunState], Any]
-    text: Callable[[Any], str]
-    meaning: str
-
-    def shown(self, state: RunState) -> str:
-        """What people see of it."""
-        return self.text(self.of(state))
-
-
-@dataclass(frozen=True, slots=True)
-class TargetFact:
-    """One fact of each target: a column. As `Fact`.
-
-    always  whether every table has it; else `swarm status` alone
-    """
-
-    name: str
-    label: str
-    unit: str
-    of: Callable[[TargetLine], Any]
+    of: Callable[[Of], Any]
     text: Callable[[Any], str]
     meaning: str
     always: bool = True
 
-    def shown(self, line: TargetLine) -> str:
-        """What people see of it."""
-        return self.text(self.of(line))
+    def shown(self, state: Of) -> str:
+        """The fact in words, as people see it."""
+        return self.text(self.of(state))
 
 
 def count(value: float | None) -> str:
@@ -118,7 +103,7 @@ def _vehicles(state: RunState) -> tuple[int, int]:
     return state.vehicles, max(state.vehicles_planned, state.vehicles)
 
 
-FACTS: tuple[Fact, ...] = (
+FACTS: tuple[Fact[RunState], ...] = (
     Fact("elapsed_s", "time", "s", lambda s: s.elapsed_s, seconds, "Time since the run began, start-up included."),
     Fact("vehicles_driven", "vehicles", "", _vehicles, of_all, "Vehicles that an agent drives, of all of the run."),
     Fact("states", "of these", "", lambda s: s.states, each, "What the vehicles do."),
@@ -165,28 +150,28 @@ FACTS: tuple[Fact, ...] = (
 )  # fmt: skip
 """What is shown of a run. A new row appears everywhere."""
 
-TARGET_FACTS: tuple[TargetFact, ...] = (
-    TargetFact("target", "target", "", lambda t: t.title, _word, "Its id, and what is unusual about it."),
-    TargetFact("chased_by", "following", "", lambda t: t.following, count, "Vehicles that go for it."),
-    TargetFact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
-    TargetFact("captures", "captures", "", lambda t: t.captures, count, "How often it was caught."),
-    TargetFact(
+TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
+    Fact("target", "target", "", lambda t: t.title, _word, "Its id, and what is unusual about it."),
+    Fact("chased_by", "following", "", lambda t: t.following, count, "Vehicles that go for it."),
+    Fact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
+    Fact("captures", "captures", "", lambda t: t.captures, count, "How often it was caught."),
+    Fact(
         "certified_gap", "certified gap", "", lambda t: t.gap, _gap_mean,
         "How far above the optimum the routes to it can be at most, in the mean.",
     ),
-    TargetFact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
-    TargetFact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
-    TargetFact("routes_served", "served", "", lambda t: t.routes_served, count, "Routes given to it.", False),
-    TargetFact("strategy", "strategy", "", lambda t: t.strategy, _word, "How its tree is kept.", False),
-    TargetFact("pose_age_s", "seen", "s", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
-    TargetFact("tracker", "tracker", "", lambda t: t.tracker, _word, "Who tells where it is.", False),
+    Fact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
+    Fact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
+    Fact("routes_served", "served", "", lambda t: t.routes_served, count, "Routes given to it.", False),
+    Fact("strategy", "strategy", "", lambda t: t.strategy, _word, "How its tree is kept.", False),
+    Fact("pose_age_s", "seen", "s", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
+    Fact("tracker", "tracker", "", lambda t: t.tracker, _word, "Who tells where it is.", False),
 )  # fmt: skip
 """What is shown of each target, what matters most first: a narrow panel cuts off the end."""
 
 _BY_NAME = {fact.name: fact for fact in FACTS}
 
 
-def fact(name: str) -> Fact:
+def fact(name: str) -> Fact[RunState]:
     """A fact of the table. Raises KeyError on a name that is none."""
     return _BY_NAME[name]
 

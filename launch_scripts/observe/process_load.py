@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
+from launch_scripts.observe.counts import sum_of
 from swarm.clock import NS_PER_S
 from swarm.runtime.own_usage import CPU_S, RSS_BYTES
 from swarm.runtime.stats import MESSAGES_PER_S, RESTARTS
@@ -102,31 +103,26 @@ def _rate(before: Stats | None, now: Stats, where: str, name: str, times: float 
 
 def by_role(lines: Iterable[ProcessLoad], roles: Iterable[str]) -> list[RoleLoad]:
     """The sums of each role, in the order of `roles`; others after them."""
-    all_lines = list(lines)
-    known = list(dict.fromkeys([*roles, *(line.role for line in all_lines)]))
-    found = []
-    for role in known:
-        mine = [line for line in all_lines if line.role == role]
-        if not mine:
-            continue
-        late = [line.late_per_s for line in mine if line.late_per_s is not None]
-        told = [line for line in mine if line.cpu_percent is not None and line.alive]
-        found.append(
-            RoleLoad(
-                role=role,
-                alive=sum(line.alive for line in mine),
-                known=len(mine),
-                cpu_percent=_sum(line.cpu_percent for line in mine if line.alive),
-                rss_bytes=_sum(line.rss_bytes for line in mine if line.alive),
-                late_per_s=max(late, default=None),
-                messages_per_s=_sum(line.messages_per_s for line in mine if line.alive),
-                restarts=sum(line.restarts for line in mine),
-                busiest=max(told, key=lambda line: line.cpu_percent or 0.0, default=None),
-            )
-        )
-    return found
+    of: dict[str, list[ProcessLoad]] = {role: [] for role in roles}
+    for line in lines:
+        of.setdefault(line.role, []).append(line)
+    return [_role_load(role, mine) for role, mine in of.items() if mine]
 
 
-def _sum(values: Iterable[float | None]) -> float | None:
-    told = [value for value in values if value is not None]
-    return sum(told) if told else None
+def _role_load(role: str, mine: list[ProcessLoad]) -> RoleLoad:
+    alive = [line for line in mine if line.alive]
+    return RoleLoad(
+        role=role,
+        alive=len(alive),
+        known=len(mine),
+        cpu_percent=sum_of(line.cpu_percent for line in alive),
+        rss_bytes=sum_of(line.rss_bytes for line in alive),
+        late_per_s=max((line.late_per_s for line in mine if line.late_per_s is not None), default=None),
+        messages_per_s=sum_of(line.messages_per_s for line in alive),
+        restarts=sum(line.restarts for line in mine),
+        busiest=max(
+            (line for line in alive if line.cpu_percent is not None),
+            key=lambda line: line.cpu_percent or 0.0,
+            default=None,
+        ),
+    )

@@ -218,7 +218,7 @@ class Recorder(RunFigures):
         self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
 
     def _sample(self, state: RunState) -> Sample:
-        waiting_s, standing_s = float(self.driven.waiting_s.sum()), float(self.driven.standing_s.sum())
+        _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
         return replace(super()._sample(state), waiting_s=waiting_s, standing_s=standing_s)
 
     def report(

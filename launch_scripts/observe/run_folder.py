@@ -43,11 +43,12 @@ def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool =
         "recorded": recorded,
         **made_with(),
     }
+    texts = {
+        SCENARIO_FILE: head + scenario_text(scenario, Path.cwd()),
+        RUN_FILE: json.dumps(facts, indent=1) + "\n",
+    }
     said = []
-    for name, text in (
-        (SCENARIO_FILE, head + scenario_text(scenario, Path.cwd())),
-        (RUN_FILE, json.dumps(facts, indent=1) + "\n"),
-    ):
+    for name, text in texts.items():
         try:
             write_file(folder / name, text.encode())
         except OSError as error:

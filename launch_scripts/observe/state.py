@@ -126,7 +126,8 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
     """The run at a time."""
     targets = latest.plan.targets_now(latest.book)
     crew = latest.plan.crew_now(targets)
-    vehicles = latest.driven(set(crew), now_ns)
+    needed = set(crew)
+    vehicles = latest.driven(needed, now_ns)
     well = [latest.fills(role, id) for role, id in crew]
     began_ns = latest.began_ns
     expected, alive = Counter(role for role, _ in crew), Counter[str]()
@@ -145,7 +146,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         expected=len(crew),
         restarts=round(latest.gauge(RESTARTS) or 0),
         crew={role: (alive[role], expected[role]) for role in expected},
-        beside=dict(Counter(role for role, id in latest.up() if (role, id) not in set(crew))),
+        beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),
         certified_gap=certified_gap(latest),
         learned=_learned(latest),
         alarms=alarms_of(latest, latest.plan, targets, now_ns),

@@ -244,8 +244,6 @@ def test_distance_and_waiting_are_those_of_each_vehicle_also_of_one_that_comes_l
     ]
     for second, (ids, places, states) in enumerate(samples):
         driven.add(2 * second * NS_PER_S, columns(ids, places, states), lambda: {"a": "g"})
-    told = dict(
-        zip(driven.ids, np.stack([driven.distance_m, driven.waiting_s, driven.standing_s], 1).tolist(), strict=True)
-    )
+    told = dict(zip(driven.ids, driven.totals.T.tolist(), strict=True))
     assert told == {"a": [10.0, 2.0, 2.0], "b": [5.0, 2.0, 0.0]}
     assert driven.groups == {"a": "g", "b": ""}
