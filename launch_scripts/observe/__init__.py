@@ -1,13 +1,23 @@
-"""What people are shown of a run, made in one place.
+"""A running swarm as seen from outside: heard in one way, kept in one state, shown in one table of facts.
 
-The live table, the live view, `swarm status` and the report draw from `RunState`, and from nothing else:
+    bus -> RunObserver -> LatestState -> RunState -> text of a fact
+                       -> Recorder    -> report
 
-    messages -> Observed -> RunState -> text of a fact
-
-plan.py    what the run should be: its targets, its processes, when it began
-state.py   `RunState`: what it is at an instant. `StateMaker.state` makes one
-facts.py   `FACTS` and `TARGET_FACTS`: name, label, unit, text and meaning of each fact
-alarms.py  `Alarm` and `KINDS`: what went wrong, where, since when, and whether it is over
+| module          | holds                                                                                     |
+|-----------------|-------------------------------------------------------------------------------------------|
+| run_observer.py | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands    |
+| latest_state.py | `LatestState`: newest message of every sender, who is alive, where vehicles are, marks    |
+| counts.py       | `Counts`: what all processes counted, summed; the certified gap is made of it             |
+| plan.py         | `RunPlan`: what the run should be: its targets, its processes, when it began              |
+| state.py        | `RunState`: the run at an instant; `state_of` makes one                                   |
+| facts.py        | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                 |
+| alarms.py       | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over              |
+| process_load.py | what each process takes up, and how well it keeps time                                    |
+| recorder.py     | `Recorder`: figures, tracks, routes, captures, notes; it makes the numbers of the report  |
+| history.py      | what a recorder keeps over time, in bounded memory                                        |
+| results.py      | results per target, group and vehicle                                                     |
+| run_folder.py   | the folder of a run, and how files are written whole                                      |
+| palette.py      | how pictures and the live view look                                                       |
 
 A new fact is one row in `FACTS`, and appears everywhere. Facts are counted by whoever does what is counted, and a
 process that is started again goes on counting where it ended (`swarm.runtime.stats.carried`). So all who watch

@@ -15,19 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from launch_scripts.observe import history
 from launch_scripts.observe.counts import of_excess
 from launch_scripts.observe.facts import for_report
-from launch_scripts.observe.history import (
-    BegunRoute,
-    Sample,
-    Thinned,
-    TrackKey,
-    Tracks,
-    at_once,
-    begun_routes,
-    buckets_of,
-    certified_gaps,
-)
+from launch_scripts.observe.history import BegunRoute, Sample, Thinned, TrackKey, Tracks
 from launch_scripts.observe.latest_state import LatestState, VehicleColumns
 from launch_scripts.observe.plan import plan_of
 from launch_scripts.observe.results import Driven, results
@@ -113,7 +104,7 @@ class RunFigures:
             alive=state.alive,
             gaps={line.id: line.gap.mean for line in state.targets if line.gap and line.gap.mean is not None},
             growth_ms={line.id: line.growth_ms for line in state.targets if line.growth_ms is not None},
-            gap_excess=buckets_of(self.observed.histogram("followed_gap_excess").buckets),
+            gap_excess=history.buckets_of(self.observed.histogram("followed_gap_excess").buckets),
         )
 
 
@@ -145,7 +136,7 @@ class Recorder(RunFigures):
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Where and when targets were captured; how often, `Observed` counts."""
-        self.routes = begun_routes()
+        self.routes = history.begun_routes()
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
@@ -231,7 +222,7 @@ class Recorder(RunFigures):
         """The numbers of the run, None where not measured. The caller gives what it knows better."""
         if seconds is None and self.observed.first_ns is not None and self.last_ns is not None:
             seconds = (self.last_ns - self.observed.first_ns) / NS_PER_S
-        observed, total = self.observed, self.observed.total
+        observed = self.observed
         # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
         state = self.summary(self.observed.moved_ns or self.last_ns or 0)
         rates = [sample.messages_per_s for sample in self.samples.all() if sample.messages_per_s is not None]
@@ -252,18 +243,10 @@ class Recorder(RunFigures):
             "stranded": state.states["stranded"] if observed.any_vehicles else None,
             "lost": state.states["lost"] if observed.any_vehicles else None,
             "marked_cells": len(self.observed.marked().cells) if observed.any_marks else None,
-            "routes_received": total("routes_received"),
-            "growths": total("growths"),
-            "window_growths": total("window_growths"),
+            **{name: observed.total(name) for name in _TOTALS},
             "gap": self._gap(),
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
-            "messages_out": total("messages_out"),
-            "messages_in": total("messages_in"),
-            "bytes_out": total("bytes_out"),
-            "bytes_in": total("bytes_in"),
             "messages_per_s": _mean(rates),
-            "ticks_late": total("ticks_late"),
-            "ticks_dropped": total("ticks_dropped"),
             **results(observed, self.driven, self.scenario),
         }
         return {name: _rounded(value) for name, value in fields.items()}
@@ -273,15 +256,15 @@ class Recorder(RunFigures):
         samples = self.samples.all()
         samples = samples[:: max(1, -(-len(samples) // points))]
         names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
-        gaps = certified_gaps(samples)
+        gaps = history.certified_gaps(samples)
         fields: dict[str, list[Any]] = {
             "t_s": [sample.time_s for sample in samples],
             **{name: [getattr(sample, name) for sample in samples] for name in names},
             **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
             **{f"certified_gap_{name}": [gap[name] for gap in gaps] for name in ("mean", "p95", "max")},
             "routes_begun": [gap["routes"] for gap in gaps],
-            "waiting_at_once": at_once(samples, lambda sample: sample.waiting_s),
-            "standing_at_once": at_once(samples, lambda sample: sample.standing_s),
+            "waiting_at_once": history.at_once(samples, lambda sample: sample.waiting_s),
+            "standing_at_once": history.at_once(samples, lambda sample: sample.standing_s),
             "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
             "messages_per_s": [sample.messages_per_s for sample in samples],
         }
@@ -314,6 +297,11 @@ class Recorder(RunFigures):
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
+_TOTALS = (
+    "routes_received", "growths", "window_growths", "messages_out", "messages_in", "bytes_out", "bytes_in",
+    "ticks_late", "ticks_dropped",
+)  # fmt: skip
+"""Counts that are reported, summed over all processes."""
 DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
 """Histograms that are reported whole."""
 TIMINGS = ("growth_ms", "window_ms", "repair_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")

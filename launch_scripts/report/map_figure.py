@@ -21,23 +21,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from launch_scripts.observe.palette import (
-    BLACK,
-    BLUE,
-    FORBIDDEN,
-    GROUPS,
-    INK,
-    LETHAL_GROUND,
-    MARKED_LETHAL,
-    MARKED_SLOW,
-    ORANGE,
-    RED,
-    YELLOW,
-    hillshade,
-    rgb,
-    round_length,
-    said_length,
-)
+from launch_scripts.observe import palette
+from launch_scripts.observe.palette import hillshade, rgb, round_length, said_length
 from launch_scripts.report.plots import halo
 from launch_scripts.report.run_arrays import RunTracks, Track
 from shared_map.arrays import Floats
@@ -84,7 +69,10 @@ def draw_map(axes: Axes, ground: GroundPicture, tracks: RunTracks, report: Mappi
 
 def colours_of_groups(report: Mapping[str, Any]) -> dict[str, str]:
     """Group -> its colour, in the order of the report."""
-    return {group: GROUPS[n % len(GROUPS)] for n, group in enumerate(report.get("by_group") or {"": None})}
+    return {
+        group: palette.GROUPS[n % len(palette.GROUPS)]
+        for n, group in enumerate(report.get("by_group") or {"": None})
+    }
 
 
 def group_of(vehicle: str, report: Mapping[str, Any]) -> str:
@@ -106,7 +94,7 @@ def mark_overlay(tracks: RunTracks) -> NDArray[np.uint8]:
     overlay = np.zeros((rows * cols, 4), np.uint8)
     row, col = np.divmod(marks.cells, grid.cols)
     blocks, lethal = row // side * cols + col // side, marks.kinds == MarkKind.LETHAL
-    for some, colour, alpha in ((~lethal, MARKED_SLOW, 0.85), (lethal, MARKED_LETHAL, 0.95)):
+    for some, colour, alpha in ((~lethal, palette.MARKED_SLOW, 0.85), (lethal, palette.MARKED_LETHAL, 0.95)):
         overlay[blocks[some]] = [round(255 * part) for part in to_rgba(colour, alpha)]
     return overlay.reshape(rows, cols, 4)
 
@@ -121,7 +109,7 @@ def _draw_vehicles(axes: Axes, tracks: RunTracks, groups: Mapping[str, str], rep
     for group, lines in members.items():
         if not lines:
             continue
-        colour = groups.get(group, GROUPS[0])
+        colour = groups.get(group, palette.GROUPS[0])
         _draw_strips(axes, lines, colour, 1.1 * thin, 1.9 * thin, zorder=3)
         starts, ends = (np.array([line[n] for line in lines]) for n in (0, -1))
         shape, size = (_FLIES, 46) if group in report.get("aloft", ()) else ("o", 26)
@@ -137,15 +125,22 @@ def _draw_vehicles(axes: Axes, tracks: RunTracks, groups: Mapping[str, str], rep
 def _draw_targets(axes: Axes, tracks: RunTracks) -> None:
     grid = tracks.grid
     pieces = [(track.id, in_km(track, grid)) for track in tracks.targets if len(track.time_ns)]
-    _draw_strips(axes, [line for _, line in pieces], RED, 2.0, 3.6, zorder=6)
+    _draw_strips(axes, [line for _, line in pieces], palette.RED, 2.0, 3.6, zorder=6)
     if tracks.captures:
         places = np.concatenate([in_km(track, grid) for track in tracks.captures])
         axes.scatter(
-            places[:, 0], places[:, 1], marker="*", s=115, c=YELLOW, edgecolors=BLACK, linewidths=0.7, zorder=8
+            places[:, 0],
+            places[:, 1],
+            marker="*",
+            s=115,
+            c=palette.YELLOW,
+            edgecolors=palette.BLACK,
+            linewidths=0.7,
+            zorder=8,
         )
     last = {id: line[-1] for id, line in pieces}
     for id, (x, y) in last.items():
-        axes.scatter([x], [y], marker="D", s=48, c=RED, edgecolors="white", linewidths=1.1, zorder=9)
+        axes.scatter([x], [y], marker="D", s=48, c=palette.RED, edgecolors="white", linewidths=1.1, zorder=9)
         if len(last) <= _SHOWN_LABELS:
             _label(axes, id, float(x), float(y), grid)
 
@@ -174,7 +169,7 @@ def _label(axes: Axes, text: str, x: float, y: float, grid: GridSpec) -> None:
     below = y * 1000 < 0.04 * grid.rows * grid.resolution_m
     axes.annotate(
         text, (x, y), xytext=(6 if right else -6, -6 if below else 5), textcoords="offset points", fontsize=9,
-        fontweight="bold", color=RED, zorder=10, path_effects=halo(), ha="left" if right else "right",
+        fontweight="bold", color=palette.RED, zorder=10, path_effects=halo(), ha="left" if right else "right",
         va="top" if below else "bottom",
     )  # fmt: skip
 
@@ -213,7 +208,7 @@ def draw_scale_bar(axes: Axes, width: float, height: float, unit_m: float = 1000
     """A bar of a round length, about a fifth of the width, in the lower left corner of axes of this size."""
     length = round_length(width / 5)
     x0, y0 = 0.03 * width, height * 0.965
-    for colour, width in (("white", 6.0), (INK, 3.0)):
+    for colour, width in (("white", 6.0), (palette.INK, 3.0)):
         axes.plot([x0, x0 + length], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
     axes.annotate(
         said_length(length * unit_m), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left",
@@ -227,7 +222,7 @@ def draw_north(axes: Axes) -> None:
     axes.annotate(
         "N", xy=(0.968, 0.985), xytext=(0.968, 0.915), xycoords="axes fraction", ha="center", va="center",
         fontsize=10, fontweight="bold", zorder=11, path_effects=halo(),
-        arrowprops={"arrowstyle": "-|>,head_width=0.22,head_length=0.45", "color": INK, "linewidth": 1.6,
+        arrowprops={"arrowstyle": "-|>,head_width=0.22,head_length=0.45", "color": palette.INK, "linewidth": 1.6,
                     "path_effects": halo()},
     )  # fmt: skip
 
@@ -237,20 +232,21 @@ def _legend(ground: GroundPicture, groups: Mapping[str, str], aloft: Collection[
         Line2D([], [], color=colour, linewidth=1.6, marker=_FLIES if group in aloft else "o", markersize=5,
                markerfacecolor=colour, markeredgecolor="white", markeredgewidth=0.6,
                label="vehicle" if len(groups) == 1 else f"vehicle of {group}")
-        for group, colour in list(groups.items())[: len(GROUPS)]
+        for group, colour in list(groups.items())[: len(palette.GROUPS)]
     ]  # fmt: skip
     handles += [
-        Line2D([], [], color=RED, linewidth=2, marker="D", markersize=6, markeredgecolor="white", label="target"),
-        Line2D([], [], color="none", marker="*", markersize=12, markerfacecolor=YELLOW, markeredgecolor=BLACK,
-               markeredgewidth=0.7, label="capture"),
-        Patch(facecolor=MARKED_LETHAL, label="marked lethal"),
-        Patch(facecolor=MARKED_SLOW, label="marked slow"),
+        Line2D([], [], color=palette.RED, linewidth=2, marker="D", markersize=6, markeredgecolor="white",
+               label="target"),
+        Line2D([], [], color="none", marker="*", markersize=12, markerfacecolor=palette.YELLOW,
+               markeredgecolor=palette.BLACK, markeredgewidth=0.7, label="capture"),
+        Patch(facecolor=palette.MARKED_LETHAL, label="marked lethal"),
+        Patch(facecolor=palette.MARKED_SLOW, label="marked slow"),
     ]  # fmt: skip
     of_ground = {
-        "hidden": Patch(facecolor="none", edgecolor=BLACK, linestyle=":", label="hidden from the map"),
+        "hidden": Patch(facecolor="none", edgecolor=palette.BLACK, linestyle=":", label="hidden from the map"),
         "lethal": Patch(facecolor="#8b9097", edgecolor="#d7dbe0", hatch="xxxxx", linewidth=0,
                         label="lethal ground"),
-        "forbidden": Patch(facecolor="#5d5d5d", edgecolor=FORBIDDEN, hatch="/////", linewidth=0.8,
+        "forbidden": Patch(facecolor="#5d5d5d", edgecolor=palette.FORBIDDEN, hatch="/////", linewidth=0.8,
                            label="forbidden zone"),
     }  # fmt: skip
     return [*handles, *(patch for name, patch in of_ground.items() if name in ground.drawn)]
@@ -299,9 +295,9 @@ def ground_picture(terrain: Terrain, scenario: Scenario, truth: NDArray[np.float
     with mpl.rc_context({"hatch.linewidth": 0.5}):
         figure, axes = _canvas(seen)
         axes.imshow(_photo(seen), extent=(0, seen.grid.cols, seen.grid.rows, 0), interpolation="bilinear")
-        _fill(axes, lethal & ~forbidden, LETHAL_GROUND, 0.45, "xxxx", "#d7dbe0", edge=None)
-        _fill(axes, forbidden, BLACK, 0.5, "////", FORBIDDEN, edge=FORBIDDEN)
-        _outline(axes, hidden, (("white", 1.9, "-"), (BLACK, 0.8, ":")))
+        _fill(axes, lethal & ~forbidden, palette.LETHAL_GROUND, 0.45, "xxxx", "#d7dbe0", edge=None)
+        _fill(axes, forbidden, palette.BLACK, 0.5, "////", palette.FORBIDDEN, edge=palette.FORBIDDEN)
+        _outline(axes, hidden, (("white", 1.9, "-"), (palette.BLACK, 0.8, ":")))
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -375,7 +371,7 @@ def _fill(
         hatched.set_edgecolor(hatch_colour)
         hatched.set_linewidth(0.0)
     if edge is not None:
-        _outline(axes, cells, ((BLACK, 2.4, "-"), (edge, 1.2, "-")))
+        _outline(axes, cells, ((palette.BLACK, 2.4, "-"), (edge, 1.2, "-")))
 
 
 def _outline(axes: Axes, cells: Bools, strokes: Sequence[tuple[str, float, str]]) -> None:
@@ -394,7 +390,7 @@ def _padded(cells: Bools) -> tuple[NDArray[np.float64], NDArray[np.float64], NDA
 # --- what was learned of it ---------------------------------------------------------------------------------------
 
 LEARNED_FILE = "learned.png"
-SLOWER, QUICKER = ORANGE, BLUE
+SLOWER, QUICKER = palette.ORANGE, palette.BLUE
 _MOST_PIXELS = 1 << 20
 _FULL = math.log(4)
 """|ln(factor)| that is drawn as strongly as can be: no factor is beyond 4 or a quarter."""

@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from launch_scripts.observe import palette
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact
-from launch_scripts.observe.palette import FAINT, GREEN, INK, RED, RULE, STYLE
 from launch_scripts.report.map_figure import GroundPicture, draw_map
 from launch_scripts.report.plots import PLOTS, draw_plot
 from launch_scripts.report.run_arrays import RunTracks
@@ -28,7 +28,7 @@ _COUNTS = ("captures", "marks", "reroute_requests", "routes_served")
 
 def save_picture(path: Path, ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> None:
     """Draw the run and write it as PNG."""
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(palette.STYLE):
         figure = draw(ground, tracks, report)
         canvas = FigureCanvasAgg(figure)
         with path.open("wb") as file:
@@ -54,26 +54,26 @@ def draw(ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> Fi
 def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
     title = f"{report['vehicles']} vehicles chase {report['targets']} targets"
     figure.text(0.033, 0.966, title, fontsize=21, fontweight="bold", va="center")
-    figure.text(0.033, 0.936, "   ·   ".join(_facts(report)), fontsize=9, color=FAINT, va="center")
+    figure.text(0.033, 0.936, "   ·   ".join(_facts(report)), fontsize=9, color=palette.FAINT, va="center")
     gap = report["certified_gap"]
     tiles = [
-        *((fact(name).label, count(report[name]), INK) for name in _COUNTS),
-        ("certified gap, mean", percent(gap["mean"]), INK),
-        ("certified gap, p95", percent(gap["p95"]), INK),
-        ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), INK),
-        ("route query, p99", duration(report["route_query_ms"]["p99"]), INK),
+        *((fact(name).label, count(report[name]), palette.INK) for name in _COUNTS),
+        ("certified gap, mean", percent(gap["mean"]), palette.INK),
+        ("certified gap, p95", percent(gap["p95"]), palette.INK),
+        ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), palette.INK),
+        ("route query, p99", duration(report["route_query_ms"]["p99"]), palette.INK),
         *(
-            (name.replace("_", " "), count(report[name]), RED if report[name] else GREEN)
+            (name.replace("_", " "), count(report[name]), palette.RED if report[name] else palette.GREEN)
             for name in ("collisions", "lethal_entries", "lost")
         ),
     ]
     for y in (0.918, 0.853):
-        figure.add_artist(Line2D([0.033, 0.967], [y, y], color=RULE, linewidth=1))
+        figure.add_artist(Line2D([0.033, 0.967], [y, y], color=palette.RULE, linewidth=1))
     widths = [max(len(label), 1.9 * len(value)) + 3 for label, value, _ in tiles]
     x, unit = 0.033, 0.95 / sum(widths)
     for (label, value, colour), width in zip(tiles, widths, strict=True):
         figure.text(x, 0.896, value, fontsize=14, fontweight="bold", color=colour, va="center")
-        figure.text(x, 0.869, label, fontsize=8, color=FAINT, va="center")
+        figure.text(x, 0.869, label, fontsize=8, color=palette.FAINT, va="center")
         x += unit * width
 
 

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from launch_scripts.observe import palette
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import duration
-from launch_scripts.observe.palette import (
-    BLUE,
-    FAINT,
-    GREEN,
-    INK,
-    ORANGE,
-    STATE_COLOURS,
-    VIOLET,
-)
 
 Report = Mapping[str, Any]
 _SHOWN_PERCENT = 0.005
@@ -55,7 +51,7 @@ def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) ->
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(axis="both", length=0)
     if not plot.draw(axes, report):
-        axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=FAINT)
+        axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=palette.FAINT)
         axes.set_yticks([])
         axes.set_xticks([])
     elif plot.over_time:
@@ -77,16 +73,18 @@ def told(report: Report, name: str) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def _states(axes: Axes, report: Report) -> bool:
     series = report["series"]
-    counts = {state: series.get(state.name.lower()) for state in STATE_COLOURS}
+    counts = {state: series.get(state.name.lower()) for state in palette.STATE_COLOURS}
     if not series["t_s"] or None in counts.values():
         return False
     shown = {state: np.array(row) for state, row in counts.items() if any(row)}
     if not shown:  # stopped before any vehicle had told where it is
         return False
-    axes.stackplot(series["t_s"], *shown.values(), colors=[STATE_COLOURS[state] for state in shown], linewidth=0)
+    axes.stackplot(
+        series["t_s"], *shown.values(), colors=[palette.STATE_COLOURS[state] for state in shown], linewidth=0
+    )
     axes.set_ylim(0, max(sum(shown.values(), np.zeros(1)).max(), 1))
     _whole(axes)
-    legend_above(axes, [Patch(facecolor=STATE_COLOURS[state], label=state.name.lower()) for state in shown])
+    legend_above(axes, [Patch(facecolor=palette.STATE_COLOURS[state], label=state.name.lower()) for state in shown])
     return True
 
 
@@ -100,10 +98,10 @@ def _look(line: Line2D) -> dict[str, Any]:
 
 
 def _totals(axes: Axes, report: Report) -> bool:
-    captures, marks = _line(GREEN, "captures", 2.0), _line(VIOLET, "marks (right)", dash="--")
+    captures, marks = _line(palette.GREEN, "captures", 2.0), _line(palette.VIOLET, "marks (right)", dash="--")
     right = axes.twinx()
     right.grid(False)
-    right.tick_params(axis="y", colors=VIOLET, length=0)
+    right.tick_params(axis="y", colors=palette.VIOLET, length=0)
     right.spines[["top", "left", "right"]].set_visible(False)
     shown = []
     for name, line, where in (("captures", captures, axes), ("marks", marks, right)):
@@ -126,11 +124,11 @@ def _gaps(axes: Axes, report: Report) -> bool:
     mean, p95 = (np.maximum(values - 1, 0) * 100 for values in (mean, p95))
     whole = report["certified_gap"]
     lines = [
-        _line(BLUE, f"mean {percent(whole['mean'])}", 2.0),
-        _line(ORANGE, f"p95 {percent(whole['p95'])}", 1.3),
+        _line(palette.BLUE, f"mean {percent(whole['mean'])}", 2.0),
+        _line(palette.ORANGE, f"p95 {percent(whole['p95'])}", 1.3),
     ]
     dots: dict[str, Any] = {"marker": "o", "markersize": 2.2} if len(mean) < 80 else {}
-    axes.fill_between(time_s, mean, p95, color=ORANGE, alpha=0.2, linewidth=0)
+    axes.fill_between(time_s, mean, p95, color=palette.ORANGE, alpha=0.2, linewidth=0)
     for line, times, values in zip(lines, (time_s, p95_s), (mean, p95), strict=True):
         axes.plot(times, values, clip_on=False, **_look(line), **dots)
     axes.set_ylim(0, max(float(p95.max()) * 1.12, 0.1))
@@ -159,7 +157,7 @@ def _courses(axes: Axes, report: Report, **lines: Line2D) -> bool:
 
 
 def _waiting(axes: Axes, report: Report) -> bool:
-    waiting, standing = _line(ORANGE, "for a route"), _line(BLUE, "with a route", 1.4, "--")
+    waiting, standing = _line(palette.ORANGE, "for a route"), _line(palette.BLUE, "with a route", 1.4, "--")
     measured = _courses(axes, report, waiting_at_once=waiting, standing_at_once=standing)
     if measured and axes.get_ylim()[1] < 0.1:
         axes.set_ylim(0, 1)
@@ -168,14 +166,14 @@ def _waiting(axes: Axes, report: Report) -> bool:
 
 
 def _growing(axes: Axes, report: Report) -> bool:
-    measured = _courses(axes, report, growth_ms_mean=_line(GREEN, "growth"))
+    measured = _courses(axes, report, growth_ms_mean=_line(palette.GREEN, "growth"))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _tick_ms(value) if value else "0"))
     return measured
 
 
 def _messages(axes: Axes, report: Report) -> bool:
-    return _courses(axes, report, messages_per_s=_line(BLUE, "messages"))
+    return _courses(axes, report, messages_per_s=_line(palette.BLUE, "messages"))
 
 
 # --- of all -----------------------------------------------------------------------------------------------------
@@ -194,8 +192,8 @@ def _shares(axes: Axes, report: Report) -> bool:
     below = np.concatenate([[0.0], np.cumsum(excess[:, 1]), [excess[:, 1].sum()]]) / routes * 100
     below[edges <= least] = below[edges <= least][-1]
     axes.set_xscale("log")
-    axes.fill_between(edges, below, step="post", color=BLUE, alpha=0.2, linewidth=0)
-    axes.step(edges, below, where="post", color=BLUE, linewidth=2.0)
+    axes.fill_between(edges, below, step="post", color=palette.BLUE, alpha=0.2, linewidth=0)
+    axes.step(edges, below, where="post", color=palette.BLUE, linewidth=2.0)
     axes.set_xlim(least, edges[-1])
     axes.set_ylim(0, 105)
     axes.yaxis.set_major_locator(MaxNLocator(4))
@@ -203,14 +201,14 @@ def _shares(axes: Axes, report: Report) -> bool:
     axes.xaxis.set_major_locator(LogLocator(numticks=6))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    legend_above(axes, [_line(BLUE, f"of {routes:,.0f} routes", 2.0)])
+    legend_above(axes, [_line(palette.BLUE, f"of {routes:,.0f} routes", 2.0)])
     return True
 
 
 TIMED = (
-    ("growth_ms", "tree growth", GREEN),
-    ("route_query_ms", "route query", BLUE),
-    ("mark_to_tree_ms", "mark to tree", VIOLET),
+    ("growth_ms", "tree growth", palette.GREEN),
+    ("route_query_ms", "route query", palette.BLUE),
+    ("mark_to_tree_ms", "mark to tree", palette.VIOLET),
 )
 
 
@@ -226,11 +224,11 @@ def _timings(axes: Axes, report: Report) -> bool:
         axes.fill_between(values, row, row + _HALF * heights, color=colour, alpha=0.55, linewidth=0)
         axes.plot(values, row + _HALF * heights, color=colour, linewidth=1.2)
         p50 = quantiles["p50"] or values[0]
-        axes.plot([p50, p50], [row, row + _HALF], color=INK, linewidth=1.4)
+        axes.plot([p50, p50], [row, row + _HALF], color=palette.INK, linewidth=1.4)
         text = f"{label}: p50 {duration(quantiles['p50'])}, p99 {duration(quantiles['p99'])}"
         axes.text(
             0.995, row + 0.76, text, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=8.5,
-            color=INK, path_effects=halo(),
+            color=palette.INK, path_effects=halo(),
         )  # fmt: skip
     axes.set_ylim(0, len(timed))
     axes.set_yticks([])
@@ -295,7 +293,7 @@ def _whole(axes: Axes) -> None:
 
 
 def _say(axes: Axes, text: str) -> None:
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=FAINT, fontsize=9)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=palette.FAINT, fontsize=9)
 
 
 def _tick_ms(value: float, _: object = None) -> str:
@@ -305,3 +303,42 @@ def _tick_ms(value: float, _: object = None) -> str:
 def halo() -> list[Any]:
     """Outline which keeps text readable on any background."""
     return [withStroke(linewidth=2.6, foreground="white")]
+
+
+# --- of a study ---------------------------------------------------------------------------------------------------
+
+
+def draw_outcome(cases: Sequence[Any], outcome: str) -> bytes:
+    """A picture (PNG) of an outcome of a study: every seed a dot, and the mean of each case with its interval.
+
+    cases  each a `CaseSummary`, a row from the top in the order of the study
+    """
+    several = len({case.scenario for case in cases}) > 1
+    labels = [f"{case.scenario}: {case.label}" if several else case.label for case in cases]
+    chance = np.random.default_rng(0)
+    with mpl.rc_context({**palette.STYLE, "text.parse_math": False}):  # names may hold a $
+        figure = Figure(figsize=(8.0, 1.3 + 0.42 * len(cases)), dpi=110, facecolor="white", layout="constrained")
+        axes = figure.subplots()
+        for row, case in enumerate(cases):
+            found = case.outcomes[outcome]
+            values = np.array(list(found.values.values()))
+            if not len(values):
+                continue
+            heights = row + chance.uniform(-0.28, 0.28, len(values))
+            faint = max(0.08, min(0.5, 20 / len(values)))
+            axes.plot(values, heights, ".", color=palette.BLUE, ms=5, alpha=faint, mew=0)
+            mean, look = found.mean, dict[str, Any](color=palette.ORANGE)
+            if mean is not None:
+                axes.plot(mean.value, row, "D", ms=6, mec="white", mew=0.8, zorder=3, **look)
+                if mean.low is not None and mean.high is not None:
+                    axes.plot([mean.low, mean.high], [row, row], "-", lw=2.5, zorder=2, **look)
+        axes.set_yticks(range(len(cases)), labels)
+        axes.set_ylim(len(cases) - 0.5, -0.5)
+        axes.grid(visible=False, axis="y")
+        axes.set_title(outcome)
+        axes.set_xlabel(
+            "a dot is a seed; the diamond is their mean, the bar its 95 % interval", color=palette.FAINT
+        )
+        content = io.BytesIO()
+        FigureCanvasAgg(figure).print_png(content)  # type: ignore[no-untyped-call]
+    return content.getvalue()

@@ -146,7 +146,9 @@ class Sweep:
             write_table(self.folder / RESULTS, self._rows(), {**_SCHEMA, **_setting_types(self.planned)})
             pictures = {name: page.file_name(name) for name in page.drawn(summary)}
             for name, file in pictures.items():
-                write_file(self.folder / file, page.draw(summary.cases, name))
+                from launch_scripts.report.plots import draw_outcome  # matplotlib takes a moment
+
+                write_file(self.folder / file, draw_outcome(summary.cases, name))
             write_file(self.folder / PAGE, page.document(summary, pictures).encode())
             write_file(self.folder / NUMBERS, (json.dumps(as_json(summary), indent=1) + "\n").encode())
         except OSError as error:

@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from support.fake_run import fake_run
 
-from launch_scripts.observe.palette import STYLE, hillshade
+from launch_scripts.observe.palette import STATE_COLOURS, STYLE, hillshade
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report import picture, plots
 from launch_scripts.report.map_figure import ground_picture
@@ -140,10 +140,10 @@ def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
             assert not any(box.overlaps(other) for other in head[:n]), figure.texts[n].get_text()
 
 
-@pytest.mark.parametrize("states", [2, len(plots.STATE_COLOURS)])
+@pytest.mark.parametrize("states", [2, len(STATE_COLOURS)])
 def test_the_legend_of_states_leaves_the_title_its_room(states: int) -> None:
     series: dict[str, Any] = {"t_s": [0.0, 1.0]}
-    series |= {state.name.lower(): [n < states] * 2 for n, state in enumerate(plots.STATE_COLOURS)}
+    series |= {state.name.lower(): [n < states] * 2 for n, state in enumerate(STATE_COLOURS)}
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(picture.WIDTH_IN, picture.HEIGHT_IN), dpi=picture.DPI)
         axes = figure.add_axes((0.655, 0.6, 0.297, 0.1))
