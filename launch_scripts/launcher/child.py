@@ -16,8 +16,6 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
@@ -106,6 +104,8 @@ def wait_for_launcher() -> None:
 def _run_until_launcher_ends(niceness: int) -> None:
     """Blocks until the launcher is gone. A role calls it once it is built, and gives way to others from then on.
     It does not before: all wait for whoever still starts."""
+    import psutil  # the launcher, which imports this module too, needs none to start
+
     with contextlib.suppress(OSError):  # not every system lets a process choose
         for thread in psutil.Process().threads():
             now = os.getpriority(os.PRIO_PROCESS, thread.id)

@@ -17,8 +17,6 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from launch_scripts.launcher.child import EndedAsAsked, ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.log_file import LogFormat
@@ -132,6 +130,8 @@ class Running:
 
     def state(self) -> str:
         """What it does, as far as the kernel says."""
+        import psutil
+
         with contextlib.suppress(psutil.Error):
             process = psutil.Process(self.process.pid if self.process is not None else None)
             return f"{process.status()}, {process.num_threads()} threads"

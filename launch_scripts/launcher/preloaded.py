@@ -27,6 +27,7 @@ MODULES = (
     # What these import as they run, each for itself otherwise.
     "encodings.idna",
     "numpy.ma",
+    "psutil",
 )
 
 loads = os.environ.pop(LOADS, "")

@@ -14,8 +14,6 @@ import signal
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
-import psutil
-
 from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
@@ -161,6 +159,8 @@ def writing(file: Path) -> list[int]:
 
 def has_ended(pid: int) -> bool:
     """Whether a process is gone, or dead and not yet reaped."""
+    import psutil
+
     try:
         return bool(psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
     except psutil.Error:
@@ -169,6 +169,8 @@ def has_ended(pid: int) -> bool:
 
 def _writes() -> Iterator[tuple[int, Path]]:
     """(pid, file) for each log that a process of this user has open so that it may write to it."""
+    import psutil
+
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error, OSError):  # ended meanwhile, or somebody else's
             for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
