@@ -82,11 +82,17 @@ def still_entities(path: Path) -> set[str]:
     return {str(chunk.entity_path) for chunk in chunks(path) if chunk.is_static}
 
 
-def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
+def recorded(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> tuple[Path, Rig]:
+    """The recording of a run, and what made it."""
     rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    tiles = rig.mesh.tile_rows * rig.mesh.tile_cols
     rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
+    return tmp_path / "run.rrd", rig
+
+
+def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
+    _, rig = recorded(scenario, terrain, tmp_path)
+    tiles = rig.mesh.tiles
     rows = rows_by_entity(tmp_path / "run.rrd")
     assert rows["/world/vehicles"] >= 11
     assert rows["/world/targets/balls"] >= 11
@@ -119,9 +125,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
     """Of more than three the viewer tells only their number, when one points at it."""
-    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
-    rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
-    rig.close()
+    recorded(scenario, terrain, tmp_path)
     for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
         parts = components(tmp_path / "run.rrd", entity)
         parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
@@ -233,72 +237,60 @@ def test_the_camera_follows_a_vehicle_or_a_target(
     scenario: Scenario, terrain: Terrain, tmp_path: Path, name: str
 ) -> None:
     following = msgspec.structs.replace(scenario, monitor=MonitorConfig(live=False, follow=name))
-    rig = Rig(following, terrain, tmp_path / "run.rrd")
-    rig.play(fake_run(terrain, hidden_truth(terrain), following))
-    rig.close()
+    recorded(following, terrain, tmp_path)
     led = [tuple(row[0]) for row in components(tmp_path / "run.rrd", "/world/followed")["translation"]]
     assert len(set(led)) > 2, "it moves"
 
 
-def test_a_window_is_drawn_when_it_changes_and_not_each_time_that_it_is_told(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
-    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-
-    def told(at_s: float, *window: int) -> tuple[int, PlannerStatus]:
-        at_ns = int(at_s * NS_PER_S)
-        return at_ns, PlannerStatus(
-            target="t0", incarnation=1, stamp_ns=at_ns, strategy="full", target_cell=0, map_version=1,
-            tree_age_ms=0.0, window=list(window), growths=1, window_growths=1, growth_ms=1.0, routes_served=1,
-            following=0, gap_mean=None, gap_p95=None, gap_max=None,
-        )  # fmt: skip
-
-    rig.play([told(0.5 + n / 2, 4, 4, 20, 20) for n in range(10)])
-    rig.play([told(6.5 + n / 2, 8, 8, 24, 24) for n in range(6)])
-    rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/windows"] == 2
-
-
-def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
-    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    seen = Sighted(
-        author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
-        cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
+def status(at_s: float, *window: int) -> tuple[int, PlannerStatus]:
+    at_ns = int(at_s * NS_PER_S)
+    return at_ns, PlannerStatus(
+        target="t0", incarnation=1, stamp_ns=at_ns, strategy="full", target_cell=0, map_version=1,
+        tree_age_ms=0.0, window=list(window), growths=1, window_growths=1, growth_ms=1.0, routes_served=1,
+        following=0, gap_mean=None, gap_p95=None, gap_max=None,
     )  # fmt: skip
-    rig.play([(NS_PER_S // 2, seen)])
-    rig.run(3)
-    rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 3, "none, one, none"
 
 
-def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
+SEEN = Sighted(
+    author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
+    cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
+)  # fmt: skip
+BODY = Body(id="r1", incarnation=1, seq=1, x_m=100.0, y_m=-100.0, radius_m=2.0, lease_s=0.7)
+BELIEVED = Believed(
+    target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
+)
+DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]]] = {
+    "a window changes, and is told again and again": (
+        [status(n / 2, *((4, 4, 20, 20) if n < 12 else (8, 8, 24, 24))) for n in range(1, 19)],
+        "windows", "strips", [1, 1],
+    ),
+    "a sighting ends": ([(NS_PER_S // 2, SEEN)], "targets/sighted", "strips", [0, 1, 0]),
+    "a body moves, and its lease ends": (
+        [(NS_PER_S // 2, BODY), (NS_PER_S, msgspec.structs.replace(BODY, seq=2, x_m=130.0))],
+        "bodies/discs", "centers", [0, 1, 1, 0],
+    ),
+    "a belief ends, and its planner is silent after another": (
+        [
+            (NS_PER_S // 2, BELIEVED), (2 * NS_PER_S, msgspec.structs.replace(BELIEVED, cells=[], shares=b"")),
+            (3 * NS_PER_S, BELIEVED),
+        ],
+        "searched", "positions", [0, 2, 0, 2, 0],
+    ),
+}  # fmt: skip
+"""What is told, the entity and its component, and how many instances each of its rows has."""
+
+
+@pytest.mark.parametrize("what", DRAWN_AND_TAKEN_AWAY)
+def test_what_is_told_is_drawn_when_it_changes_and_taken_away_when_it_is_over(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path, what: str
 ) -> None:
-    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    grid = terrain.grid
-    x_m, y_m = grid.centre_m(grid.cell(5, 5))
-    body = Body(id="r1", incarnation=1, seq=1, x_m=x_m, y_m=y_m, radius_m=2.0, lease_s=0.7)
-    rig.play([(NS_PER_S // 2, body), (NS_PER_S, msgspec.structs.replace(body, seq=2, x_m=x_m + 30.0))])
-    rig.run(3)
+    told, entity, component, instances = DRAWN_AND_TAKEN_AWAY[what]
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+    rig.play(told)
+    rig.run(8)
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies/discs"] == 4, "none, here, there, none"
-
-
-def test_where_a_target_is_believed_to_be_is_drawn_until_it_is_seen_or_its_planner_is_silent(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
-    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    told = Believed(
-        target="t0", incarnation=1, stamp_ns=0, side_m=30.0, cells=[5, 9], shares=pack_column([0.7, 0.3], "<f4")
-    )
-    over = msgspec.structs.replace(told, cells=[], shares=b"")
-    rig.play([(NS_PER_S // 2, told), (2 * NS_PER_S, over), (3 * NS_PER_S, told)])
-    rig.run(8)  # its planner says no more
-    rig.close()
-    found = [len(row) for row in components(tmp_path / "run.rrd", "/world/searched")["positions"]]
-    assert found == [0, 2, 0, 2, 0]
+    rows = components(tmp_path / "run.rrd", f"/world/{entity}")[component]
+    assert [len(row) for row in rows] == instances
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(

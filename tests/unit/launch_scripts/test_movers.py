@@ -42,6 +42,7 @@ from launch_scripts.monitor.movers.styles import (
     shaded,
 )
 from launch_scripts.monitor.movers.vehicles_view import vehicle_details
+from launch_scripts.monitor.sinks import Pen
 from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.counts import CertifiedGap
 from launch_scripts.observe.latest_state import VehicleColumns
@@ -433,3 +434,16 @@ def test_what_is_due_is_due_once_in_its_time() -> None:
     seldom = [t for t in times_s if limit.due("seldom", int(round(t, 1) * NS_PER_S))]
     assert len(often) == 20
     assert len(seldom) == 5
+
+
+def test_of_what_is_drawn_only_what_differs_is_news_until_it_is_forgotten() -> None:
+    pen = Pen([], TerrainMesh(hill(4, 4)))
+    here, there = np.zeros((2, 3), np.float32), np.ones((2, 3), np.float32)
+    assert pen.news("a", positions=here, labels=["x", "y"]).keys() == {"positions", "labels"}
+    assert pen.news("a", positions=here.copy(), labels=["x", "y"]) == {}
+    assert pen.news("a", positions=there, labels=None).keys() == {"positions"}
+    assert pen.news("a", positions=there[:1], labels=["x", "y"]).keys() == {"positions"}
+    assert pen.news("b", lines=poles(pen.mesh, there)).keys() == {"lines"}
+    assert pen.news("b", lines=poles(pen.mesh, there)) == {}
+    pen.forget()
+    assert pen.news("a", positions=there[:1], labels=["x", "y"]).keys() == {"positions", "labels"}
