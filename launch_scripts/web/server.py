@@ -175,7 +175,6 @@ class _Visit(BaseHTTPRequestHandler):
     """One request. The library bounds its size; HTTP/1.0 bounds a connection to one."""
 
     server: Server
-
     raw_requestline: bytes
 
     def setup(self) -> None:
@@ -202,10 +201,8 @@ class _Visit(BaseHTTPRequestHandler):
             return
         reply = page(query, self.headers)
         self.send_response(reply.code)
-        size = str(len(reply.content))
-        for name, value in {
-            **_HEADERS, "Content-Type": reply.content_type, "Content-Length": size, **reply.headers
-        }.items():  # fmt: skip
+        its = {"Content-Type": reply.content_type, "Content-Length": str(len(reply.content))}
+        for name, value in {**_HEADERS, **its, **reply.headers}.items():
             self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
@@ -216,11 +213,8 @@ class _Visit(BaseHTTPRequestHandler):
         if self.server.behind is None or not self.path.startswith("/rerun."):
             self.send_error(404)
             return
-        passed = [
-            f"{name}: {value}"
-            for name, value in self.headers.items()
-            if name.lower() not in ("connection", "keep-alive")
-        ]
+        del self.headers["connection"], self.headers["keep-alive"]  # they are of this connection only
+        passed = [f"{name}: {value}" for name, value in self.headers.items()]
         head = "\r\n".join([f"{self.command} {self.path} HTTP/1.1", *passed, "Connection: close", "", ""])
         self._pass_on(self.server.behind, head.encode("latin1"))
 
