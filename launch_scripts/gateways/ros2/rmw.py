@@ -48,14 +48,6 @@ class Qos(Enum):
     TRANSFORMS = "1:2:1,100:,:,:,,"
     """Reliable, volatile, the last 100: /tf."""
 
-    @property
-    def latched(self) -> bool:
-        return self is Qos.LATCHED
-
-    @property
-    def best_effort(self) -> bool:
-        return self is Qos.SENSOR
-
 
 @dataclass(frozen=True, slots=True)
 class NodeName:

@@ -113,9 +113,9 @@ class Node:
 
     def publisher(self, topic: str, type_name: str, qos: Qos = Qos.DEFAULT) -> Publisher:
         endpoint = self._endpoint(Kind.PUBLISHER, topic, type_name, qos)
-        reliability = zenoh.Reliability.BEST_EFFORT if qos.best_effort else zenoh.Reliability.RELIABLE
+        reliability = zenoh.Reliability.BEST_EFFORT if qos is Qos.SENSOR else zenoh.Reliability.RELIABLE
         made: Any
-        if qos.latched:
+        if qos is Qos.LATCHED:
             made = ext.declare_advanced_publisher(
                 self._session,
                 endpoint.key,
@@ -137,7 +137,7 @@ class Node:
         newest = Newest(self, endpoint, most_bytes)
         made: Any
         # What this node puts itself is not for it: a topic may go both ways.
-        if qos.latched:
+        if qos is Qos.LATCHED:
             made = ext.declare_advanced_subscriber(
                 self._session,
                 endpoint.key,

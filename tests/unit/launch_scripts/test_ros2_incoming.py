@@ -215,6 +215,16 @@ def test_a_goal_target_stands_where_all_who_use_it_go(steps: list[tuple[bool, in
         assert all(pool.cell_of(id) == cell for id, cell in lent)
 
 
+def test_the_goal_target_that_has_been_idle_for_the_longest_is_moved_first() -> None:
+    pool = GoalTargets(["g0", "g1"])
+    for cell in (1, 2, 1):
+        lent = pool.lend(cell)
+        assert lent is not None
+        pool.give_back(lent[0])
+    assert pool.lend(3) == ("g1", False)
+    assert pool.lend(1) == ("g0", True), "it stands there still"
+
+
 # --- areas -----------------------------------------------------------------------------------------------------
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from launch_scripts.gateways.ros2.incoming.readings import Place
 from launch_scripts.gateways.ros2.incoming.work_queue import WorkQueue
@@ -24,13 +24,6 @@ Answer = Callable[[Route | str], None]
 """Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
 
 
-@dataclass
-class _Stand:
-    cell: int | None = None
-    users: int = 0
-    used: int = 0
-
-
 class GoalTargets:
     """A few external targets, lent to those who need a route to a place. One serves all who go to the same cell.
 
@@ -39,30 +32,30 @@ class GoalTargets:
     """
 
     def __init__(self, ids: Sequence[str]) -> None:
-        self._stands = {id: _Stand() for id in ids}
-        self._turn = 0
+        self._cells: dict[str, int | None] = dict.fromkeys(ids)
+        """Where each stands, None before it was lent first. The one that was lent last is the last."""
+        self._users: Counter[str] = Counter()
 
     def lend(self, cell: int) -> tuple[str, bool] | None:
         """(target, whether it stands there already) for a goal in a cell; None if all are in use elsewhere."""
-        there = next((id for id, stand in self._stands.items() if stand.cell == cell), None)
-        idle = [id for id, stand in self._stands.items() if not stand.users]
-        id = there or min(idle, key=lambda each: self._stands[each].used, default=None)
+        there = next((id for id, at in self._cells.items() if at == cell), None)
+        id = there or next((id for id in self._cells if not self._users[id]), None)
         if id is None:
             return None
-        stand = self._stands[id]
-        self._turn += 1
-        stand.cell, stand.users, stand.used = cell, stand.users + 1, self._turn
+        del self._cells[id]
+        self._cells[id] = cell
+        self._users[id] += 1
         return id, there is not None
 
     def give_back(self, id: str) -> None:
         """One who was lent it needs it no more."""
-        if self._stands[id].users <= 0:
+        if self._users[id] <= 0:
             raise ValueError(f"{id} is lent to nobody")
-        self._stands[id].users -= 1
+        self._users[id] -= 1
 
     def cell_of(self, id: str) -> int | None:
         """Where it stands; None before it was lent first."""
-        return self._stands[id].cell
+        return self._cells[id]
 
 
 class PlaceRoutes:
