@@ -7,7 +7,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from launch_scripts.gateways.ros2.rmw import Qos
+from launch_scripts.gateways.ros2.rmw import Endpoint, NodeName, Qos
 from launch_scripts.gateways.ros2.ros_node import Node
 from launch_scripts.gateways.ros2.ros_types import RosTypes
 
@@ -49,8 +49,13 @@ class FakeNode:
 
     def __init__(self, types: RosTypes) -> None:
         self.types = types
+        self.name = NodeName(0, "fake", "swarm_gateway")
+        self.tell: Callable[[Endpoint, bool], None] = lambda seen, there: None
         self.topics: dict[str, FakeNewest] = {}
         self.heard: dict[str, list[Any]] = {}
+
+    def watch(self, domain: str, seen: Callable[[Endpoint, bool], None]) -> None:
+        self.tell = seen
 
     def newest(self, topic: str, *_: Any, **__: Any) -> FakeNewest:
         return self.topics.setdefault(topic, FakeNewest(topic))

@@ -281,8 +281,6 @@ class Gateway:
         actions: list[Action] = [Remove(self._channels(VEHICLE, name)) for name in gone]
         for name in gone:
             del self._vehicles[name]
-        if gone:
-            self._refused = {each for each in self._refused if each.startswith("target")}  # their names are free
         taken = [self._take(id, seen, now.now_ns) for id, seen in now.vehicles.items()]
         came = [name for name in taken if name is not None]
         if came or gone:
@@ -317,7 +315,7 @@ class Gateway:
         return None
 
     def _refuse(self, who: str, why: str) -> None:
-        if who not in self._refused:
+        if who not in self._refused and len(self._refused) < MOST_VEHICLES:
             self._refused.add(who)
             self._problems.append(f"{who} is not told to ROS: {why}")
 

@@ -215,6 +215,10 @@ def test_the_rest_of_the_same_route_is_no_new_mission_and_another_one_is() -> No
     world.adapter.hear_way(Way(WITH_A_TURN.points_m[3:], "ok"))
     world.run(8.0)
     assert len(world.vehicle.missions) == 1
+    world.vehicle.cell = GRID.cell(23, 39)
+    world.run(8.0)
+    assert len(world.vehicle.missions) == 1, "near its end it has all that there is"
+    world.vehicle.cell = START + 3
     world.adapter.hear_way(TO_THE_EAST)
     world.run(8.0)
     assert places(world.vehicle.missions[-1][1:]) == [START + 4, GRID.cell(40, 39)]

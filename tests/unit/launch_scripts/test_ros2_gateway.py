@@ -232,6 +232,27 @@ def test_velocity_is_the_difference_of_places_along_the_heading() -> None:
     assert odometry.twist.twist.linear.x == 0.0, "it stands"
 
 
+def test_what_is_put_elsewhere_has_no_speed_and_a_heading_that_is_not_told_is_the_last() -> None:
+    core = gateway()
+    told(core, World({"a": vehicle("a", 300_100.0, heading_rad=1.0)}), 0.0)
+    (before,) = puts(told(core, World({"a": vehicle("a", 300_100.5, heading_rad=1.0)}), 0.1), "odom")
+    (after,) = puts(told(core, World({"a": vehicle("a", 300_600.0, heading_rad=None)}), 0.2), "odom")
+    assert before.twist.twist.linear.x > 0
+    assert (after.pose.pose.position.x, after.twist.twist.linear.x) == (600.0, 0.0)
+    assert after.pose.pose.orientation == before.pose.pose.orientation
+
+
+def test_robots_of_ros_and_more_vehicles_than_there_may_be_are_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.gateways.ros2.gateway.MOST_VEHICLES", 1)
+    core = gateway()
+    world = World({id: vehicle(id) for id in ("robot", "a", "b")})
+    actions = core.tick(0, BEGAN_NS, BEGAN_NS, world, Health(), {"robot"})
+    assert [each.channel.topic for each in actions if isinstance(each, Put) and each.channel.row == "odom"] == [
+        "/a/odom"
+    ]
+    assert core.take_problems() == ["vehicle b is not told to ROS: there are 1 already"]
+
+
 def test_a_plan_is_put_when_it_is_new_and_at_most_once_a_second() -> None:
     core, counts = gateway(), Counter[float]()
     for step in range(30):
@@ -315,6 +336,23 @@ def test_a_map_and_the_updates_since_are_the_map(turns: list[Any], sparse: bool)
                 heard[m.y : m.y + m.height, m.x : m.x + m.width] = m.data.reshape(m.height, m.width)
         assert heard is not None
         assert (heard[::-1] == core._feed.occupancy(GRID.window)).all()
+
+
+def test_updates_are_put_where_the_map_is_not() -> None:
+    core, marks = gateway('forward = ["map_updates"]'), OwnMarks("all.a.1", "all", GRID)
+    (update,) = puts(told(core, World(sets=marks.state([5], MarkKind.LETHAL, 0.0, BEGAN_NS)), 0.0), "map_updates")
+    assert (update.x, update.y, update.data.tolist()) == (5, GRID.rows - 1, [100])
+
+
+@pytest.mark.parametrize(("cells", "put_s"), [(10, 20), (1500, 10)])
+def test_a_large_map_is_put_again_sooner_if_much_has_changed(
+    monkeypatch: pytest.MonkeyPatch, cells: int, put_s: int
+) -> None:
+    monkeypatch.setattr("launch_scripts.gateways.ros2.map_feed._CELLS_AT_ONCE", GRID.cells // 2)
+    core, marks = gateway(), OwnMarks("all.a.1", "all", GRID)
+    assert puts(told(core, World(), 0.0), "map")
+    told(core, World(sets=marks.state(range(cells), MarkKind.LETHAL, 0.0, BEGAN_NS)), 1.0)
+    assert [second for second in range(2, 31) if puts(told(core, World(), second), "map")] == [put_s]
 
 
 def test_without_the_terrain_the_map_holds_marks_alone() -> None:
@@ -447,6 +485,11 @@ def test_a_peer_that_will_never_hear_us_is_named_once(changes: dict[str, Any], s
     assert sentence.startswith("node rviz subscribes to /map")
     assert says in sentence
     assert watch.sentence(peer(**changes), [OURS]) is None
+
+
+def test_a_peer_that_one_of_ours_fits_is_not_named() -> None:
+    other = replace_fields(OURS, type_name="nav_msgs/msg/Path")
+    assert PeerWatch().sentence(peer(), [other, OURS]) is None
 
 
 @pytest.mark.parametrize("changes", [{}, {"topic": "/other", "domain": 7}, {"kind": Kind.PUBLISHER, "domain": 7}])

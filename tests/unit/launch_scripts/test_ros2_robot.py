@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import Any
+from concurrent.futures import Future
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from support.client_rig import Program
 from support.ros_node import FakeNode
 from support.swarm_model import SwarmModel
 
-from launch_scripts.gateways.ros2.gateway_settings import Robots
+from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
+from launch_scripts.gateways.ros2.incoming.incoming import Incoming
 from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
 from launch_scripts.gateways.ros2.incoming.readings import Place
 from launch_scripts.gateways.ros2.incoming.robot import Robot
-from launch_scripts.gateways.ros2.incoming.work_queue import WorkQueue
+from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
+from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.clock import NS_PER_S
+from swarm.errors import ConfigError
 
 TYPES = types_of(Distribution.JAZZY)
 
@@ -108,3 +114,122 @@ def test_what_is_called_as_a_vehicle_of_the_swarm_is_no_robot_and_said_once(
     taken.add("two")
     world.say("two", "odom", 2, 3)
     assert not world.robots["two"].present, "the swarm's own was seen late"
+
+
+def test_a_robot_at_its_goal_follows_its_target_again_and_its_goal_target_is_free() -> None:
+    world = World(target="fox")
+    world.say("one", "goal_pose", 5, 5)
+    world.say("one", "odom", 5, 5)
+    assert world.follows("one") == "fox"
+    world.say("two", "goal_pose", 6, 6)
+    assert world.follows("two") == "goal0"
+
+
+def test_a_goal_that_cannot_be_followed_is_lent_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+
+    def follow(target: str) -> None:
+        raise ConfigError("it is refused")
+
+    monkeypatch.setattr(world.robots["one"]._vehicle, "follow", follow)
+    world.say("one", "goal_pose", 5, 5)
+    world.say("two", "goal_pose", 6, 6)
+    assert world.follows("two") == "goal0"
+
+
+def test_a_route_to_where_the_goal_target_stood_before_is_no_plan() -> None:
+    world = World()
+    world.say("one", "goal_pose", 5, 5)
+    robot: Any = world.robots["one"]
+    robot._hear_route(SimpleNamespace(target="goal0", target_cell=0, ok=False, remaining_s=1.0))
+    assert not world.node.heard["/one/plan"]
+
+
+def route_to(cell: int) -> Future[Any]:
+    found: Future[Any] = Future()
+    found.set_result(SimpleNamespace(target_cell=cell))
+    return found
+
+
+def test_a_planner_is_asked_until_it_goes_by_the_goal_and_no_longer_than_anybody_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.place_routes.PATIENCE_S", 0.2)
+    answers = iter([route_to(1), route_to(1), route_to(7)])
+    swarm: Any = SimpleNamespace(route_soon=lambda *_, **__: next(answers, route_to(7)))
+    routes = PlaceRoutes(swarm, ["goal0"], NoQueue())
+    found: Any = routes._find("goal0", 7, Place(0.0, 0.0), "ground")
+    assert found.target_cell == 7
+    why = routes._find("goal0", 8, Place(0.0, 0.0), "ground")
+    assert why == "the planner of goal0 finds no way to the goal: nobody may stand there"
+
+
+# --- areas, and whose topics are robots' --------------------------------------------------------------------------
+
+
+class DoneAtOnce(WorkQueue):
+    def give(self, what: str, work: Callable[[], None], failed: Callable[[str], None]) -> bool:
+        work()
+        return True
+
+
+class Calls(list[tuple[str, Any]]):
+    """Whatever is called of it, with its first argument and whether it clears."""
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *given, **named: self.append((name, given[0] if given else None))
+
+
+def test_areas_are_told_once_and_taken_away_where_they_are_drawn_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.incoming.WorkQueue", DoneAtOnce)
+    orders, author, node = Calls(), Calls(), FakeNode(TYPES)
+    frame = Program(SwarmModel()).swarm.frame
+    swarm: Any = SimpleNamespace(frame=frame, orders=lambda: orders, vehicle=lambda name: author)
+    settings = IncomingSettings(
+        zones=(ZoneSettings(name="works", topic="/works"),), grids=(GridSettings(name="seen", topic="/seen"),)
+    )
+    incoming = Incoming(cast(Any, node), swarm, settings)
+    side, rows, cols = frame.grid.resolution_m, frame.grid.rows, frame.grid.cols
+    corners = [{"x": x * side, "y": y * side} for x, y in ((0.5, 0.5), (1.5, 0.5), (1.5, 1.5))]
+    square = TYPES.make("geometry_msgs/msg/PolygonStamped", header={"frame_id": "map"}, polygon={"points": corners})
+    none = TYPES.make("geometry_msgs/msg/PolygonStamped", header={"frame_id": "map"})
+    for number, (polygon, data) in enumerate([(square, [100, 0]), (square, [100, 0]), (none, [0, 100])]):
+        node.topics["/works"].waiting.append(polygon)
+        info = {"resolution": side, "width": 2, "height": 1}
+        values = np.array(data, np.int8)
+        grid = TYPES.make("nav_msgs/msg/OccupancyGrid", header={"frame_id": "map"}, info=info, data=values)
+        node.topics["/seen"].waiting.append(grid)
+        incoming.tick(number * 2 * NS_PER_S)
+    assert [name for name, _ in orders] == ["add_zone", "remove_zone"], "the same corners are ordered once"
+    first = (rows - 1) * cols
+    assert author == [("mark", [first]), ("mark", [first]), ("mark", [first + 1])], "closed, opened, another closed"
+
+
+def test_what_the_queue_has_no_room_for_is_taken_at_a_later_tick() -> None:
+    node: Any = FakeNode(TYPES)
+    taken: list[Any] = []
+    full = WorkQueue("full", 1, 0)
+    area = Input(node, "/works", "", 1.0, lambda message, _: taken.append(message), queue=full)
+    node.topics["/works"].waiting.append("polygon")
+    area.tick(0)
+    assert not taken
+    area._queue = DoneAtOnce("room", 1, 1)
+    area.tick(2 * NS_PER_S)
+    area.tick(4 * NS_PER_S)
+    assert taken == ["polygon"]
+
+
+def test_topics_of_another_gateway_are_no_robots() -> None:
+    node = FakeNode(TYPES)
+    incoming = Incoming(cast(Any, node), Program(SwarmModel()).swarm, IncomingSettings(robots=(Robots(),)))
+    kind = "nav_msgs/msg/Odometry"
+    for number, name in enumerate((node.name.name, "driver")):
+        seen = Endpoint(
+            NodeName(0, "ab", name), number, Kind.PUBLISHER, f"/r{number}/odom", kind, TYPES.hash_of(kind), ""
+        )
+        node.tell(seen, True)
+    incoming.tick(NS_PER_S)
+    assert incoming.robots == {"r1"}
+    node.tell(seen, False)
+    incoming.tick(2 * NS_PER_S)
+    assert not incoming.robots
