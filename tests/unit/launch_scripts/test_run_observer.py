@@ -1,0 +1,103 @@
+"""An observer from outside goes by the run that most of the answers name, and by what came before them."""
+
+from __future__ import annotations
+
+import msgspec
+from support.client_rig import run_info
+from support.swarm_model import SwarmModel
+from support.target_reports import fleet
+
+from launch_scripts.observe.run_observer import OutsideObserver, RunObserver
+from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, Replied
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.wire.messages.processes import Stats
+from swarm.wire.topics import FLEET, RUN, STATS
+
+INFO = run_info(GridSpec(40, 50, 10.0))
+
+
+def answered(observer: OutsideObserver, *runs: str, now_ns: int = 0) -> None:
+    """One round of answers, each of another agent."""
+    for n, run_id in enumerate(runs):
+        info = msgspec.structs.replace(INFO, role="agent", id=f"a{n}", run_id=run_id)
+        observer.take(Replied("observer-run", RUN, {}, info), now_ns)
+    observer.take(AskEnded("observer-run", RUN, len(runs), None), now_ns)
+
+
+def outside(*, follows: bool = False) -> OutsideObserver:
+    return OutsideObserver(SwarmModel().bus("outside"), lambda _: None, follows=follows)
+
+
+def stats(id: str) -> Stats:
+    return Stats(role="agent", id=id, incarnation=1, stamp_ns=2, counts={"captures": 1}, gauges={}, histograms={})
+
+
+def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None:
+    observer = outside()
+    observer.take(Heard(FLEET, {}, fleet(100.0, ("a0-00", 1))), 5)
+    observer.take(Appeared(Peer("agent", "a0", 1)), 6)
+    answered(observer, "r1")
+    latest = observer.latest
+    assert latest is not None
+    assert latest.grid.rows == 40
+    assert latest.vehicles().ids == ["a0-00"]
+    assert latest.ids_up("agent") == ["a0"]
+    assert latest.first_ns == 5
+    assert not observer.whole, "a0 has not said what it counts"
+    observer.take(Heard(STATS, {}, stats("a0")), 7)
+    assert observer.whole
+
+
+def test_the_run_of_most_answers_is_observed_and_the_others_are_strangers() -> None:
+    observer = outside()
+    answered(observer, "r1", "r2", "r2")
+    assert observer.run is not None
+    assert observer.run.run_id == "r2"
+    members, strangers = observer.members()
+    assert [info.id for info in members] == ["a1", "a2"]
+    assert [info.id for info in strangers] == ["a0"]
+
+
+def test_it_is_over_once_all_answers_are_of_another_run_and_not_where_none_comes() -> None:
+    observer = outside()
+    answered(observer, "r1")
+    answered(observer)
+    answered(observer, "r2", "r1")
+    assert not observer.over
+    answered(observer, "r2")
+    assert observer.over
+
+
+def test_one_that_follows_forgets_the_run_before_but_not_who_is_there() -> None:
+    observer = outside(follows=True)
+    answered(observer, "r1")
+    observer.take(Appeared(Peer("agent", "a0", 1)), 1)
+    observer.take(Appeared(Peer("agent", "a9", 1)), 1)
+    observer.take(Heard(STATS, {}, stats("a0")), 2)
+    observer.take(Disappeared(Peer("agent", "a9", 1)), 3)
+    answered(observer, "r2", now_ns=4)
+    assert observer.run is not None
+    assert observer.run.run_id == "r2"
+    assert observer.latest is not None
+    assert observer.latest.total("captures") is None
+    assert observer.latest.ids_up("agent") == ["a0"]
+    assert not observer.over
+
+
+def test_only_what_is_due_is_taken_and_at_the_end_all_of_it() -> None:
+    swarm = SwarmModel()
+    latest = outside()
+    observer = RunObserver(swarm.bus("inside"), lambda _: None, latest, {FLEET: 1.0, STATS: 0.0})
+    observer.keep_samples()
+    agent = swarm.bus("agent")
+    for tick in range(4):
+        report = fleet(100.0 * tick, ("a0-00", tick))
+        agent.publish(FLEET, report, region=0, author=report.author)
+        agent.publish(STATS, stats("a0"), role="agent", id="a0")
+        swarm.run(0.1)
+        due = [heard.topic.name for heard in observer.due(tick * NS_PER_S // 4)]
+        assert (FLEET.name in due) == (tick == 0)
+        assert STATS.name in due
+    assert FLEET.name in [heard.topic.name for heard in observer.due(NS_PER_S // 2, all=True)]
