@@ -12,7 +12,7 @@ from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.forms import AnyTree, in_cells
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 from shared_map.arrays import Floats
 
 _NONE: Floats = np.empty(0, np.float32)

@@ -14,9 +14,9 @@ from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
 from planner_service.map_intake import LONGEST_WAIT_NS, MapIntake
 from planner_service.pulled_routes import Puller, pulls
+from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
-from planner_service.search.ways import Ways
 from planner_service.target_tree import TargetTree
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf

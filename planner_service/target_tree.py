@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.growth_times import GrowthTimes
-from planner_service.reach import Reach
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.forms import AnyTree, empty_tree, in_cells, in_pieces
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
 from planner_service.tree.windows import exact_half
 from planner_service.update import Update
+from planner_service.windows_grown import Reach
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig

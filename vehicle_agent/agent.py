@@ -20,19 +20,19 @@ from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.routes import Route, RouteStatus
+from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.driven_vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.route_bounds import RouteBounds
-from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.group_costs import GroupCosts
-from vehicle_agent.local_map import LocalMap, meet
 from vehicle_agent.sensing.empty_places import EmptyPlaces
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
+from vehicle_agent.traffic.cell_requests import Wishes
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
-from vehicle_agent.traffic.wishes import Wishes
 
 _LONGEST_STEP_S = 0.5
 _STALE_CELLS = 8

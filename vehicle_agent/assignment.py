@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
 from swarm.wire.messages.vehicles import SharedCosts, VehicleState
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.matching import HYSTERESIS, need_first, spread
 

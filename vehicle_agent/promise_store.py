@@ -16,7 +16,7 @@ from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.recording.external_calls import ExternalCalls
 from swarm.wire.messages.traffic import Table
-from vehicle_agent.traffic.right_of_way import OwnRecord
+from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 _SIZE_BYTES = 1 << 18
 """Of each of the two files, and at least four times what still counts in them."""

@@ -14,14 +14,14 @@ from swarm.grid import REGION_CELLS, GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.own_time import OwnTime
-from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
 

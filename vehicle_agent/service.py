@@ -59,20 +59,19 @@ from vehicle_agent.agent import Agent, AgentAction, AskRoutes
 from vehicle_agent.agent_maps import AgentMaps
 from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.chasers import ChasersReport
+from vehicle_agent.driving.driven_vehicle import Follow
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
-from vehicle_agent.driving.places import Places
-from vehicle_agent.driving.vehicle import Follow
-from vehicle_agent.entering import Entering
-from vehicle_agent.fleet import FleetReport
+from vehicle_agent.driving.positions import Places
 from vehicle_agent.group_costs import GroupCosts
+from vehicle_agent.known_zones import ZonesAround
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
+from vehicle_agent.reports import ChasersReport, FleetReport
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.spawning import Entering
 from vehicle_agent.target_bodies import TargetBodies
-from vehicle_agent.zones import ZonesAround
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from swarm.errors import ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.places import cell_of
 from swarm.plugins.find import find_plugin
-from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY, Plots, fitting_regions
+from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY, Plots, fitting_regions
 from vehicle_agent.placement import spawn_cells
 
 

@@ -20,7 +20,7 @@ from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.report.export import FORMATS, Layer, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.learned import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile

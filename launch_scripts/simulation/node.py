@@ -9,8 +9,8 @@ from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.prepared_costs import PREPARED_COSTS
 from planner_service.service import PlannerService
+from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KEEPER_STORE, KeeperStore
 from swarm.bus.bus import Bus, Event, Post, Worker
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker

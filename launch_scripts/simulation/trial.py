@@ -19,7 +19,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
-from swarm.right_of_way.plots import FEWEST_FOR_MAJORITY
+from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
 from swarm.runtime.garbage import collected_rarely
 
 SECONDS = 30.0

@@ -10,7 +10,7 @@ from planner_service.kernels.repair import repair
 from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16

@@ -24,9 +24,8 @@ from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import FINE, KeptScratch
+from planner_service.tree.growth import FINE, KeptScratch, box_of, grow_window
 from planner_service.tree.strides import StrideNetwork
-from planner_service.tree.window_growth import box_of, grow_window
 from shared_map.arrays import Floats
 from swarm.grid import Window
 

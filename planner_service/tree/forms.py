@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 
 AnyTree = CostToGoTree | PieceTree
 

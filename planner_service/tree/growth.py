@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import bucket_queue, wide_buckets
+from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.climbs import Climbs
-from planner_service.kernels.layout import TOO_FINE, PaddedGrid
+from planner_service.kernels.directed_buckets import BASE_BITS, WIDTH, grow_directed_by_buckets, make_scratch
+from planner_service.kernels.layout import NONE, TOO_FINE, PaddedGrid, step_offsets
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.tied_parents import untie_parents
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_range import CostRange
-from planner_service.tree.directed_growth import grow_directed_costs
+from planner_service.tree.padded_climbs import climbs_in
 from shared_map.arrays import Floats
+from swarm.errors import OutsideGridError
+from swarm.grid import Window
 
 MOST_BUCKETS = 1 << 8
 """As narrow as the cheapest step: where the dearest takes more of them, their width follows the map."""
@@ -89,3 +94,109 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
     """Two float32 numbers, given as integers of the same bits."""
     lowest, highest = struct.unpack("=2f", struct.pack("=2i", *bits))
     return lowest, highest
+
+
+# A full growth where steps cost by what they climb, too: how wide its buckets are.
+
+_SAMPLE = 1 << 10
+"""Cells by which the usual cell cost is told."""
+_RARE = 1 / 16
+"""Of them, so many may cost less than the usual."""
+_FEW, _NEAR = 16.0, 4.0
+"""Buckets are as narrow as the lowest cell cost asks for where none is more than `_FEW` times as much, or the usual
+one no more than `_NEAR` times."""
+
+
+def grow_directed_costs(
+    padded: PaddedGrid,
+    climbs: Climbs,
+    bounds: tuple[float, float, float],
+    root: int,
+    cost: Floats,
+    kept: dict[tuple[int, int], Any],
+) -> None:
+    """Exact costs to a padded, passable root, written whole; the arguments are those of `growth.grow_tree`."""
+    cell_cost = padded[0]
+    key = cell_cost.size, 0
+    if key not in kept:
+        kept.clear()
+        kept[key] = make_scratch(cell_cost.size)
+    width, look = _width(cell_cost, *bounds[:2])
+    grow_directed_by_buckets(padded, cost, root, climbs, width, look, kept[key])
+
+
+def _width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, bool]:
+    """s, of the finest buckets; whether some steps may cost less than that.
+
+    So narrow that one level of buckets is as wide as the usual cell cost asks for, and the finest no wider than the
+    lowest does.
+    """
+    if highest > _FEW * lowest:
+        sample = cell_cost[:: max(cell_cost.size // _SAMPLE, 1)]
+        sample = sample[sample < np.inf]
+        rank = int(sample.size * _RARE)
+        usual = float(np.partition(sample, rank)[rank]) if sample.size else lowest
+        if usual > _NEAR * lowest:
+            width = usual * WIDTH
+            while width > lowest:
+                width /= 1 << BASE_BITS
+            return width, True
+    return lowest * WIDTH, False
+
+
+# A window of a map, grown on its own around a target's new cell.
+
+Box = tuple[int, int, int, int]
+
+_SMALL = 1 << 16
+"""Padded cells of a small window, whose scratch is worth keeping."""
+
+
+class GrownWindow(NamedTuple):
+    """Costs and parents of a window as a padded grid of its own, s.
+
+    way  s; what it costs to get from the old root to the new one inside the window; inf where there is no way
+    """
+
+    box: Box
+    cost: Floats
+    parent: NDArray[np.uint8] | None
+    way: float
+
+
+def grow_window(
+    grid: CostGrid, root: int, old: int, window: Window, kept: KeptScratch, with_parents: bool
+) -> GrownWindow:
+    """Grow a window that holds the new root and the old one. Raises OutsideGridError where it is not inside the
+    grid or does not hold both.
+
+    kept  scratch of the last window of one tree
+    """
+    row0, col0, row1, col1 = box = box_of(grid, window)
+    width = col1 - col0 + 2
+    start, end = _in_window(grid, root, window), _in_window(grid, old, window)
+    part = np.empty((row1 - row0 + 2) * width, np.float32)
+    bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
+    cost = np.empty_like(part)
+    parent = np.full(part.size, NONE, np.uint8) if with_parents else None
+    padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
+    climbs = None if grid.climbs is None else climbs_in(grid.climbs, grid.stride, box)
+    scratch = kept if part.size <= _SMALL else None
+    grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, parent, scratch)
+    return GrownWindow(box, cost, parent, float(cost[end]))
+
+
+def box_of(grid: CostGrid, window: Window) -> Box:
+    """For kernels. Raises OutsideGridError on a window that is not inside the grid."""
+    row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
+    if not (0 <= row0 < row1 <= grid.grid.rows and 0 <= col0 < col1 <= grid.grid.cols):
+        raise OutsideGridError(f"{window} is not inside the grid")
+    return row0, col0, row1, col1
+
+
+def _in_window(grid: CostGrid, cell: int, window: Window) -> int:
+    """A cell's index in the window as a padded grid of its own. Raises OutsideGridError if it lies outside."""
+    row, col = grid.grid.row_col(cell)
+    if not window.contains(row, col):
+        raise OutsideGridError(f"cell {cell} is not in {window}")
+    return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1

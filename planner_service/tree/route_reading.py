@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from planner_service.kernels.route_walk import OK
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 from swarm.wire.routes import RouteBatch
 
 

@@ -10,9 +10,9 @@ import msgspec
 from shared_map.keeper.base_map_transfer import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.last_words import LastWords
-from shared_map.keeper.orders import KeptOrders
-from shared_map.keeper.store import Keeper, KeeperStore
-from shared_map.keeper.zones import free_name, rows_of, zone_sets, zones_of
+from shared_map.keeper.mark_store import Keeper, KeeperStore
+from shared_map.keeper.order_service import KeptOrders
+from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
 from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync

@@ -10,31 +10,293 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
+from typing import Protocol
 
 from swarm.bus.bus import (
     Appeared,
     Asked,
+    AskEnded,
     Disappeared,
     Event,
     Heard,
     HeardMany,
     LinkChanged,
     Post,
+    Replied,
     check_subscription,
     new_counts,
     newest_of,
 )
-from swarm.bus.memory_declarations import Declaration, Subscriptions, narrowed, sampled
-from swarm.bus.memory_links import LinkModel
-from swarm.bus.memory_query import Asking, MemoryAnswerer
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
-from swarm.wire.codec import decode, encode, may_be_json, packed_json
+from swarm.wire.codec import decode, decode_either, encode, may_be_json, packed_json
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic
+
+# One query on the simulated network: which queryables have not ended yet, and how their answers travel.
+
+
+@dataclass(eq=False)
+class Asking:
+    """One query under way.
+
+    waiting   queryables that have not ended yet, by number; the query ends with the last
+    replies   how many were posted
+    failure   the last refusal, or "timeout"
+    asked     the question's payload
+    over      whether `AskEnded` was posted: what comes later is dropped
+    began_ns  when it was asked
+    """
+
+    bus: MemoryBus
+    topic: Topic
+    wanted: dict[str, str]
+    tag: str
+    post: Post
+    timeout_s: float
+    waiting: set[int] = field(default_factory=set)
+    replies: int = 0
+    failure: str | None = None
+    asked: bytes = b""
+    over: bool = False
+    began_ns: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.began_ns = self.bus.network.scheduler.clock.now_ns()
+
+    @property
+    def took_s(self) -> float:
+        """Since it was asked."""
+        return (self.bus.network.scheduler.clock.now_ns() - self.began_ns) / NS_PER_S
+
+    def finish(self) -> None:
+        if not self.over:
+            self.over = True
+            self.post(AskEnded(self.tag, self.topic, self.replies, self.failure))
+
+    def time_out(self) -> None:
+        if not self.over:
+            self.failure = "timeout"
+            self.finish()
+
+
+@dataclass(eq=False)
+class MemoryAnswerer:
+    """The answers of one queryable to one query.
+
+    index            the queryable's number in `Asking.waiting`
+    arrived_ns       when the query arrives
+    ended            whether `end` was called
+    last_arrival_ns  when its latest answer arrives: no later answer overtakes it
+    """
+
+    asking: Asking
+    queryable: Declaration
+    index: int
+    arrived_ns: int
+    ended: bool = False
+    last_arrival_ns: int = 0
+
+    @property
+    def timeout_s(self) -> float:
+        return self.asking.timeout_s
+
+    def waited_s(self) -> float:
+        return (self.queryable.bus.network.scheduler.clock.now_ns() - self.arrived_ns) / NS_PER_S
+
+    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
+        if self.ended:
+            raise RuntimeError("answered after the end")
+        asking, bus = self.asking, self.queryable.bus
+        named = asking.topic.one({**self.queryable.narrow, **fields})
+        if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
+            return
+        payload = encode(message)
+        bus.sent(payload)
+        key = asking.topic.below(named)
+        code = code_of(bus.authenticator, asking.topic, key, payload, asking.asked)
+        parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
+
+        def arrive() -> None:
+            if asking.over:
+                return
+            try:
+                check_code(asking.bus.authenticator, code, asking.topic, key, payload, asking.asked)
+            except ProtocolError:
+                asking.bus.counts["payloads_dropped"] += 1
+                return
+            asking.bus.received(payload)
+            asking.replies += 1
+            asking.post(Replied(asking.tag, asking.topic, named, parsed, asking.took_s))
+
+        self._send(payload, arrive)
+
+    def refuse(self, reason: str) -> None:
+        def arrive() -> None:
+            self.asking.failure = reason
+
+        if not self.ended:
+            self._send(reason.encode(), arrive)
+
+    def end(self) -> None:
+        if self.ended:
+            return
+        self.ended = True
+
+        def arrive() -> None:
+            self.asking.waiting.discard(self.index)
+            if not self.asking.waiting:
+                self.asking.finish()
+
+        self._send(b"", arrive)
+
+    def _send(self, payload: bytes, arrive: Callable[[], None]) -> None:
+        """What answers one query stays in order; it may be lost or repeated."""
+        source, to, what = self.queryable.bus, self.asking.bus, self.asking.topic.name
+        if source.closed:
+            return
+
+        def deliver() -> None:
+            if to.traced(source, what, payload):
+                arrive()
+
+        now_ns = source.network.scheduler.clock.now_ns()
+        for delay_ns in source.network.delays_ns(source, to, what):
+            self.last_arrival_ns = max(self.last_arrival_ns, now_ns + delay_ns)
+            source.network.scheduler.at(self.last_arrival_ns, deliver)
+
+
+# What nodes of the simulated network hear: their subscriptions and queryables, by topic and key.
+
+
+@dataclass(eq=False, slots=True)
+class Declaration:
+    """One subscription or queryable of one bus.
+
+    narrow    the fields of its key that are no wildcard
+    post      a subscription without one keeps its samples until they are collected
+    together  it posts a `HeardMany` of each sample: in a simulation nothing waits, so each comes alone
+    """
+
+    bus: MemoryBus
+    narrow: dict[str, str]
+    post: Post | None
+    together: bool = False
+
+    def meets(self, fields: Mapping[str, str]) -> bool:
+        """Whether this and another key of the topic, either with wildcards, can name the same value."""
+        for name, chunk in self.narrow.items():  # noqa: SIM110 (`all` with a generator costs a simulation time)
+            if fields[name] not in (chunk, "*"):
+                return False
+        return True
+
+
+def narrowed(topic: Topic, fields: Mapping[str, str | int]) -> dict[str, str]:
+    """The fields of a key expression that are no wildcard. Raises TypeError and ValueError as `Topic.every`."""
+    return {name: chunk for name, chunk in topic.every(fields).items() if chunk != "*"}
+
+
+class Subscriptions:
+    """The subscriptions of one topic, looked up by the values of the fields that they name.
+
+    A topic has few such sets of fields, and hundreds of subscriptions: a hundred vehicles each listen to a key of
+    their own, agents to each plot near them.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._found: dict[tuple[str, ...], list[Declaration]] = {}
+        """Values of all fields of a key -> `find` of it, until a subscription comes or goes."""
+        self._by_names: dict[tuple[str, ...], dict[tuple[str, ...], list[tuple[int, Declaration]]]] = {}
+        """Names of the fields that are no wildcard -> their values -> (number of the declaration, subscription)."""
+
+    def add(self, declaration: Declaration) -> None:
+        self._found.clear()
+        names, values = tuple(declaration.narrow), tuple(declaration.narrow.values())
+        self._by_names.setdefault(names, {}).setdefault(values, []).append((self._count, declaration))
+        self._count += 1
+
+    def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
+        """Forget the subscriptions of a bus: all, or those with exactly these fields."""
+        self._found.clear()
+        for names, by_values in self._by_names.items():
+            if narrow is not None and names != tuple(narrow):
+                continue
+            for values in list(by_values) if narrow is None else [tuple(narrow.values())]:
+                kept = [each for each in by_values.pop(values, ()) if each[1].bus is not bus]
+                if kept:
+                    by_values[values] = kept
+
+    def find(self, fields: Mapping[str, str]) -> list[Declaration]:
+        """Those that a value with these fields reaches: first the ones with wildcards, each kind in the order of
+        its declaration. A replayed run depends on this order. The list is kept: nobody may change it."""
+        key = tuple(fields.values())
+        found = self._found.get(key)
+        if found is None:
+            found = self._found[key] = self._look_up(fields)
+        return found
+
+    def _look_up(self, fields: Mapping[str, str]) -> list[Declaration]:
+        wide: list[tuple[int, Declaration]] = []
+        exact: list[tuple[int, Declaration]] = []
+        for names, by_values in self._by_names.items():
+            found = by_values.get(tuple([fields[name] for name in names]), ())
+            (exact if len(names) == len(fields) else wide).extend(found)
+        return [declaration for _, declaration in sorted(wide, key=itemgetter(0)) + exact]
+
+
+def sampled(bus: MemoryBus, post: Post, every_ns: int) -> Post:
+    """Posts the newest sample of each key, `every_ns` after the first that came."""
+    newest: dict[str, Heard] = {}
+
+    def flush() -> None:
+        waiting = list(newest.values())
+        newest.clear()
+        if not bus.closed:
+            for event in waiting:
+                post(event)
+
+    def arrive(event: Event) -> None:
+        if isinstance(event, Heard):
+            if not newest:
+                bus.network.scheduler.after(every_ns, flush)
+            newest[event.topic.below(event.fields)] = event
+
+    return arrive
+
+
+# What becomes of messages between the nodes of a `MemoryNetwork`.
+
+
+class LinkModel(Protocol):
+    """What happens to a message between two nodes."""
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        """One delay per copy that arrives; none where it is lost."""
+        ...
+
+    def connected(self, source: str, destination: str, now_ns: int) -> bool:
+        """Whether the network holds the two for connected, in the direction of the message. Tokens and queries
+        depend on it. It may lag behind `delays_ns`: a cut is noticed when the lease runs out."""
+        ...
+
+
+class PerfectLinks:
+    """Every message arrives once, after the same short time."""
+
+    def __init__(self, delay_ns: int = 200_000) -> None:
+        self._delays = (delay_ns,)
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        return self._delays
+
+    def connected(self, source: str, destination: str, now_ns: int) -> bool:
+        return True
+
 
 TOKEN_NS = 1_000_000
 """Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""

@@ -10,17 +10,22 @@ ten times a second for nothing (`Arrivals`).
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import re
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
 from swarm.bus.bus import (
     TIMEOUT_PARAMETER,
+    USUAL_TIMEOUT_S,
     Appeared,
     Asked,
     AskEnded,
@@ -33,9 +38,7 @@ from swarm.bus.bus import (
     Undecoded,
     check_subscription,
 )
-from swarm.bus.endpoints import listening, wait_for_router
-from swarm.bus.open_errors import why_not_listening, why_unreachable
-from swarm.bus.zenoh_answerer import ZenohAnswerer
+from swarm.bus.endpoints import host_port, listening, wait_for_router
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_intake import Intake
 from swarm.bus.zenoh_threads import (
@@ -54,6 +57,96 @@ from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
+
+# The answers to one query on Zenoh.
+
+
+class Reply(Protocol):
+    """Sends one answer to a query whose payload was `asked`, or as a text why there is none."""
+
+    def __call__(
+        self, query: zenoh.Query, asked: bytes, message: Message | str, fields: Mapping[str, str | int]
+    ) -> None: ...
+
+
+class ZenohAnswerer:
+    """The `Answerer` of one query, which arrives when this is made. `_query` is None after the end.
+
+    asked  its payload
+    """
+
+    def __init__(self, query: zenoh.Query, asked: bytes, reply: Reply) -> None:
+        self._query: zenoh.Query | None = query
+        self._reply = reply
+        self.asked = asked
+        self._arrived_s = time.monotonic()
+        self.timeout_s = USUAL_TIMEOUT_S
+
+    def waited_s(self) -> float:
+        return time.monotonic() - self._arrived_s
+
+    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
+        if self._query is None:
+            raise RuntimeError("answered after the end")
+        self._reply(self._query, self.asked, message, fields)
+
+    def refuse(self, reason: str) -> None:
+        if self._query is not None:
+            self._reply(self._query, self.asked, reason, {})
+
+    def end(self) -> None:
+        # Zenoh ends a query when its last handle goes; `drop` does it now, not at the next garbage collection.
+        if self._query is not None:
+            self._query.drop()  # type: ignore[no-untyped-call]
+            self._query = None
+
+
+# Why a session could not be opened, in our words. The library names its own source files instead.
+
+_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+_KNOCK_S = 1.0
+_HINTS = {
+    errno.EADDRINUSE: "is the port taken?",
+    errno.EADDRNOTAVAIL: "is it an address of this machine?",
+    errno.EACCES: "ports below 1024 are for administrators",
+}
+
+
+def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
+    """Why no router is reached at any of these endpoints: what its port does when somebody knocks."""
+    reasons = dict.fromkeys(_why_silent(endpoint, encrypted) for endpoint in endpoints)
+    return "; ".join(reasons)
+
+
+def why_not_listening(error: Exception) -> str:
+    """Why nobody can listen, from what the library says."""
+    found = _OS_ERROR.search(str(error))
+    if found is None:
+        return "the network library refuses; its own words are in the log (is the port taken?)"
+    number = int(found[1])
+    hint = _HINTS.get(number)
+    return os.strerror(number) + (f" ({hint})" if hint else "")
+
+
+def _why_silent(endpoint: str, encrypted: bool) -> str:
+    try:
+        host, port = host_port(endpoint)
+        socket.create_connection((host, port), timeout=_KNOCK_S).close()
+    except socket.gaierror:
+        return f"the name {host} is unknown here"
+    except TimeoutError:
+        return f"no answer within {_KNOCK_S:g} s (is a firewall between?)"
+    except ConnectionRefusedError:
+        return "nobody listens there (is `swarm router` running there?)"
+    except (OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error)
+    if encrypted:
+        return (
+            "somebody listens there, and refuses us or is no router "
+            "(is `swarm router` running there, with certificates of the same authority?)"
+        )
+    return "somebody listens there, and does not answer as a router (is `swarm router` running there?)"
+
 
 log = logging.getLogger(__name__)
 

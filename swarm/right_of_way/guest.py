@@ -11,7 +11,7 @@ from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Known
 
 MOST_AHEAD = 16

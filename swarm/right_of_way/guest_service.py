@@ -14,7 +14,7 @@ from swarm.right_of_way.guest import Guest, SaveLives
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.life_file import Lives
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.fields import check_id
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest
 from swarm.wire.topics import GRANTED, KNOWN, STANDING

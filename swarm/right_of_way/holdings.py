@@ -8,8 +8,8 @@ from itertools import chain, takewhile
 
 import msgspec
 
-from swarm.right_of_way.lives import BEAT_NS, FURTHEST_EPOCH
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
 
 _UNHEARD_NS = 5 * BEAT_NS // 2

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer, Roster
 from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
-from swarm.right_of_way.lives import first_life, is_far_ahead
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.incarnations import first_life, is_far_ahead
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted
 
 LIVES_KEPT = 32

@@ -9,7 +9,7 @@ from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest import Removal
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest
 from swarm.wire.topics import GRANTED, KNOWN, STANDING

@@ -16,8 +16,8 @@ from support.effort import few
 from support.map_strategies import GRID, held_winners, naive_winners
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.replication.marks import base_seq
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.wire.messages.map_data import DIGEST_ROW, MarkKind, MarkSet

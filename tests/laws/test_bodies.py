@@ -17,14 +17,14 @@ from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Body
 from vehicle_agent.agent import Agent
+from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.bodies import REACTION_S, Bodies
 from vehicle_agent.discs import Capsule
 from vehicle_agent.driving.driver import Driver
-from vehicle_agent.local_map import LocalMap
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.steering import Steering
 

@@ -19,7 +19,7 @@ from planner_service.target_tree import TargetTree
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 from planner_service.tree.route_reading import read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk

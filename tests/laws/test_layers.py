@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from swarm.grid import GridSpec
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import KnownRequest
-from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 names = st.lists(st.sampled_from([f"a{n}" for n in range(12)]), min_size=1, max_size=12, unique=True)
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.wire.messages.map_data import MarkKind
 

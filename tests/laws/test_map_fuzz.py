@@ -13,7 +13,7 @@ import pytest
 from support.map_strategies import GRID, Acknowledged, Composite, held_winners, naive_winners, set_of
 from support.swarm_model import SwarmModel
 
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.marks import fault
 from shared_map.replication.replica import MapReplica

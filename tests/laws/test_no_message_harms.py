@@ -27,8 +27,8 @@ from launch_scripts.monitor.sinks import Pen
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.service import PlannerService
 from shared_map.arrays import Floats
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth, terrain_of_pace
 from swarm.bus.bus import Event, Replied
 from swarm.bus.scheduler import InlineWorker

@@ -19,7 +19,7 @@ from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Grant
 from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.member import Member
-from vehicle_agent.traffic.right_of_way import RightOfWay
+from vehicle_agent.traffic.right_of_way_core import RightOfWay
 from vehicle_agent.traffic.warden import Warden
 
 QUIET_S = 12.0

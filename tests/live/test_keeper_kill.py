@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.learning.words import ONE, Said, stated
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.tiles import beyond_region, beyond_tile

@@ -14,8 +14,8 @@ from support.processes import eventually
 from typer.testing import CliRunner
 
 from launch_scripts.commands.map_commands import app
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.learning.words import ONE, Said
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_region, beyond_tile

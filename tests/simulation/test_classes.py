@@ -14,7 +14,7 @@ from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, nodes_of
 from shared_map.class_grounds import ClassGround, class_grounds
-from shared_map.keeper.zones import zones_of
+from shared_map.keeper.zone_orders import zones_of
 from shared_map.terrain.terrain import build_truth
 from swarm.config.agents import added_agent
 from swarm.config.classes import ClassConfig, class_numbers

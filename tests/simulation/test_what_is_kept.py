@@ -21,12 +21,12 @@ from swarm.config.agents import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Granted, Table
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
+from vehicle_agent.traffic.cell_requests import Wishes
 from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.warden import SILENT_NS, Warden, _is_entering, _turn
-from vehicle_agent.traffic.wishes import Wishes
 
 ROVERS = (
     RoverConfig(name="quick", count=3, speed_m_per_s=3.0, radius_m=4.0),

@@ -12,7 +12,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Event, Heard
-from swarm.bus.memory_links import LinkModel
+from swarm.bus.memory_bus import LinkModel
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.config.load import parse_scenario
@@ -24,7 +24,7 @@ from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, Rou
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 

@@ -13,7 +13,7 @@ from swarm.right_of_way.guest import Guest, GuestAction, Removal, SaveLives
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest
-from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 _ANOTHER_CELL_NS = 2 * NS_PER_S
 

@@ -14,7 +14,7 @@ from planner_service.full_growth import GrownTree
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.pieces import PieceTree
+from planner_service.tree.partitioned_tree import PieceTree
 from planner_service.tree.strides import StrideSearch
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig

@@ -15,10 +15,10 @@ from typing import Any
 from msgspec.json import encode
 from support.wire_strategies import EXAMPLES
 
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from swarm.grid import GridSpec
 from vehicle_agent.promise_store import FilePromiseStore
-from vehicle_agent.traffic.right_of_way import OwnRecord
+from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 _GRID = GridSpec(64, 96, 30.0)
 

@@ -9,14 +9,13 @@ from typing import TypeVar
 import numpy as np
 from support.map_strategies import GRID, Composite
 
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Event, Post
-from swarm.bus.memory_bus import MemoryBus, MemoryNetwork
-from swarm.bus.memory_links import LinkModel, PerfectLinks
+from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario

@@ -8,10 +8,10 @@ from itertools import pairwise
 
 from shared_map.terrain.step_climb import Climb, may_be_pulled
 from swarm.right_of_way.holdings import Holdings
+from vehicle_agent.agent_maps import LocalMap
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.motion import Motion, Point
-from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.local_map import LocalMap
 
 
 class Driver:

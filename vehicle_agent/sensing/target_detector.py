@@ -12,7 +12,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.messages.planning import Sighted, TargetPose
-from vehicle_agent.driving.places import Places
+from vehicle_agent.driving.positions import Places
 
 _TELL_NS = NS_PER_S // 2
 """Period of the sightings of a target that stays in sight."""

@@ -17,7 +17,7 @@ from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 
 _LOOK_CELLS = 200
 """Cells of the route ahead that are searched for bodies, and behind a body for where to come back."""

@@ -10,8 +10,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.right_of_way.lives import BEAT_NS, FURTHEST_EPOCH
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.incarnations import BEAT_NS, FURTHEST_EPOCH
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Stamp, Standing, Stored, Table
 from vehicle_agent.traffic.warden import Warden
 

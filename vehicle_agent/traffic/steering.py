@@ -15,7 +15,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""

@@ -15,8 +15,8 @@ from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.right_of_way.lives import BEAT_NS, is_far_ahead
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.incarnations import BEAT_NS, is_far_ahead
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Shut, Stamp, Stand, Standing, Table
 from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.pibt import Mover, Round

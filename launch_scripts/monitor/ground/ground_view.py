@@ -24,7 +24,7 @@ from launch_scripts.monitor.movers.styles import Look
 from launch_scripts.monitor.sinks import Pen, even, screen
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
-from shared_map.keeper.zones import cells_of_zones
+from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import zone_mask

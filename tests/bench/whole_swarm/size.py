@@ -11,7 +11,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
 from swarm.errors import ConfigError
-from swarm.right_of_way.plots import fitting_regions
+from swarm.right_of_way.lock_regions import fitting_regions
 
 CELLS_PER_VEHICLE = 262.144
 """As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""

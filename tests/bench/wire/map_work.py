@@ -11,7 +11,7 @@ import typer
 
 from bench.harness import Seed, benchmark, cpu_ms, numbers_of, track
 from shared_map.keeper.compaction import compact
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.presence import Presence
 from shared_map.replication.replica import MapReplica
 from swarm.clock import NS_PER_S

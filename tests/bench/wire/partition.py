@@ -31,8 +31,8 @@ import typer
 from bench.harness import benchmark, track
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher.router import RouterService
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.map_commands import app
 from shared_map.keeper.export import from_json, to_bands, to_json
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.words import Said
 from shared_map.replication.replica import MapReplica
 from swarm.errors import StoreError

@@ -20,8 +20,7 @@ from launch_scripts import web
 from launch_scripts.observe.counts import Counts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, figures_of, named
-from swarm.bus.memory_bus import MemoryNetwork
-from swarm.bus.memory_links import PerfectLinks
+from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.errors import BusError

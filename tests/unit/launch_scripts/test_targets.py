@@ -23,7 +23,7 @@ from launch_scripts.simulation.world.targets import (
     TargetWorld,
 )
 from launch_scripts.simulation.world.walks import Walk
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.start_cells import homes_of
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard

@@ -20,7 +20,7 @@ from planner_service.service import PlannerService
 from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps, read_by
 from shared_map.cost_map import CostMap
-from shared_map.keeper.zones import rows_of
+from shared_map.keeper.zone_orders import rows_of
 from shared_map.learning.words import ONE, Said
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain

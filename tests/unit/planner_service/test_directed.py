@@ -24,13 +24,13 @@ from swarm.config.values import Strategy
 from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes
+from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.assignment import AskCosts
-from vehicle_agent.local_map import LocalMap
 from vehicle_agent.sensing.sensor import TruthSensor
 
 RES = 10.0

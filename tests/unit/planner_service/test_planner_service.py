@@ -17,7 +17,7 @@ from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.target_tree import TargetTree
 from shared_map.cost_map import CostMap
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig

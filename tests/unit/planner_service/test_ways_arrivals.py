@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from planner_service.search.ways import Ways
+from planner_service.search.search_routes import Ways
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -41,7 +41,7 @@ def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below
     exact = oracle_s(pace, 10.0, start)
     ways = Ways(costs)
     np.testing.assert_allclose(ways.arrivals_s(start), exact, rtol=1e-5)
-    monkeypatch.setattr("planner_service.search.ways._MOST_CELLS", 0)
+    monkeypatch.setattr("planner_service.search.search_routes._MOST_CELLS", 0)
     bound = ways.arrivals_s(start)
     assert (bound <= exact * (1 + 1e-5)).all()
     assert (np.isinf(bound) == np.isinf(exact)).all()

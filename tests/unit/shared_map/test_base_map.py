@@ -14,7 +14,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, describe, pack
 from shared_map.keeper.base_map_transfer import BaseMapServer, Fetching, fetch_base_map
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Bus, Event, Replied
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig

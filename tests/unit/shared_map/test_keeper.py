@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, Acknowledged, set_of
 from support.swarm_model import SwarmModel
 
-from shared_map.keeper.store import Keeper, KeeperStore
+from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.learning.words import ONE, Said, told
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace

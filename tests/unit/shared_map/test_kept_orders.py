@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.swarm_model import SwarmModel
 
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import LONGEST_NS, Sightings, pose_of
 from swarm.bus.bus import Heard
@@ -18,8 +18,8 @@ from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
-from vehicle_agent.driving.places import Places
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.driving.positions import Places
 from vehicle_agent.sensing.target_detector import TargetDetector
 
 GRID = GridSpec(40, 40, 10.0, west_m=1000.0, north_m=5000.0)

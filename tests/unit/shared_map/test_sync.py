@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from support.map_strategies import Acknowledged, Composite, set_of
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync

@@ -16,8 +16,8 @@ from support.map_strategies import held_winners, set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.cost_map import CostMap
-from shared_map.keeper.store import KeeperStore
-from shared_map.keeper.zones import _crossing, rows_of, zone_sets
+from shared_map.keeper.mark_store import KeeperStore
+from shared_map.keeper.zone_orders import _crossing, rows_of, zone_sets
 from shared_map.replication.filter import readable_for_target
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace

@@ -21,7 +21,7 @@ from support.map_strategies import Composite
 from support.planner_swarm import GRID, Swarm, driven_s, rough
 from support.swarm_model import LossyLinks, SwarmModel
 
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Heard
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream

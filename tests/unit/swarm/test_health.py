@@ -16,8 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.bus.bus import AskEnded, Event, LinkChanged
-from swarm.bus.memory_bus import MemoryNetwork
-from swarm.bus.memory_links import PerfectLinks
+from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
 from swarm.runtime import health as health_module

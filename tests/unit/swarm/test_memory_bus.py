@@ -13,7 +13,7 @@ from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus import memory_bus
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
-from swarm.bus.memory_links import PerfectLinks
+from swarm.bus.memory_bus import PerfectLinks
 from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
 from swarm.liveness import Peer

@@ -19,19 +19,19 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
+from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
-from vehicle_agent.driving.places import Places
-from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.fleet import FleetReport
-from vehicle_agent.local_map import LocalMap
+from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.driving.positions import Places
 from vehicle_agent.placement import spawn_cells
+from vehicle_agent.reports import FleetReport
 from vehicle_agent.sensing.sensor import TruthSensor
 
 GRID = GridSpec(12, 12, 10.0)

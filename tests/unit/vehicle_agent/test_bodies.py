@@ -19,7 +19,7 @@ from swarm.right_of_way.holdings import Wish
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import MOST_BODIES, Bodies
-from vehicle_agent.driving.vehicle import GivenRoute, Vehicle
+from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
 

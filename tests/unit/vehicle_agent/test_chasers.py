@@ -10,7 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
-from vehicle_agent.chasers import HEARTBEAT_NS, ChasersReport
+from vehicle_agent.reports import HEARTBEAT_NS, ChasersReport
 
 TICK_NS = NS_PER_S // 10
 GRID = GridSpec(rows=64, cols=64, resolution_m=10.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swarm.clock import NS_PER_S
-from vehicle_agent.entering import Entering
+from vehicle_agent.spawning import Entering
 
 
 class Held:

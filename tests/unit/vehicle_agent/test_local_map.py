@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.grid import Window
-from vehicle_agent.local_map import meet
+from vehicle_agent.agent_maps import meet
 
 numbers = st.integers(-4, 20)
 sizes = st.just((-1, -1)) | st.tuples(st.integers(0, 9), st.integers(0, 9))

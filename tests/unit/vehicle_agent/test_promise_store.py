@@ -13,7 +13,7 @@ from swarm.errors import StoreError
 from swarm.wire.messages.traffic import Grant, Table
 from vehicle_agent import promise_store
 from vehicle_agent.promise_store import FilePromiseStore
-from vehicle_agent.traffic.right_of_way import OwnRecord
+from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 
 def table(plot: int, seq: int) -> Table:

@@ -32,7 +32,7 @@ from vehicle_agent.assignment import (
     assigner_of,
     shares_costs,
 )
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.group_costs import GroupCosts
 from vehicle_agent.matching import HYSTERESIS, need_first
 

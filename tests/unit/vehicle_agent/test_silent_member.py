@@ -5,10 +5,10 @@ from __future__ import annotations
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Known, KnownRequest, Table
 from vehicle_agent.traffic.member import AskPromises, Save
-from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 AGENTS = ["a0", "a1", "a2"]
 PLOTS = Plots(GridSpec(8, 8, 1.0), AGENTS)

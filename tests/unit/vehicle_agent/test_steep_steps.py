@@ -17,10 +17,10 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import RouteStatus
+from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.driving.driver import Driver
-from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.local_map import LocalMap
 from vehicle_agent.traffic.steering import Steering
 
 GRID = GridSpec(8, 8, 10.0)

@@ -15,14 +15,14 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings, Tell, Wish
-from swarm.right_of_way.lives import BEAT_NS, first_life, is_far_ahead
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.incarnations import BEAT_NS, first_life, is_far_ahead
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from swarm.wire.topics import STANDING
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
-from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 from vehicle_agent.traffic.steering import Steering
 from vehicle_agent.traffic.warden import Warden
 

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
-import swarm.right_of_way.plots
+import swarm.right_of_way.lock_regions
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import MOST_PLOTS, REGION_CELLS, GridSpec
 from swarm.right_of_way.guest_service import GuestService
 from swarm.right_of_way.life_file import MemoryLives
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table
-from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 GRID = GridSpec(1100, 1100, 1.0)
 SMALL, LARGE = REGION_CELLS, 2 * REGION_CELLS
@@ -72,7 +72,7 @@ class Mixed(TrafficWorld):
 def test_vehicles_of_agents_with_plots_of_two_sizes_do_not_meet(
     agents: int, per_agent: int, side: int, others: set[str], other_side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(swarm.right_of_way.plots, "REGION_CELLS", 4)
+    monkeypatch.setattr(swarm.right_of_way.lock_regions, "REGION_CELLS", 4)
     for seed in range(4):
         world = Mixed(seed, agents, per_agent, side, others, other_side)
         world.run(12)

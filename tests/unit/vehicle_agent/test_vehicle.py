@@ -13,7 +13,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteStatus
-from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Reason, Vehicle
+from vehicle_agent.driving.driven_vehicle import AskRoute, Follow, GivenRoute, Reason, Vehicle
 
 GRID = GridSpec(10, 10, 10.0)
 S = NS_PER_S

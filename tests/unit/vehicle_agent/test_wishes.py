@@ -12,13 +12,13 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.right_of_way.holdings import Holdings, Wish
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.vehicle import GivenRoute, Vehicle
+from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
+from vehicle_agent.traffic.cell_requests import Wishes
 from vehicle_agent.traffic.steering import Steering
-from vehicle_agent.traffic.wishes import Wishes
 
 GRID = GridSpec(24, 24, 10.0, 0.0, 240.0)
 TICK_NS = NS_PER_S // 10

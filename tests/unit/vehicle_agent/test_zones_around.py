@@ -6,7 +6,7 @@ from typing import Any
 
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event, Replied
 from swarm.wire.messages.orders import ZoneOrder, Zones
 from swarm.wire.messages.vehicles import Body, VehicleState

@@ -17,8 +17,7 @@ from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.pieces import ALTERED, CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.growth import KeptScratch
-from planner_service.tree.window_growth import grow_window
+from planner_service.tree.growth import KeptScratch, grow_window
 from swarm.grid import Window
 
 MOST_LOOKS = 3.0

@@ -17,7 +17,7 @@ from swarm.grid import REGION_CELLS
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host, first_of
-from swarm.right_of_way.plots import Plots
+from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Standing, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused
 

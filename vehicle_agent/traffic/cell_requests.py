@@ -15,9 +15,9 @@ import numpy as np
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.right_of_way.holdings import Holdings, Wish
+from vehicle_agent.agent_maps import meet
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.local_map import meet
+from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S

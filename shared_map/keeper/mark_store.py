@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO
@@ -15,7 +15,6 @@ from urllib.parse import quote
 
 import msgspec
 
-from shared_map.keeper.class_order import agreed
 from shared_map.keeper.compaction import united, without
 from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import base_seq, is_tombstone
@@ -27,6 +26,28 @@ from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order
 from swarm.wire.messages.planning import Sighted
+
+# Which class of vehicles each number means, by which the marks in a store name it. Pure.
+
+
+def agreed(stored: Sequence[str], given: Sequence[str], used: Collection[int]) -> list[str] | str:
+    """The classes in the order of their numbers, once a run with these has the store; why it cannot have it, in
+    words, where a mark for one class alone would become one for another, or for nobody though the class is there.
+
+    stored  the classes as the store has them; it may lack some of `used` if it is older than they
+    given   those of the run
+    used    numbers, from 1 on, of the classes for which alone something is marked
+    """
+    for number in sorted(used):
+        if number > len(stored):
+            continue
+        name = stored[number - 1]
+        is_gone = number > len(given) and name not in given
+        if not is_gone and given[number - 1 : number] != [name]:
+            there = ", ".join(given) if given else "none"
+            return f"marks for {name} alone, which is class {number} there, but this run has the classes {there}"
+    return [*given, *stored[len(given) :]]
+
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import REGION_CELLS, GridSpec
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import Vehicle
 
 
 class Places:
