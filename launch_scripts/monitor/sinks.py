@@ -243,9 +243,7 @@ class Sinks:
         live: list[rr.GrpcServerSink] = []
         if config.live:
             host, port = behind = _hidden_address()
-            self.gate = _when_free(
-                lambda: Server("grpc_port", config.grpc_port, {}, behind=behind, newest_first=False)
-            )
+            self.gate = _when_free(lambda: Server("grpc_port", config.grpc_port, {}, behind=behind))
             self.page = _when_free(lambda: LivePage(config.web_port, behind))
             self._servers = [self.page.server, self.gate]
             live.append(rr.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY))

@@ -58,7 +58,7 @@ class LivePage:
             _BANNER: lambda query, headers: Reply(200, "text/javascript", banner),
             "/run.json": lambda query, headers: Reply(200, "application/json", json.dumps(self.run()).encode()),
         }
-        self.server = Server("web_port", port, pages, behind=stream, lasts_s=_LASTS_S, newest_first=False)
+        self.server = Server("web_port", port, pages, behind=stream, lasts_s=_LASTS_S)
 
     def _entrance(self, query: str, headers: Message) -> Reply:
         """Leads a visit without a query to the stream, which comes through the page's own port: so a tunnel needs

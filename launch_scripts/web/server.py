@@ -68,14 +68,15 @@ class Audience(NamedTuple):
 class Server(socketserver.ThreadingTCPServer):
     """Answers requests, each connection on a thread of its own. At most `MOST_CONNECTIONS` are open at once.
 
-    what          names the port in an error
-    port          0 is any
-    pages         path -> what answers it
-    address       one beyond loopback serves visitors from elsewhere, too
-    behind        address of rerun's server, to which requests for the stream are passed
-    lasts_s       a connection that does not take the stream is cut after so long
-    newest_first  a visitor beyond the bound is let in, and the oldest connection is cut for it: where requests are
-                  short, nobody keeps others out by holding connections open; else that visitor is cut
+    what     names the port in an error
+    port     0 is any
+    pages    path -> what answers it
+    address  one beyond loopback serves visitors from elsewhere, too
+    behind   address of rerun's server, to which requests for the stream are passed
+    lasts_s  a connection that does not take the stream is cut after so long
+
+    A visitor beyond the bound is cut where there is a stream. Where there is none, requests are short: it gets in,
+    and the oldest connection is cut for it, so that nobody keeps others out by holding connections open.
 
     Raises BusError if it cannot listen there. The OSError is its cause.
     """
@@ -95,9 +96,8 @@ class Server(socketserver.ThreadingTCPServer):
         *,
         behind: tuple[str, int] | None = None,
         lasts_s: float = 10.0,
-        newest_first: bool = True,
     ) -> None:
-        self.pages, self.behind, self.lasts_s, self.newest_first = pages, behind, lasts_s, newest_first
+        self.pages, self.behind, self.lasts_s = pages, behind, lasts_s
         self.guarded = address in _HOSTS
         self.address_family = socket.AF_INET6 if ":" in address else socket.AF_INET
         self._lock = threading.Lock()
@@ -136,7 +136,7 @@ class Server(socketserver.ThreadingTCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         with self._lock:
-            if len(self._open) >= MOST_CONNECTIONS and self.newest_first:
+            if len(self._open) >= MOST_CONNECTIONS and self.behind is None:
                 oldest = next(iter(self._open))
                 del self._open[oldest]
                 _cut(oldest)
