@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from bench.wire.partition import partitions, why_not
+from bench.wire.partition import partitions
+from support.machines import why_not
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
-
-from bench.wire.partition import why_not
-
-__all__ = ["Machines", "machines", "why_not"]
 
 
 class Machines:
@@ -93,3 +90,18 @@ def machines(addresses: Mapping[str, str], environment: Mapping[str, str]) -> It
 def _ip(*arguments: str) -> None:
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"ip {' '.join(arguments)}: {done.stderr.strip()}"
+
+
+def why_not() -> str | None:
+    """Why this machine cannot run two namespaces; None if it can."""
+    if shutil.which("ip") is None:
+        return "there is no command ip (iproute2)"
+    space = f"swarm-try-{os.getpid()}"
+    tried = subprocess.run(["ip", "netns", "add", space], capture_output=True, text=True, check=False)
+    if tried.returncode:
+        return f"network namespaces are not permitted: {tried.stderr.strip()}"
+    name = f"swt{os.getpid() % 1_000_000}"
+    link = ["ip", "-n", space, "link", "add", name, "type", "veth", "peer", "name", f"{name}p"]
+    tried = subprocess.run(link, capture_output=True, text=True, check=False)
+    subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
+    return f"veth links are not permitted: {tried.stderr.strip()}" if tried.returncode else None

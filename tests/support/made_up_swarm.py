@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from multiprocessing.connection import Connection
+from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from shared_map.replication.marks import Statements, mark_set
 from swarm.bus.bus import Asked
@@ -18,10 +20,11 @@ from swarm.wire.fields import pack_column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, RUN
 
 GRID = GridSpec(2048, 2048, 10.0)
+Numbers = NDArray[Any]
 _PER_AGENT = 25
 _HZ = 10.0
 _ROUTE_CELLS, _NEW_ROUTE_S = 200, 2.0
@@ -35,6 +38,20 @@ def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
     kinds = (np.arange(marks) % 2).astype(np.uint8)
     paces = np.where(kinds == MarkKind.PACE, np.float32(0.25), np.float32(0))
     return mark_set(author, "all", tile, 1, seq, Statements(cells, kinds, paces, np.full(marks, seq + 1, np.int64)))
+
+
+def some_fleet(
+    agent: str, region: int, seq: int, cells: Numbers, east_m: Numbers, south_m: Numbers, target_ids: list[str]
+) -> Fleet:
+    """An agent's vehicles, all of which drive east, after the first target if there is one."""
+    many = len(cells)
+    return Fleet(
+        author=f"{agent}.1", group="all", region=region, seq=seq, stamp_ns=time.time_ns(), target_ids=target_ids,
+        ids=[f"{agent}-{n:02d}" for n in range(many)], cells=pack_column(cells, "<u4"),
+        east_m=pack_column(east_m, "<f4"), south_m=pack_column(south_m, "<f4"),
+        heading_rad=pack_column(np.full(many, np.pi / 2), "<f4"), states=bytes([VehicleState.FOLLOWING] * many),
+        targets=bytes([0 if target_ids else NO_TARGET] * many),
+    )  # fmt: skip
 
 
 def swarm_peer(
@@ -75,12 +92,7 @@ def _tell(bus: ZenohBus, tick: int, vehicles: int) -> None:
         south_m = np.full(_PER_AGENT, 500.0 + 100.0 * agent)
         cells = (south_m // GRID.resolution_m).astype(int) * GRID.cols + (east_m // GRID.resolution_m).astype(int)
         ids = [f"a{agent}-{n:02d}" for n in numbers]
-        fleet = Fleet(
-            author=author, group="all", region=agent, seq=tick, stamp_ns=time.time_ns(), ids=ids, target_ids=["t0"],
-            cells=pack_column(cells, "<u4"), east_m=pack_column(east_m, "<f4"),
-            south_m=pack_column(south_m, "<f4"), heading_rad=pack_column(np.full(_PER_AGENT, np.pi / 2), "<f4"),
-            states=bytes([VehicleState.FOLLOWING] * _PER_AGENT), targets=bytes(_PER_AGENT),
-        )  # fmt: skip
+        fleet = some_fleet(f"a{agent}", agent, tick, cells, east_m, south_m, ["t0"])
         bus.publish(FLEET, fleet, region=agent, author=author)
         for n in range(tick % int(_NEW_ROUTE_S * _HZ), _PER_AGENT, int(_NEW_ROUTE_S * _HZ)):
             steps = bytes((np.arange(_ROUTE_CELLS) // 7 % 2 + 2).astype(np.uint8))  # east and south-east

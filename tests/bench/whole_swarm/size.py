@@ -20,16 +20,8 @@ _FEWEST_AGENTS, _MOST_AGENTS = 5, 40
 _MOST_VEHICLES = 100_000
 LEAST_SIDE, MOST_SIDE = 32, 16_384
 
+_LIVE = "# --- of live swarms only\n"
 _SCENARIO = Path(__file__).with_name("scale.toml.in")
-_PLACES = """
-[network]
-listen = ["{endpoint}"]
-connect = ["{endpoint}"]
-
-[monitor]
-grpc_port = 0
-web_port = 0
-"""
 
 
 class Size(msgspec.Struct, frozen=True, kw_only=True):
@@ -115,7 +107,8 @@ def scenario_text(size: Size, endpoint: str | None = None) -> str:
     endpoint  of the router; the live view then takes free ports
     """
     lengths, areas = size.side / 512, (size.side / 512) ** 2
-    text = _SCENARIO.read_text(encoding="utf-8").format(
+    scenario, _, places = _SCENARIO.read_text(encoding="utf-8").partition(_LIVE)
+    text = scenario.format(
         **msgspec.structs.asdict(size),
         planner_hz=size.tick_hz,
         roads=min(max(round(24 * lengths), 2), 200),
@@ -123,7 +116,7 @@ def scenario_text(size: Size, endpoint: str | None = None) -> str:
         closed_roads=min(round(20 * areas), 1000),
         rubble_fields=min(round(30 * areas), 10_000),
     )
-    return text if endpoint is None else text + _PLACES.format(endpoint=endpoint)
+    return text if endpoint is None else text + places.format(endpoint=endpoint)
 
 
 def scenario_of(size: Size) -> Scenario:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from support.made_up_swarm import some_fleet
 
 from bench.harness import Seed, benchmark, cpu_ms, numbers_of, track
 from shared_map.keeper.compaction import compact
@@ -17,8 +18,7 @@ from shared_map.replication.replica import MapReplica
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
-from swarm.wire.fields import pack_column
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet
 
 _PER_AGENT = 25
 _LEASE_NS = 2_000_000_000
@@ -34,23 +34,8 @@ def fleets(grid: GridSpec, count: int, seed: int) -> list[Fleet]:
     reports = []
     for agent in range(count // _PER_AGENT):
         rows, cols = rng.integers(0, grid.rows, _PER_AGENT), rng.integers(0, grid.cols, _PER_AGENT)
-        reports.append(
-            Fleet(
-                author=f"a{agent}.1",
-                group="all",
-                region=0,
-                seq=1,
-                stamp_ns=1,
-                ids=[f"a{agent}-{n:02d}" for n in range(_PER_AGENT)],
-                target_ids=[],
-                cells=pack_column(rows * grid.cols + cols, "<u4"),
-                east_m=pack_column((cols + 0.5) * grid.resolution_m, "<f4"),
-                south_m=pack_column((rows + 0.5) * grid.resolution_m, "<f4"),
-                heading_rad=pack_column(np.zeros(_PER_AGENT), "<f4"),
-                states=bytes([VehicleState.FOLLOWING] * _PER_AGENT),
-                targets=bytes([NO_TARGET] * _PER_AGENT),
-            )
-        )
+        east_m, south_m = (cols + 0.5) * grid.resolution_m, (rows + 0.5) * grid.resolution_m
+        reports.append(some_fleet(f"a{agent}", 0, 1, rows * grid.cols + cols, east_m, south_m, []))
     return reports
 
 

@@ -13,7 +13,6 @@ import contextlib
 import json
 import os
 import queue
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from support.machines import why_not
 
 from bench.harness import benchmark, track
 from launch_scripts.deploy.certificates import issue
@@ -306,21 +306,6 @@ def partitions(count: int, seconds: float, folder: Path) -> Generator[dict[str, 
             since_s = sides.equal_since()
             assert since_s is not None
             yield {"equal_after_s": round(max(since_s - healed_s, 0.0), 3), "digests_apart": apart}
-
-
-def why_not() -> str | None:
-    """Why this machine cannot run two namespaces; None if it can."""
-    if shutil.which("ip") is None:
-        return "there is no command ip (iproute2)"
-    space = f"swarm-try-{os.getpid()}"
-    tried = subprocess.run(["ip", "netns", "add", space], capture_output=True, text=True, check=False)
-    if tried.returncode:
-        return f"network namespaces are not permitted: {tried.stderr.strip()}"
-    name = f"swt{os.getpid() % 1_000_000}"
-    link = ["ip", "-n", space, "link", "add", name, "type", "veth", "peer", "name", f"{name}p"]
-    tried = subprocess.run(link, capture_output=True, text=True, check=False)
-    subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
-    return f"veth links are not permitted: {tried.stderr.strip()}" if tried.returncode else None
 
 
 def _ip(*arguments: str) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import zenoh
 from support.far_processes import Far, asked
+from support.made_up_swarm import some_fleet
 
 from bench.wire.remote import RAW, Parts, beside, read_on_thread, run_service
 from shared_map.terrain.terrain import terrain_of_pace
@@ -24,7 +25,6 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import ThreadWorker
 from swarm.runtime.role import RoleSetup
 from swarm.wire.codec import encode
-from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.routes import RouteStatus
@@ -166,7 +166,7 @@ def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles:
         for _ in range(int(seconds * _HZ)):
             seq += 1
             for n, bus in enumerate(buses):
-                fleet = _fleet(f"a{first + n}.1", first + n, seq, vehicles)
+                fleet = _fleet(first + n, seq, vehicles)
                 if raw:
                     bus.session.put(f"{RAW}/fleet/{fleet.region}/{fleet.author}", encode(fleet))
                 else:
@@ -179,24 +179,9 @@ def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles:
         bus.close()
 
 
-def _fleet(author: str, region: int, seq: int, vehicles: int) -> Fleet:
-    agent = author.partition(".")[0]
+def _fleet(agent: int, seq: int, vehicles: int) -> Fleet:
     places = np.linspace(0.0, 1000.0, vehicles) + seq
-    return Fleet(
-        author=author,
-        group="all",
-        region=region,
-        seq=seq,
-        stamp_ns=time.time_ns(),
-        ids=[f"{agent}-{n:02d}" for n in range(vehicles)],
-        target_ids=[_TARGET],
-        cells=pack_column(places, "<u4"),
-        east_m=pack_column(places, "<f4"),
-        south_m=pack_column(places, "<f4"),
-        heading_rad=pack_column(places / 1000, "<f4"),
-        states=bytes(vehicles),
-        targets=bytes(vehicles),
-    )
+    return some_fleet(f"a{agent}", agent, seq, places, places, places, [_TARGET])
 
 
 def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
@@ -227,7 +212,7 @@ def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str,
     """CPU time for all positions in one process: ours, and raw Zenoh which only receives the bytes."""
     watcher = far.start(watcher_peer)
     senders = [far.start(fleet_sender, first, vehicles) for first in range(0, agents, _SESSIONS)]
-    figures: dict[str, Any] = {"vehicles": agents * vehicles, "bytes": len(encode(_fleet("a0.1", 0, 1, vehicles)))}
+    figures: dict[str, Any] = {"vehicles": agents * vehicles, "bytes": len(encode(_fleet(0, 1, vehicles)))}
     for name, raw in (("raw", True), ("ours", False)):
         before = asked(watcher, "counts")
         began_s = time.monotonic()
