@@ -4,7 +4,8 @@ A command is a function and `@command(app, PANEL)`. Its docstring is its help: p
 `name  meaning` for its arguments and options, as the docstrings of scenario sections have them. A parameter without
 a default is an argument, one with a default an option; `Annotated[..., typer.Option(...)]` says what else there is,
 such as bounds or completion. A parameter whose type is a dataclass stands for one option per field, which the
-class's own docstring explains: options that several commands share are declared and explained once.
+class's own docstring explains: options that several commands share are declared and explained once. What the
+function returns is the exit code.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import cached_property
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
 from swarm.config.explain import meanings
+
+F = TypeVar("F", bound=Callable[..., int | None])
 
 RUN = "Run a swarm"
 PREPARE = "Before a run"
@@ -44,12 +47,10 @@ _AS_IT_STANDS = (" ", "\b", "[", "swarm ")
 """Lines of examples and tables begin so: they keep their line ends, whereas prose fills the terminal's width."""
 
 
-def command(
-    app: typer.Typer, panel: str | None = None, name: str | None = None
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def command(app: typer.Typer, panel: str | None = None, name: str | None = None) -> Callable[[F], F]:
     """Adds a function to an app as a command, and returns the function as it is."""
 
-    def added(function: Callable[..., None]) -> Callable[..., None]:
+    def added(function: F) -> F:
         app.command(name, rich_help_panel=panel, help=_prose(function.__doc__))(_called_with_options(function))
         return function
 
@@ -71,7 +72,7 @@ def _prose(docstring: str | None) -> str:
     )
 
 
-def _called_with_options(function: Callable[..., None]) -> Callable[..., None]:
+def _called_with_options(function: Callable[..., int | None]) -> Callable[..., None]:
     """The function as Typer reads it: every dataclass parameter is replaced by the fields of its class."""
     said = meanings(function)
     groups: dict[str, Any] = {}
@@ -96,7 +97,8 @@ def _called_with_options(function: Callable[..., None]) -> Callable[..., None]:
     def run(**values: Any) -> None:
         for name, group in groups.items():
             values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-        function(**values)
+        if code := function(**values):
+            raise typer.Exit(code)
 
     run.__name__ = function.__name__
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

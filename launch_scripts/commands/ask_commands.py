@@ -172,7 +172,7 @@ def top(
 
 
 @command(app, ASK)
-def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> None:
+def health(where: Where, url: str | None = None, live: bool = False, as_json: AsJson = False) -> int:
     """Say whether a swarm is ready: exit code 0 if it is, 1 if not, 4 if nobody answers. For probes.
 
     With --url it asks the processes of one machine, which answer without a router; put it first, and the answer is
@@ -198,7 +198,7 @@ def health(where: Where, url: str | None = None, live: bool = False, as_json: As
             "--url asks one machine without TLS; what says how a whole swarm is reached goes without it"
         )
     answer = swarm_answer(_ask_status(where)) if url is None else ask(url, live=live)
-    raise typer.Exit(answer.show(as_json=as_json))
+    return answer.show(as_json=as_json)
 
 
 def swarm_answer(status: Status) -> Answer:

@@ -153,7 +153,7 @@ def size(
     memory: Annotated[float, typer.Option(min=0.1)] = 64.0,
     link: Annotated[float, typer.Option(min=1)] = 1000.0,
     as_json: Annotated[bool, typer.Option("--json")] = False,
-) -> None:
+) -> int:
     """How many machines a swarm needs, by a table of swarms that were measured.
 
     swarm deploy size --vehicles 1000 --targets 10
@@ -200,8 +200,7 @@ def size(
             typer.echo(f"{each}: more machines do not help.")
         if beyond:
             typer.echo("Extrapolated: larger than the swarms that were measured.")
-    if full:
-        raise typer.Exit(1)
+    return int(bool(full))
 
 
 def _show_size(found: Needs) -> None:

@@ -37,23 +37,23 @@ Vehicles = Annotated[
 
 
 @command(app, ORDER)
-def pause(where: Where, as_json: AsJson = False) -> None:
+def pause(where: Where, as_json: AsJson = False) -> int:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
     Vehicles drive to the middle of the cell that they are entering and stand there. Planners go on planning.
 
     swarm pause
     """
-    give(where, as_json, {"subject": "pause"})
+    return give(where, as_json, {"subject": "pause"})
 
 
 @command(app, ORDER)
-def resume(where: Where, as_json: AsJson = False) -> None:
+def resume(where: Where, as_json: AsJson = False) -> int:
     """Let all go on after a pause.
 
     swarm resume
     """
-    give(where, as_json, {"subject": "pause", "off": True})
+    return give(where, as_json, {"subject": "pause", "off": True})
 
 
 @command(app, ORDER)
@@ -65,7 +65,7 @@ def group(
     ] = None,
     as_scenario: bool = False,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Say which targets the vehicles of a group may chase.
 
     swarm group red targets t1 t2
@@ -83,7 +83,7 @@ def group(
         chosen = chosen[1:]
     if as_scenario == bool(chosen):
         raise ConfigError("group: give either targets or --as-scenario")
-    give(where, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
+    return give(where, as_json, {"subject": "group", "name": name, "targets": chosen, "off": as_scenario})
 
 
 @command(app, ORDER, "set")
@@ -95,7 +95,7 @@ def set_(
     value: Annotated[float | None, typer.Argument(metavar="VALUE")] = None,
     as_scenario: bool = False,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Change a setting while the swarm runs: time_scale, vehicles.reassign_s, planner.cpu_budget, planner.push_s.
 
     swarm set time_scale 5
@@ -114,7 +114,7 @@ def set_(
         raise ConfigError("set: give either a value or --as-scenario")
     if key not in SETTINGS:
         raise ConfigError(f"set: {key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
-    give(where, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
+    return give(where, as_json, {"subject": "set", "name": key, "value": value, "off": as_scenario})
 
 
 @command(app, ORDER)
@@ -147,7 +147,7 @@ def add(
     walk: Walk = "waypoints",
     speed: float = 4.0,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Add a target. A launcher starts its planner; groups that may chase every target chase it.
 
     swarm target add x --at 36.41,-84.29 --walk evade
@@ -158,48 +158,48 @@ def add(
     speed  Metres per second on level open ground.
     """
     fields = {"subject": "target", "name": id, "new": True, "walk": walk, "speed_m_per_s": speed}
-    give(where, as_json, fields, at=at)
+    return give(where, as_json, fields, at=at)
 
 
 @command(target_app)
-def move(id: Id, at: At, where: Where, as_json: AsJson = False) -> None:
+def move(id: Id, at: At, where: Where, as_json: AsJson = False) -> int:
     """Put a target somewhere else; it goes on from there.
 
     swarm target move t3 --at cell:40,200
     """
-    give(where, as_json, {"subject": "target", "name": id}, at=at)
+    return give(where, as_json, {"subject": "target", "name": id}, at=at)
 
 
 @command(target_app)
-def remove(id: Id, where: Where, as_json: AsJson = False) -> None:
+def remove(id: Id, where: Where, as_json: AsJson = False) -> int:
     """Remove a target. Its planner ends, and the vehicles that chased it chase others.
 
     swarm target remove t3
     """
-    give(where, as_json, {"subject": "target", "name": id, "off": True})
+    return give(where, as_json, {"subject": "target", "name": id, "off": True})
 
 
-def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> None:
+def stop(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
     """Let vehicles stand in the middle of their cells until they are let go. Others drive around them.
 
     swarm vehicle stop a0-03 a0-04
     """
-    give(where, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
+    return give(where, as_json, *({"subject": "vehicle", "name": id, "off": False} for id in ids))
 
 
-def go(ids: Vehicles, where: Where, as_json: AsJson = False) -> None:
+def go(ids: Vehicles, where: Where, as_json: AsJson = False) -> int:
     """Let stopped vehicles go.
 
     swarm vehicle go a0-03
     """
-    give(where, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
+    return give(where, as_json, *({"subject": "vehicle", "name": id, "off": True} for id in ids))
 
 
 # --- how an order is given --------------------------------------------------------------------------------------
 
 
-def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> None:
-    """Gives orders, one after the other, and prints who obeys. Exit code 1 if somebody has not said so.
+def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = None) -> int:
+    """Gives orders, one after the other, and prints who obeys. Returns 1 if somebody has not said so.
 
     orders  fields of `GiveOrder` each
     at      the place that they are about, if any: becomes their `cell`
@@ -236,8 +236,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
             print_obeyed(acknowledged)
     if as_json:
         typer.echo(json.dumps(printed[0] if len(printed) == 1 else printed, indent=2))
-    if silent:
-        raise typer.Exit(1)
+    return int(silent)
 
 
 def checked(kind: type[M], fields: dict[str, Any]) -> M:

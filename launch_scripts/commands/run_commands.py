@@ -14,7 +14,7 @@ app = typer.Typer()
 
 
 @command(app, RUN)
-def demo(run: RunOptions) -> None:
+def demo(run: RunOptions) -> int:
     """Run the whole swarm on real mountains: 99 rovers, a drone, 10 targets, 19 processes.
 
     The same as `swarm up demo`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
@@ -22,11 +22,11 @@ def demo(run: RunOptions) -> None:
 
     swarm demo --seconds 20 --port 0
     """
-    up("demo", run, Meeting(), SomeProcesses())
+    return up("demo", run, Meeting(), SomeProcesses())
 
 
 @command(app, RUN)
-def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: SomeProcesses) -> None:
+def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: SomeProcesses) -> int:
     """Run a scenario: all of its processes on this machine, or some of them.
 
     swarm up jacksboro --seconds 20 --port 0
@@ -78,7 +78,7 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
         if (not named or role in named) and not (role == "router" and meeting.connect is not None)
     )
     one_by_one = any("." in word for word in part.only or ())
-    code = run_swarm(
+    return run_swarm(
         UpOptions(
             chosen,
             run.runs,
@@ -97,7 +97,6 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
             takes_over=part.take_over,
         )
     )
-    raise typer.Exit(code)
 
 
 def _began_s() -> float:

@@ -208,7 +208,7 @@ def _from(path: Path, name: str | None) -> str:
 @command(app, PREPARE)
 def check(
     scenario: ScenarioArgument, runs: Runs = Path("runs"), port: PortOption = None, as_json: AsJson = False
-) -> None:
+) -> int:
     """Say all that is wrong with a scenario, before any process of it is started.
 
     Keys and values, files, the terrain and the places on it, certificates, ports, plug-ins, and whether this
@@ -240,8 +240,7 @@ def check(
         typer.echo(json.dumps({"scenario": str(path), **as_fields(found), **facts}, indent=2))
     else:
         _print(str(path), found, facts)
-    if any(finding.level == "failure" for finding in found):
-        raise typer.Exit(1)
+    return int(any(finding.level == "failure" for finding in found))
 
 
 def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -327,7 +326,7 @@ def _print(path: str, found: list[Finding], facts: dict[str, Any]) -> None:
 
 
 @command(app, PREPARE)
-def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> None:
+def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
     """Look at this machine and this installation: is it fit for a swarm, and what is to be done?
 
     Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, ports, clock, browser and
@@ -354,5 +353,4 @@ def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> None:
         console = Console(highlight=False)
         console.print(table)
         console.print(f"{counted(found, 'failure')}, {counted(found, 'warning')}")
-    if any(finding.level == "failure" for finding in found):
-        raise typer.Exit(1)
+    return int(any(finding.level == "failure" for finding in found))

@@ -46,7 +46,7 @@ def simulate(
     runs: Runs = Path("runs"),
     trace: Path | None = None,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Run the same swarm in one process, on a memory bus and a manual clock, and leave the same folder.
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
@@ -72,11 +72,10 @@ def simulate(
         if scenario is None:
             raise ConfigError("give a SCENARIO, or --seeds A:B to try many seeds of small worlds")
         _simulate_once(scenario, seed, seconds, trace, runs, as_json)
-        return
+        return 0
     if seed is not None or trace is not None:
         raise ConfigError("--seeds goes with neither --seed nor --trace")
-    if not simulate_seeds(scenario, seeds, seconds, jobs, as_json):
-        raise typer.Exit(1)
+    return int(not simulate_seeds(scenario, seeds, seconds, jobs, as_json))
 
 
 def _simulate_once(
@@ -197,7 +196,7 @@ def sweep(
     workers: Annotated[int | None, typer.Option(min=1, max=1024)] = None,
     out: Path | None = None,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Run a study: scenarios x settings x seeds through the simulation, over many processes or machines.
 
     Leaves results.parquet, summary.md and pictures in the folder. Results are kept as they come: started again,
@@ -213,8 +212,7 @@ def sweep(
     workers    Processes of this machine; as many as it has cores if not given.
     out        Folder of the results; sweeps/NAME of the study if not given.
     """
-    if not sweep_study(study, scheduler, workers, out, as_json):
-        raise typer.Exit(1)
+    return int(not sweep_study(study, scheduler, workers, out, as_json))
 
 
 def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path | None, as_json: bool) -> bool:

@@ -70,7 +70,7 @@ def remove(
     names: Annotated[list[str], typer.Argument(autocompletion=complete.vehicle_ids)],
     where: Where,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Let vehicles leave the map. Returns once their cells are free for others.
 
     An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.
@@ -98,8 +98,7 @@ def remove(
             raise ConfigError(f"agent {one.agent} hosts no {', '.join(one.unknown)}")
         if not as_json:
             typer.echo(f"{', '.join(one.left)}: left" + (f"; {one.held} still hold cells" if one.held else ""))
-    if any(one.held for one in said.values()):
-        raise typer.Exit(1)
+    return int(any(one.held for one in said.values()))
 
 
 @command(app)

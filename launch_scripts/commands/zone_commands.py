@@ -48,7 +48,7 @@ def add(
     name: str = "",
     vehicle_class: Annotated[str | None, typer.Option("--class")] = None,
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Close an area, or set its pace. Returns once all maps and trees go by it.
 
     swarm zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --until 10m --name bridge
@@ -81,14 +81,13 @@ def add(
         fields["polygon"] = [(0.0, 0.0) for _ in places]
         fields["polygon_m"] = [_corner(word) for word in _words("--polygon-m", polygon_m, " such as 40,200")]
         order = checked(ZoneOrder, fields)
-        _give(
+        return _give(
             lambda frame: [
                 msgspec.structs.replace(order, polygon=corners_of(places, frame, "--polygon")) if places else order
             ],
             where,
             as_json,
         )
-        return
     if polygon is not None or polygon_m is not None:
         raise ConfigError("zone add: give either --file or a polygon")
     if not file.is_file():
@@ -104,11 +103,11 @@ def add(
             called = f"{name}-{number}" if several else name
             yield checked(ZoneOrder, fields | {"name": called, "polygon": outline})
 
-    _give(of_file, where, as_json)
+    return _give(of_file, where, as_json)
 
 
 @command(app)
-def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, as_json: AsJson = False) -> None:
+def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, as_json: AsJson = False) -> int:
     """Open a zone again.
 
     swarm zone remove bridge
@@ -116,7 +115,7 @@ def remove(name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, a
     name  The zone.
     """
     order = checked(ZoneOrder, {"action": "remove", "name": name})
-    _give(lambda frame: [order], where, as_json)
+    return _give(lambda frame: [order], where, as_json)
 
 
 @command(app, name="list")
@@ -136,8 +135,8 @@ def list_zones(where: Where, as_json: AsJson = False) -> None:
         typer.echo("no zones")
 
 
-def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as_json: bool) -> None:
-    """Gives orders and prints who obeys; as JSON all at once. Exit code 1 if somebody has not said so.
+def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as_json: bool) -> int:
+    """Gives orders and prints who obeys; as JSON all at once. Returns 1 if somebody has not said so.
 
     orders_on  makes the orders for the swarm's terrain; all are made before the first is given
     """
@@ -155,8 +154,7 @@ def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as
     if as_json:
         told = {"changed": zones.changed, "obeyed_s": obeyed, "silent": sorted(silent)}
         typer.echo(json.dumps({**_fields(zones, frame), **told}, indent=2))
-    if silent:
-        raise typer.Exit(1)
+    return int(bool(silent))
 
 
 def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:
