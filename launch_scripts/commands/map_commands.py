@@ -17,7 +17,7 @@ from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.observe.run_observer import frame_of_run
-from launch_scripts.report.export import FORMATS, Layer, write_layers, write_raster
+from launch_scripts.report.exporter import FORMATS, Layer, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.mark_store import KeeperStore

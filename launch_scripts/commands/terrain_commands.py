@@ -20,7 +20,7 @@ from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.export import FORMATS, write_raster
+from launch_scripts.report.exporter import FORMATS, write_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.slope_rules import (
     SLOPE_RULES,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.commands.route_files import DescribedRoute, metres_along, profile_of, write_route
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.export import COSTS, Feature, Layer, areas_of, write_layers, write_raster
+from launch_scripts.report.exporter import COSTS, Feature, Layer, areas_of, write_layers, write_raster
 from planner_service.route_finder import FoundRoute, RouteFinder
 from shared_map.arrays import Floats
 from shared_map.terrain.layers import TerrainClass

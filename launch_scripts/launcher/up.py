@@ -32,7 +32,7 @@ from launch_scripts.launcher.tables import live_table, plain_line
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
 from launch_scripts.observe import facts
-from launch_scripts.observe.plan import plan_of_members
+from launch_scripts.observe.latest_state import plan_of_members
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run

@@ -10,12 +10,11 @@ from rich.console import Console, Group
 from rich.text import Text
 
 from launch_scripts.launcher.tables import SHOWN_ALARMS, loads_table
-from launch_scripts.observe.alarms import Alarm, alarms_of
 from launch_scripts.observe.facts import lines_of
-from launch_scripts.observe.latest_state import LatestState
-from launch_scripts.observe.plan import RunPlan
+from launch_scripts.observe.latest_state import LatestState, RunPlan
 from launch_scripts.observe.process_load import ProcessLoad, by_role
 from launch_scripts.observe.recorder import Recorder
+from launch_scripts.observe.run_alarms import Alarm, alarms_of
 from launch_scripts.observe.run_observer import HEARD, RECORDED, RunObserver
 from launch_scripts.process_table import ROLES, TABLE, ProcessSpec
 from swarm.bus.bus import Bus, Event, Heard

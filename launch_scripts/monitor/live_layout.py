@@ -25,8 +25,8 @@ from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Look, level_for
 from launch_scripts.monitor.sinks import Colour, Pen, in_markdown, screen, shown
 from launch_scripts.observe import facts, palette
-from launch_scripts.observe.alarms import KINDS
 from launch_scripts.observe.history import Sample
+from launch_scripts.observe.run_alarms import KINDS
 from launch_scripts.observe.state import RunState
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup

@@ -6,12 +6,11 @@
 | module          | holds                                                                                     |
 |-----------------|-------------------------------------------------------------------------------------------|
 | run_observer.py | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands    |
-| latest_state.py | `LatestState`: newest message of every sender, who is alive, where vehicles are, marks    |
+| latest_state.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be          |
 | counts.py       | `Counts`: what all processes counted, summed; the certified gap is made of it             |
-| plan.py         | `RunPlan`: what the run should be: its targets, its processes, when it began              |
 | state.py        | `RunState`: the run at an instant; `state_of` makes one                                   |
 | facts.py        | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                 |
-| alarms.py       | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over              |
+| run_alarms.py   | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over              |
 | process_load.py | what each process takes up, and how well it keeps time                                    |
 | recorder.py     | `Recorder`: figures, tracks, routes, captures, notes; it makes the numbers of the report  |
 | history.py      | what a recorder keeps over time, in bounded memory                                        |

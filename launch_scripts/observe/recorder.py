@@ -19,8 +19,7 @@ from launch_scripts.observe import history
 from launch_scripts.observe.counts import of_excess
 from launch_scripts.observe.facts import for_report
 from launch_scripts.observe.history import BegunRoute, Sample, Thinned, TrackKey, Tracks
-from launch_scripts.observe.latest_state import LatestState, VehicleColumns
-from launch_scripts.observe.plan import plan_of
+from launch_scripts.observe.latest_state import LatestState, VehicleColumns, plan_of
 from launch_scripts.observe.results import Driven, results
 from launch_scripts.observe.run_observer import TRACK_S
 from launch_scripts.observe.state import RunState, state_of

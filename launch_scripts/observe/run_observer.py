@@ -13,8 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
-from launch_scripts.observe.latest_state import LatestState
-from launch_scripts.observe.plan import plan_of_members, run_of_most
+from launch_scripts.observe.latest_state import LatestState, plan_of_members, run_of_most
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.client.frame import Frame

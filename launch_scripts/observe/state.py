@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from launch_scripts.observe.alarms import Alarm, alarms_of, starts
 from launch_scripts.observe.counts import CertifiedGap, certified_gap, gaps_to
 from launch_scripts.observe.latest_state import LatestState, VehicleColumns
+from launch_scripts.observe.run_alarms import Alarm, alarms_of, starts
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND

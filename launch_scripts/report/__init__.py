@@ -8,11 +8,11 @@ Commands and the ends of runs and studies write it; nothing else imports it. Mat
 | run_arrays.py     | tracks.npz and ground.npz, and reads them again, checked                                 |
 | picture.py        | report.png: main figures, map, plots                                                     |
 | run_page.py       | report.html, one file: figures, map, plots, tables (templates/)                          |
-| plots.py          | plots of a run over time and as distributions, and of the outcomes of a study            |
+| run_plots.py      | plots of a run over time and as distributions, and of the outcomes of a study            |
 | map_figure.py     | the map of a run: its ground, tracks, marks, captures                                    |
 | terrain_figure.py | figures of a terrain, of a route on it, of slope rules                                   |
 | compare.py        | what differs between runs                                                                |
-| export.py         | the one exporter of layers and rasters: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF      |
+| exporter.py       | the one exporter of layers and rasters: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF      |
 | run_layers.py     | tracks, captures, routes and marks of a run as layers; `swarm export`                    |
 | mcap_export.py    | a run as MCAP with ROS 2 messages; timeline.py puts them in order                        |
 """

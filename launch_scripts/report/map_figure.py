@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.palette import hillshade, rgb, round_length, said_length
-from launch_scripts.report.plots import halo
 from launch_scripts.report.run_arrays import RunTracks, Track
+from launch_scripts.report.run_plots import halo
 from shared_map.arrays import Floats
 from shared_map.learning.factors import keys_of
 from shared_map.terrain.places import MapFrame

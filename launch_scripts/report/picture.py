@@ -14,8 +14,8 @@ from launch_scripts.observe import palette
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact
 from launch_scripts.report.map_figure import GroundPicture, draw_map
-from launch_scripts.report.plots import PLOTS, draw_plot
 from launch_scripts.report.run_arrays import RunTracks
+from launch_scripts.report.run_plots import PLOTS, draw_plot
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
-from launch_scripts.report.export import (
+from launch_scripts.report.exporter import (
     COSTS,
     FORMATS,
     TIMED,

@@ -18,10 +18,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from launch_scripts.observe import palette
-from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact, grouped, together
 from launch_scripts.observe.palette import GROUPS, STYLE, round_length, said_length
+from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
 from launch_scripts.report.map_figure import (
     GROUND_FILE,
@@ -34,8 +34,8 @@ from launch_scripts.report.map_figure import (
     in_km,
     mark_overlay,
 )
-from launch_scripts.report.plots import PLOTS, draw_plot
 from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.errors import StoreError

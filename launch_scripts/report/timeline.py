@@ -34,8 +34,8 @@ from launch_scripts.gateways.ros2.ros_messages import (
     headings_along,
     ros_name,
 )
-from launch_scripts.observe.alarms import Alarm
-from launch_scripts.report.export import turns_of
+from launch_scripts.observe.run_alarms import Alarm
+from launch_scripts.report.exporter import turns_of
 from launch_scripts.report.run_arrays import GivenRoute, GroundPace, RunTracks, Track
 from shared_map.terrain.places import middles_of
 from swarm.clock import NS_PER_S

@@ -19,10 +19,10 @@ from launch_scripts.monitor.movers.map_lines import feet, poles, rings
 from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY, mixed
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.sinks import LABEL_COLOUR, Colour, Pen, screen, shown
-from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.facts import TARGET_FACTS
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
+from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.state import RunState, TargetLine
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings

@@ -146,7 +146,7 @@ class Sweep:
             write_table(self.folder / RESULTS, self._rows(), {**_SCHEMA, **_setting_types(self.planned)})
             pictures = {name: page.file_name(name) for name in page.drawn(summary)}
             for name, file in pictures.items():
-                from launch_scripts.report.plots import draw_outcome  # matplotlib takes a moment
+                from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
 
                 write_file(self.folder / file, draw_outcome(summary.cases, name))
             write_file(self.folder / PAGE, page.document(summary, pictures).encode())

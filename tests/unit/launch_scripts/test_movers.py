@@ -43,9 +43,9 @@ from launch_scripts.monitor.movers.styles import (
 )
 from launch_scripts.monitor.movers.vehicles_view import vehicle_details
 from launch_scripts.monitor.sinks import Pen
-from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.counts import CertifiedGap
 from launch_scripts.observe.latest_state import VehicleColumns
+from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.state import TargetLine
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S

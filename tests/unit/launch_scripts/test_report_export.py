@@ -24,7 +24,7 @@ from support.map_strategies import set_of
 from launch_scripts.cli import main
 from launch_scripts.observe.history import BegunRoute
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report.export import COSTS, in_degrees
+from launch_scripts.report.exporter import COSTS, in_degrees
 from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.mark_store import KeeperStore
