@@ -12,8 +12,7 @@ from planner_service.kernel_build import KernelLoader, needed_kernels
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
 from shared_map.prepared_classes import load_classes
-from shared_map.terrain.cache import kept_key
-from shared_map.terrain.store import load_terrain
+from shared_map.terrain.store import kept_key, load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError

@@ -12,7 +12,7 @@ import msgspec
 from shared_map.arrays import Bools, Floats
 from shared_map.class_maps import read_by
 from shared_map.terrain.air import air_terrain
-from shared_map.terrain.start_cells import homes_of
+from shared_map.terrain.store import homes_of
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.classes import GROUND, ClassConfig, class_named, driven_classes
 from swarm.config.scenario import Scenario

@@ -16,8 +16,16 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from shared_map.class_grounds import ClassGround, class_grounds, give_known, least_pace
-from shared_map.terrain.cache import fetch_kept, keep, kept_key
-from shared_map.terrain.store import read_array, read_ground, read_meta, save_ground, scenario_key
+from shared_map.terrain.store import (
+    fetch_kept,
+    keep,
+    kept_key,
+    read_array,
+    read_ground,
+    read_meta,
+    save_ground,
+    scenario_key,
+)
 from shared_map.terrain.terrain import Terrain
 from swarm.config.classes import class_named, driven_classes, flies, of_class
 from swarm.config.scenario import Scenario

@@ -44,8 +44,8 @@ _FLIGHT = "Tuple((f4[::1], f4[::1], f4[::1], UniTuple(f8, 2)))"
 
 @helper
 def _flown(flight, down, right, length):
-    """float64, cells: how far one comes in still air, while a segment is flown; `shared_map.terrain.wind` has the
-    formula."""
+    """float64, cells: how far one comes in still air, while a segment is flown; `shared_map.terrain.step_climb` has
+    the formula."""
     if flight is None:
         return length
     south, east = flight[3]

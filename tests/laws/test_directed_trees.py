@@ -30,8 +30,7 @@ from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.wind import Wind
+from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import SlopeRule

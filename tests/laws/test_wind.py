@@ -22,7 +22,7 @@ from planner_service.search.search_routes import Ways
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.air import AirGround, Flight, air_ground
-from shared_map.terrain.wind import STILL, Wind, wind_of
+from shared_map.terrain.step_climb import STILL, Wind, wind_of
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, walk
 from swarm.wire.routes import RouteStatus

@@ -18,8 +18,7 @@ from planner_service.full_growth import GrownTree
 from planner_service.kernel_build import load_all
 from planner_service.target_tree import TargetTree
 from shared_map.arrays import Floats
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.wind import Wind
+from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.config.values import SlopeRule, Strategy

@@ -14,8 +14,8 @@ from launch_scripts.launcher import forkserver
 
 _ALL_ROLES = """
 import json, sys
-from shared_map.terrain import start_cells
-start_cells.largest_part = lambda passable: passable
+from shared_map.terrain import store
+store.largest_part = lambda passable: passable
 import launch_scripts.launcher.preloaded
 from launch_scripts.simulation import simulate
 simulate.build_truth = lambda scenario, terrain: terrain.pace_s_per_m

@@ -24,7 +24,7 @@ from launch_scripts.simulation.world.targets import (
 )
 from launch_scripts.simulation.world.walks import Walk
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.terrain.start_cells import homes_of
+from shared_map.terrain.store import homes_of
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S

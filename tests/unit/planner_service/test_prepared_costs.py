@@ -15,8 +15,7 @@ from planner_service.target_tree import TargetTree
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.strides import StrideSearch, find_strides
-from shared_map.terrain.cache import fetch_kept, keep
-from shared_map.terrain.store import load_prepared, save_prepared
+from shared_map.terrain.store import fetch_kept, keep, load_prepared, save_prepared
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window

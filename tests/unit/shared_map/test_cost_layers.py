@@ -10,8 +10,7 @@ import pytest
 from support.plugin_modules import forgotten_afterwards
 
 from launch_scripts.launcher.fetched_terrain import missing_files
-from shared_map.terrain.cache import kept_key
-from shared_map.terrain.store import scenario_key
+from shared_map.terrain.store import kept_key, scenario_key
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared_map.terrain import cache as terrain_cache
 from shared_map.terrain import store, terrain
 from shared_map.terrain.store import prepare
 from swarm.config.ground import CostConfig, HiddenConfig, TerrainConfig, ZoneConfig
@@ -54,11 +53,11 @@ def test_a_terrain_is_made_once_and_is_the_same_ever_after(tmp_path: Path, built
 def test_the_terrain_that_comes_with_a_library_is_kept_until_that_is_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    key = terrain_cache.kept_key(Scenario())
+    key = store.kept_key(Scenario())
     assert key is not None
-    version = terrain_cache.version
-    monkeypatch.setattr(terrain_cache, "version", lambda name: "0" if name == "matplotlib" else version(name))
-    assert terrain_cache.kept_key(Scenario()) not in (key, None)
+    version = store.version
+    monkeypatch.setattr(store, "version", lambda name: "0" if name == "matplotlib" else version(name))
+    assert store.kept_key(Scenario()) not in (key, None)
 
 
 OTHERS = {
@@ -84,7 +83,7 @@ def test_the_terrain_of_other_code_is_never_taken(
     tmp_path: Path, built: list[Scenario], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepare(tmp_path / "one", SMALL)
-    monkeypatch.setattr(terrain_cache, "source_digest", lambda *_: "another")
+    monkeypatch.setattr(store, "source_digest", lambda *_: "another")
     prepare(tmp_path / "two", SMALL)
     assert built == [SMALL, SMALL]
 
@@ -131,16 +130,16 @@ def test_what_is_kept_is_bounded_and_the_longest_unused_goes_first(
     scenarios = [msgspec.structs.replace(SMALL, seed=seed) for seed in (1, 2, 3)]
     for age, scenario in zip((300, 200), scenarios, strict=False):
         prepare(tmp_path / str(scenario.seed), scenario)
-        key = terrain_cache.kept_key(scenario)
+        key = store.kept_key(scenario)
         assert key is not None
         os.utime(cache / key, (0, os.stat(cache / key).st_mtime - age))
     each = sum(path.stat().st_size for path in (cache / key).iterdir())
     prepare(tmp_path / "again", scenarios[0])  # used: the other one is older now
-    monkeypatch.setattr(terrain_cache, "MOST_BYTES", int(2.5 * each))
+    monkeypatch.setattr(store, "MOST_BYTES", int(2.5 * each))
     prepare(tmp_path / "third", scenarios[2])
     assert {path.name for path in cache.iterdir()} == {
-        terrain_cache.kept_key(scenarios[0]),
-        terrain_cache.kept_key(scenarios[2]),
+        store.kept_key(scenarios[0]),
+        store.kept_key(scenarios[2]),
     }
 
 
@@ -151,7 +150,7 @@ def test_what_is_made_from_files_is_not_kept() -> None:
         msgspec.structs.replace(SMALL, cost=CostConfig(zones=(mask,))),
         msgspec.structs.replace(SMALL, terrain=msgspec.structs.replace(SMALL.terrain, photo="photo.tif")),
     ):
-        assert terrain_cache.kept_key(scenario) is None
+        assert store.kept_key(scenario) is None
 
 
 def test_where_nothing_can_be_kept_a_run_starts_all_the_same(tmp_path: Path, cache: Path) -> None:
