@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from planner_service.kernels.directed_buckets import BASE_BITS, WIDTH, grow_dire
 from planner_service.kernels.layout import NONE, TOO_FINE, PaddedGrid, step_offsets
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.tied_parents import untie_parents
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_range import CostRange
 from planner_service.tree.padded_climbs import climbs_in
 from shared_map.arrays import Floats
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
+
+if TYPE_CHECKING:
+    from planner_service.tree.cost_grid import CostGrid
 
 MOST_BUCKETS = 1 << 8
 """As narrow as the cheapest step: where the dearest takes more of them, their width follows the map."""
