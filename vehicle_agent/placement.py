@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import CellsOf, private_copy
 from shared_map.class_grounds import ClassGround
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.config.agents import AddedAgent, plan_agents
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError

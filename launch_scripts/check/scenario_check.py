@@ -15,7 +15,7 @@ from shared_map.arrays import Bools, Floats
 from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.importers.sources import FILE_KINDS, is_terrain
 from shared_map.terrain.layers import inflate, inflation_halves
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents

@@ -24,7 +24,7 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.learned import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import BusError, StoreError, writing
 from swarm.grid import GridSpec

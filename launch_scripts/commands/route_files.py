@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import said_length
 from launch_scripts.report.exporter import COSTS, Feature, FieldKind, Layer, check_file, write_layers
-from shared_map.terrain.places import MapFrame, middles_of
+from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec

@@ -29,7 +29,7 @@ from launch_scripts.observe.run_observer import OutsideObserver, frame_of_member
 from launch_scripts.observe.state import RunState, state_of
 from launch_scripts.plain_text import plain
 from launch_scripts.process_table import ROLES
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, Clock, MonotonicClock
 from swarm.errors import BusError

@@ -15,7 +15,7 @@ import typer
 
 from launch_scripts.commands.route_files import DescribedRoute, metres_along, write_route
 from launch_scripts.observe.run_observer import frame_of_run
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.config.classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk

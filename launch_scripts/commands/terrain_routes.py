@@ -17,7 +17,7 @@ from launch_scripts.report.exporter import COSTS, Feature, Layer, areas_of, writ
 from planner_service.route_finder import FoundRoute, RouteFinder
 from shared_map.arrays import Floats
 from shared_map.terrain.layers import TerrainClass
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, TerrainError

@@ -24,7 +24,7 @@ from swarm.runtime.operator import Acknowledged, Operator
 from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
 
 if TYPE_CHECKING:
-    from shared_map.terrain.places import MapFrame
+    from shared_map.terrain.map_frame import MapFrame
 
 app = family_app("""Close areas of the terrain, slow them down, and open them again, while the swarm runs.
 

@@ -28,7 +28,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 

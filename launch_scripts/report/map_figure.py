@@ -27,7 +27,7 @@ from launch_scripts.report.run_arrays import RunTracks, Track
 from launch_scripts.report.run_plots import halo
 from shared_map.arrays import Floats
 from shared_map.learning.factors import keys_of
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain, build_truth
 from shared_map.terrain.zones import zone_mask

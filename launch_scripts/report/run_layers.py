@@ -25,7 +25,7 @@ from launch_scripts.report.exporter import (
     write_layers,
 )
 from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, Track, read_tracks
-from shared_map.terrain.places import MapFrame, middles_of
+from shared_map.terrain.map_frame import MapFrame, middles_of
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind

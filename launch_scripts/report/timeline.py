@@ -37,7 +37,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.report.exporter import turns_of
 from launch_scripts.report.run_arrays import GivenRoute, GroundPace, RunTracks, Track
-from shared_map.terrain.places import middles_of
+from shared_map.terrain.map_frame import middles_of
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S

@@ -8,7 +8,7 @@ import numpy as np
 
 from shared_map.arrays import Bools
 from shared_map.terrain.layers import TerrainClass, slope_deg
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.step_climb import Climb
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec

@@ -12,7 +12,7 @@ import numpy as np
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.importers.raster_files import mask_of
 from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2.ros_messages import RosMessages
-from shared_map.terrain.places import middles_of
+from shared_map.terrain.map_frame import middles_of
 from swarm.grid import GridSpec, Window
 
 UNKNOWN = -1

@@ -26,7 +26,7 @@ from launch_scripts.simulation.world.walks import (
 from shared_map.arrays import Bools, Floats, private_copy
 from shared_map.class_grounds import class_truths
 from shared_map.terrain.layers import inflate, inflation_halves
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.classes import aloft_classes

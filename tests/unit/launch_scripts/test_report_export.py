@@ -28,7 +28,7 @@ from launch_scripts.report.exporter import COSTS, in_degrees
 from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

@@ -11,7 +11,7 @@ import pytest
 
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.observe.run_observer import frame_of_members
-from shared_map.terrain.places import MapFrame
+from shared_map.terrain.map_frame import MapFrame
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.places import cell_of

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 from support.effort import few
 
-from shared_map.terrain.places import MapFrame, middles_of
+from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import zone_mask
 from swarm.client.frame import Frame
