@@ -60,7 +60,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     config : TerrainConfig
         The section `[terrain]`. Paths are relative to the working folder unless they are absolute.
     seed : int
-        Of what is made up, and of learning from labels.
+        Of what is made up.
     progress : callable
         Told what is done and how much of it.
 
