@@ -19,10 +19,10 @@ from swarm.errors import ConfigError
 from swarm.liveness import job_of
 from swarm.recording.recording import recorded
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.job_slots import JobSlots
 from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
-from swarm.runtime.turns import Turns
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     network = scenario.network
     with (
         open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
-        closing(ThreadWorker("grow-tree", inbox, Turns(setup.run_dir))) as worker,
+        closing(ThreadWorker("grow-tree", inbox, JobSlots(setup.run_dir))) as worker,
         recorded(setup, terrain.digest) as boundary,
     ):
         service = PlannerService(

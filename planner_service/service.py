@@ -35,9 +35,9 @@ from swarm.config.agents import agent_of
 from swarm.config.classes import GROUND, class_numbers
 from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
-from swarm.runtime.candidacy import Candidacy
+from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
-from swarm.runtime.obedience import Obedience
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (
@@ -149,7 +149,7 @@ class PlannerService:
         self._planners = ClassPlanners(
             self._planner, self._begin_class, self._maps.of, class_kernels or (lambda: True)
         )
-        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version = 0
         self._removed = False
         """Whether its target was removed: then it serves nobody."""

@@ -25,7 +25,7 @@ from swarm.errors import ConfigError
 from swarm.liveness import Roster, job_of
 from swarm.plugins.find import named_plugin
 from swarm.runtime.membership import Member
-from swarm.runtime.obedience import Obedience
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column, pack_column
@@ -185,7 +185,7 @@ class AgentService:
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * as_class.vehicles.sense_range_m)
         self._zones = ZonesAround(self._replica, self._maps)
-        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._obeyed_version = 0
         self._roster = Roster()

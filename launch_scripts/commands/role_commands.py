@@ -230,8 +230,7 @@ def _health_of(name: str, place: Place) -> Health:
     """What the role tells of itself: to its supervisor, and to probes if they are given a port."""
     from launch_scripts.web.health_verdict import Process, health_pages
     from launch_scripts.web.server import Server
-    from swarm.runtime.health import Health
-    from swarm.runtime.supervisor import supervisor_of
+    from swarm.runtime.health import Health, supervisor_of
 
     health = Health(supervisor=supervisor_of(os.environ))
     if place.health_port is not None:

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 from launch_scripts.launcher.options import UpOptions
 from launch_scripts.web.health_verdict import Process
 from swarm.errors import BusError
-from swarm.runtime.health import Health
-from swarm.runtime.supervisor import supervisor_of
+from swarm.runtime.health import Health, supervisor_of
 
 if TYPE_CHECKING:
     from launch_scripts.observe.latest_state import LatestState

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from launch_scripts.observe.counts import sum_of
 from swarm.clock import NS_PER_S
-from swarm.runtime.own_usage import CPU_S, RSS_BYTES
-from swarm.runtime.stats import MESSAGES_PER_S, RESTARTS
+from swarm.runtime.stats import CPU_S, MESSAGES_PER_S, RESTARTS, RSS_BYTES
 from swarm.wire.messages.processes import Stats
 
 _LEAST_NS = NS_PER_S // 2

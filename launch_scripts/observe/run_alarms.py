@@ -1,6 +1,6 @@
 """What went wrong in a run: one list for the view, the table, `swarm status` and the report. Pure.
 
-Whoever is concerned tells it (`swarm.runtime.alarms`), with each `Stats`, so that one who comes late knows it, too.
+Whoever is concerned tells it (`swarm.runtime.membership`), with each `Stats`, so that one who comes late knows it.
 What a process cannot tell of itself is found here: that it is gone or silent, and that a target is lost.
 
 A tree that was grown long ago is no alarm: what has changed since is repaired in it.

@@ -31,8 +31,8 @@ from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.liveness import ranked_id
-from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.order_book import OrderBook
+from swarm.runtime.process import collected_rarely
 from swarm.wire.access import Authenticator
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder

@@ -20,7 +20,7 @@ from swarm.config.agents import plan_agents
 from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
 from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
-from swarm.runtime.garbage import collected_rarely
+from swarm.runtime.process import collected_rarely
 
 SECONDS = 30.0
 """Faults in the first 18, quiet in the rest: a wait of ten seconds has its place in it."""

@@ -40,9 +40,9 @@ from swarm.bus.bus import (
 )
 from swarm.bus.endpoints import host_port, listening, wait_for_router
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_intake import Intake
-from swarm.bus.zenoh_threads import (
+from swarm.bus.zenoh_intake import (
     Arrivals,
+    Intake,
     guarded,
     says_json,
     taken_after,

@@ -16,8 +16,7 @@ from swarm.recording.events import event_of, rest_of, set_figures
 from swarm.recording.external_calls import unpack
 from swarm.recording.recording import FAILED, RAISED, digest_of, raised_as
 from swarm.recording.records import Call, Called, Cut, Ended, Handled, Output, Outputs, Read, RecordReader
-from swarm.runtime.garbage import collected_rarely
-from swarm.runtime.process import Service
+from swarm.runtime.process import Service, collected_rarely
 
 T = TypeVar("T")
 MAKING = "making the service"

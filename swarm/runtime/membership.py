@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import msgspec
 
@@ -11,13 +12,67 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Li
 from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
-from swarm.runtime.alarms import Alarms
 from swarm.runtime.stats import MESSAGES_PER_S, READY, RESTARTS, Counters, carried
 from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages import Nothing
-from swarm.wire.messages.processes import Note, RunInfo, Stats
+from swarm.wire.messages.processes import Alarm, Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
 from swarm.wire.versions import are_neighbours
+
+_MOST_STANDING, _MOST_OVER = 40, 20
+"""Alarms in a `Stats`, which has to stay a small message: it is sent each second."""
+
+
+class Alarms:
+    """The alarms of one process: those that last, 40 at most, and the newest 20 that are over.
+
+    They are told again with each `Stats`, so that one who begins to listen late knows them.
+    """
+
+    def __init__(self, before: Iterable[Alarm] = ()) -> None:
+        self._standing: dict[tuple[str, str], Alarm] = {}
+        """(kind, about) -> what lasts. What lasted in an earlier life lasts no longer: this one says it anew."""
+        self._over: deque[Alarm] = deque((each for each in before if each.over_ns is not None), maxlen=_MOST_OVER)
+
+    def happened(
+        self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None, target: str | None = None
+    ) -> None:
+        """Something happened that is over at once, as a collision."""
+        self._over.append(
+            Alarm(
+                kind=kind, about=about[:100], text=text[:MOST_TEXT], since_ns=now_ns, over_ns=now_ns,
+                cell=cell, target=target,
+            )
+        )  # fmt: skip
+
+    def begin(
+        self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None, target: str | None = None
+    ) -> None:
+        """Something lasts from now on; said again, only its words and its place change."""
+        known = self._standing.get((kind, about))
+        if known is None and len(self._standing) >= _MOST_STANDING:
+            return
+        since_ns = now_ns if known is None else known.since_ns
+        self._standing[kind, about] = Alarm(
+            kind=kind, about=about[:100], text=text[:MOST_TEXT], since_ns=since_ns, cell=cell, target=target
+        )
+
+    def end(self, kind: str, about: str, now_ns: int) -> None:
+        """It is over; nothing happens if it did not last."""
+        known = self._standing.pop((kind, about), None)
+        if known is not None:
+            self._over.append(msgspec.structs.replace(known, over_ns=max(now_ns, known.since_ns)))
+
+    def last_of(self, kind: str, abouts: Collection[str], now_ns: int) -> None:
+        """Of this kind only these last: all others are over."""
+        for standing, about in list(self._standing):
+            if standing == kind and about not in abouts:
+                self.end(kind, about, now_ns)
+
+    def told(self) -> list[Alarm]:
+        """What lasts, then what is over, each in order of time."""
+        return [*sorted(self._standing.values(), key=lambda alarm: alarm.since_ns), *self._over]
+
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import pytest
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import job_of, ranked_id, split_rank
-from swarm.runtime.leadership import BEAT_NS, LEASE_NS, SETTLED_NS, Leadership
+from swarm.runtime.election import BEAT_NS, LEASE_NS, SETTLED_NS, Leadership
 from swarm.wire.messages.processes import Beat
 
 MS = NS_PER_S // 1000
@@ -140,7 +140,7 @@ class World:
 
     def read(self, who: Candidate, core: Leadership, now_ns: int) -> None:
         for beat in who.waiting:
-            core.hear(beat, now_ns)
+            core.on_beat(beat, now_ns)
         who.waiting.clear()
 
     def arrive(self, who: Candidate, beat: Beat) -> None:
@@ -266,8 +266,8 @@ def test_of_two_lives_of_one_process_the_younger_leads() -> None:
         older.tick(True, now_ns)
         if n >= 10:
             younger.tick(True, now_ns)
-            older.hear(beat(younger, 2), now_ns)
-            younger.hear(beat(older, 1), now_ns)
+            older.on_beat(beat(younger, 2), now_ns)
+            younger.on_beat(beat(older, 1), now_ns)
         elif n == 9:
             assert older.leads
     assert younger.leads
@@ -280,7 +280,7 @@ def test_strangers_without_end_take_no_memory_and_one_lie_holds_for_a_lease_only
         core.tick(True, n * BEAT_NS)
     assert core.leads
     for life in range(1000):
-        core.hear(Beat(role="planner", id="t0", incarnation=life, ready=True, leads=True), 19 * BEAT_NS)
+        core.on_beat(Beat(role="planner", id="t0", incarnation=life, ready=True, leads=True), 19 * BEAT_NS)
     assert len(core._others) <= 64
     assert not core.tick(True, 20 * BEAT_NS)
     leads = [core.tick(True, n * BEAT_NS) for n in range(21, 30)]

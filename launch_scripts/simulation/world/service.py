@@ -15,9 +15,9 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.liveness import Roster, job_of
-from swarm.runtime.candidacy import Candidacy
+from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
-from swarm.runtime.obedience import Obedience
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
 from swarm.wire.messages.orders import Obey
@@ -80,7 +80,7 @@ class TargetsService:
             homes=load_homes(setup, terrain, truth),
             leads=self._candidacy.leads,
         )
-        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
         self._anew = setup.anew
         self._heard: set[str] = set()

@@ -20,7 +20,7 @@ from launch_scripts.simulation import worlds as crowded
 from launch_scripts.simulation.campaign import in_processes, parse_seeds
 from launch_scripts.simulation.worlds import CROWDS
 from swarm.errors import ConfigError
-from swarm.runtime.garbage import collected_rarely
+from swarm.runtime.process import collected_rarely
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 

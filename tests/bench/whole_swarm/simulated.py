@@ -13,7 +13,7 @@ import msgspec
 from bench.isolated import TimeLimit, isolated
 from bench.whole_swarm.size import Size, scenario_of, size_of
 from launch_scripts.parent_death import end_with_parent
-from swarm.runtime.garbage import collected_rarely
+from swarm.runtime.process import collected_rarely
 
 WARM_UP_S = 1.0
 """Simulated seconds before the measured ones: all processes start in them."""

@@ -20,12 +20,11 @@ from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
 from swarm.runtime import health as health_module
-from swarm.runtime.health import BOARD_BYTES, SLOT_BYTES, Board, Health, Phase, Vitals
+from swarm.runtime.health import BOARD_BYTES, SLOT_BYTES, Board, Health, Phase, Supervisor, Vitals, supervisor_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
 from swarm.runtime.stats import READY, Counters
-from swarm.runtime.supervisor import Supervisor, supervisor_of
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import RUN
 

@@ -215,3 +215,18 @@ def test_while_questions_come_late_samples_and_other_questions_take_turns_with_t
     taken = [inbox.take(0) for _ in range(10)]
     assert route.question in taken[:3]
     assert [event for event in taken if isinstance(event, Heard)] == [note(n) for n in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("timeout_s", "waited_s", "late"),
+    [(0.6, 0.29, False), (0.6, 0.31, True), (5.0, 0.49, False), (5.0, 0.51, True)],
+)
+def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(
+    timeout_s: float, waited_s: float, late: bool
+) -> None:
+    inbox, time = Inbox(), Time()
+    askers = [Asker(time, timeout_s=timeout_s) for _ in range(2)]
+    for asker in askers:
+        inbox.post(asker.question)
+    time.now_s = waited_s
+    assert inbox.take(0) is askers[late].question  # of late ones the newest is taken

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.runtime.stats import Counters, Histogram, merged
+from swarm.runtime.stats import Counters, Histogram, carried, merged
+from swarm.wire.messages.processes import Stats
 
 positive = st.floats(1e-6, 1e9)
 samples = st.lists(positive, min_size=1, max_size=60)
@@ -89,3 +90,14 @@ def test_few_values_are_counted_as_many_are_and_in_the_same_order(values: list[f
         patch.setattr("swarm.runtime.stats._FEW", -1)
         many.add_all(np.array(values, np.float64))
     assert list(few.buckets.items()) == list(many.buckets.items())
+
+
+def test_a_later_life_counts_on_and_says_since_when_the_first_has_counted() -> None:
+    def life(incarnation: int, marks: int) -> Stats:
+        counts = {"marks": marks}
+        return Stats(
+            role="agent", id="a0", incarnation=incarnation, stamp_ns=1, counts=counts, gauges={}, histograms={}
+        )
+
+    third = carried(carried(life(10, 2), life(20, 3)), life(30, 4))
+    assert (third.incarnation, third.since, third.counts) == (30, 10, {"marks": 9})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.bus.zenoh_threads import Arrivals
+from swarm.bus.zenoh_intake import Arrivals
 
 
 @given(st.integers(1, 5), st.lists(st.booleans(), max_size=40))

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from swarm.runtime.turns import LONG_NS, Turns
+from swarm.runtime.job_slots import LONG_NS, JobSlots
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from swarm.runtime.turns import Turns
-with Turns(Path(sys.argv[1]), most=1).one():
+from swarm.runtime.job_slots import JobSlots
+with JobSlots(Path(sys.argv[1]), most=1).one():
     print("mine", flush=True)
     time.sleep(60)
 """
@@ -26,7 +26,7 @@ with Turns(Path(sys.argv[1]), most=1).one():
 
 @pytest.mark.parametrize("most", [1, 2, 3])
 def test_no_more_have_a_turn_at_once_than_may_and_everybody_has_one(tmp_path: Path, most: int) -> None:
-    turns, lock = Turns(tmp_path, most), threading.Lock()
+    turns, lock = JobSlots(tmp_path, most), threading.Lock()
     at_once, highest, done = 0, 0, 0
 
     def work() -> None:
@@ -55,16 +55,16 @@ def test_the_turn_of_a_process_that_is_killed_ends(tmp_path: Path) -> None:
         assert holder.stdout.readline() == b"mine\n"
         began_s = time.monotonic()
         threading.Timer(0.2, os.kill, (holder.pid, signal.SIGKILL)).start()
-        with Turns(tmp_path, most=1, longest_s=30).one():
+        with JobSlots(tmp_path, most=1, longest_s=30).one():
             assert 0.1 < time.monotonic() - began_s < 20
 
 
 def test_nobody_waits_for_ever_for_one_that_is_stopped_and_short_jobs_not_at_all(tmp_path: Path) -> None:
     entered = []
-    with Turns(tmp_path, most=1).one():
-        with Turns(tmp_path, most=1, longest_s=0.1).one():
+    with JobSlots(tmp_path, most=1).one():
+        with JobSlots(tmp_path, most=1, longest_s=0.1).one():
             entered.append("after a while")
-        with Turns(tmp_path, most=1, longest_s=3600).one(LONG_NS - 1):
+        with JobSlots(tmp_path, most=1, longest_s=3600).one(LONG_NS - 1):
             entered.append("at once")
     assert entered == ["after a while", "at once"]
 
@@ -72,5 +72,5 @@ def test_nobody_waits_for_ever_for_one_that_is_stopped_and_short_jobs_not_at_all
 def test_a_folder_that_cannot_be_written_keeps_nobody_from_work(tmp_path: Path) -> None:
     file = tmp_path / "no-folder"
     file.touch()
-    with Turns(file).one(), Turns(None).one():
+    with JobSlots(file).one(), JobSlots(None).one():
         pass

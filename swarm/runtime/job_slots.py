@@ -23,7 +23,7 @@ _LONGEST_S = 20.0
 """Nobody waits longer: the one whose turn it is may be stopped for good. Turns make jobs quick, not right."""
 
 
-class Turns:
+class JobSlots:
     """Files of a folder which all processes of a run on one machine see; whoever has locked one has a turn. The
     system ends the turn of a process that dies.
 

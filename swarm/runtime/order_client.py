@@ -23,7 +23,7 @@ _ASKS = 10
 """So many that were not answered in time, though somebody is there."""
 
 
-class Obedience:
+class OrderClient:
     """The orders that a process goes by, and the queries of operators that wait until it does.
 
     A process that starts asks keepers for their book; where none answers, everybody; where nobody answers, it goes
