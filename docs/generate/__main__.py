@@ -9,32 +9,79 @@ Both refuse a change of the wire that builds before this one could not read.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from docs.generate import cli_page, cover_page, ros2_page, scenario_page, ways_page, wire_lock, wire_page
+import click
+from typer.cli import get_docs_for_click
+
+from docs.generate import scenario_page, wire_lock, wire_page
+from docs.generate.templates import filled
+from launch_scripts import cli
+from launch_scripts.command_line.declaring import Family
+from launch_scripts.gateways.ros2.gateway_settings import EXAMPLE, Settings, incoming_rows
+from launch_scripts.gateways.ros2.topic_table import TABLE
+from shared_map.importers.cover.cover_codes import TABLES
+from shared_map.importers.zones.way_classes import BUILT_IN, COLUMNS
+
+_REFERENCE = Path(__file__).parents[1] / "reference"
+_QOS = {
+    "DEFAULT": "reliable, volatile, last 10",
+    "LATCHED": "reliable, transient local, last 1",
+    "SENSOR": "best effort, volatile, last 5",
+    "TRANSFORMS": "reliable, volatile, last 100",
+}
+_EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
+_OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `--help`.*\n", re.MULTILINE)
+
+
+def command_line() -> str:
+    """Returns the page of the command `swarm`: what Typer writes, with the examples of a command as code."""
+    root = cli.command()
+    for name, each in root.commands.items():
+        if isinstance(each, Family):
+            each.group.name = name
+            root.commands[name] = each.group
+    text = get_docs_for_click(obj=root, ctx=click.Context(root, info_name="swarm"), name="swarm")
+    text = _OF_EVERY_COMMAND.sub("", text.partition("\n")[2])
+    text = _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
+    return filled("cli", commands=text.strip())
+
+
+def land_cover() -> str:
+    """Returns the page of land-cover codes."""
+    return filled("land-cover", tables=TABLES.values())
+
+
+def ways() -> str:
+    """Returns the page of classes of roads and water."""
+    return filled("ways", kinds=BUILT_IN, columns=COLUMNS)
+
+
+def ros2() -> str:
+    """Returns the page of what `swarm ros2` forwards and of its settings."""
+    incoming = incoming_rows(EXAMPLE, has_map=True)
+    settings = scenario_page.settings(Settings)
+    return filled("ros2", outgoing=TABLE, incoming=incoming, qos=_QOS, settings=settings)
+
 
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
     wire_lock.PATH: wire_lock.document,
     scenario_page.PATH: scenario_page.document,
     scenario_page.SCHEMA_PATH: scenario_page.schema,
-    cli_page.PATH: cli_page.document,
-    cover_page.PATH: cover_page.document,
-    ways_page.PATH: ways_page.document,
-    ros2_page.PATH: ros2_page.document,
+    _REFERENCE / "cli.md": command_line,
+    _REFERENCE / "land-cover.md": land_cover,
+    _REFERENCE / "ways.md": ways,
+    _REFERENCE / "ros2.md": ros2,
 }
-
-
-def stale() -> list[Path]:
-    """The files that are not what the code says."""
-    return [
-        path for path, make in PAGES.items() if not path.is_file() or path.read_text(encoding="utf-8") != make()
-    ]
+"""File -> what makes its text, without the line end at its end."""
 
 
 def main() -> int:
+    """Writes or checks the pages; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m docs.generate", description="Write the generated pages of the reference."
     )
@@ -43,14 +90,15 @@ def main() -> int:
     if faults := wire_lock.faults():
         print("\n".join(faults), file=sys.stderr)
         return 1
-    if check:
-        for path in stale():
-            print(f"{path} is not current: run `python -m docs.generate`", file=sys.stderr)
-        return 1 if stale() else 0
+    stale = 0
     for path, make in PAGES.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(make(), encoding="utf-8")
-    return 0
+        text = make() + "\n"
+        if not check:
+            path.write_text(text, encoding="utf-8")
+        elif not path.is_file() or path.read_text(encoding="utf-8") != text:
+            print(f"{path} is not current: run `python -m docs.generate`", file=sys.stderr)
+            stale = 1
+    return stale
 
 
 if __name__ == "__main__":

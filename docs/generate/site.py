@@ -5,6 +5,7 @@ MkDocs loads this file twice: as a hook, and as an extension of griffe, which re
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,14 @@ from typing import Any
 import griffe
 from mkdocs.structure.files import File
 
-from docs.generate.docstrings import as_markdown
-
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("planner_service", "shared_map", "swarm", "vehicle_agent")
 _NUMPY = re.compile(r"^ *(Parameters|Returns|Raises)\n *-+$", re.MULTILINE)
 """What the public API of a package looks like, for readers of NumPy's documentation."""
 _API, _DECISIONS = "Python API", "Decisions"
+
+
+_ROW = re.compile(r"(?P<names>[A-Za-z_][\w.`]*(?:, [A-Za-z_][\w.`]*)*) {2,}(?P<meaning>\S.*)")
 
 
 class Listings(griffe.Extension):
@@ -32,6 +34,22 @@ class Listings(griffe.Extension):
             obj.docstring.parser_options = {"warnings": False}  # how a docstring is laid out breaks no build
         else:
             obj.docstring.value = as_markdown(obj.docstring.value)
+
+
+def as_markdown(docstring: str) -> str:
+    """Returns a docstring whose rows `name  meaning` are items of a list.
+
+    Lines which continue a row are indented, and so belong to its item.
+    """
+    lines: list[str] = []
+    for line in inspect.cleandoc(docstring).splitlines():
+        if row := _ROW.fullmatch(line):
+            if lines and lines[-1] and not lines[-1].startswith(("- ", " ")):
+                lines.append("")  # a list begins a paragraph
+            names = ", ".join(f"`{name.strip('`')}`" for name in row["names"].split(", "))
+            line = f"- {names}: {row['meaning']}"
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def packages() -> dict[str, list[str]]:

@@ -85,7 +85,7 @@ def _fields(struct: type[msgspec.Struct]) -> list[list[str]]:
 
 def document() -> str:
     """The lock as text: a topic a line, a field a line, so that a change shows where it is."""
-    return _text(lock(), "") + "\n"
+    return _text(lock(), "")
 
 
 def _text(value: Any, margin: str) -> str:

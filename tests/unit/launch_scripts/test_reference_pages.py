@@ -12,19 +12,19 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from docs.generate import cli_page, scenario_page
-from docs.generate.__main__ import PAGES
-from docs.generate.docstrings import as_markdown, meanings, prose
+from docs.generate import scenario_page, wire_page
+from docs.generate.__main__ import PAGES, command_line
 from launch_scripts import cli
 from launch_scripts.command_line.declaring import Family
 from swarm.config.scenario import Scenario
+from swarm.wire.topics import TOPICS
 
 ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_the_page_is_current(path):
-    assert path.read_text(encoding="utf-8") == PAGES[path](), "run `python -m docs.generate`"
+    assert path.read_text(encoding="utf-8") == PAGES[path]() + "\n", "run `python -m docs.generate`"
 
 
 class Explained(msgspec.Struct):
@@ -52,8 +52,8 @@ class Unexplained(msgspec.Struct):
 
 def test_a_key_has_its_meaning_unit_range_and_default_on_the_page():
     page = scenario_page.document(Explained)
-    assert "| `width_m` | how wide it is | m | number > 0, ≤ 5 | `1.0` |" in page
-    assert '| `shade` | which |  | text | `""` |' in page
+    assert "| `width_m` | how wide it is | m | a number, more than 0, up to 5 | `1.0` |" in page
+    assert '| `shade` | which |  | text in quotes | `""` |' in page
 
 
 def test_a_key_without_a_row_is_refused_by_page_and_schema():
@@ -92,7 +92,7 @@ def test_the_schema_knows_every_key_of_a_shipped_scenario_and_no_other(scenario)
 
 
 def test_every_command_and_option_of_the_command_line_is_on_the_page():
-    page = cli_page.document()
+    page = command_line()
     for name, command in cli.command().commands.items():
         section = page.partition(f"## `swarm {name}`\n")[2].partition("\n## `")[0]
         assert section
@@ -102,18 +102,15 @@ def test_every_command_and_option_of_the_command_line_is_on_the_page():
             assert all(f"### `swarm {name} {inner}`" in section for inner in command.group.commands)
 
 
-def test_rows_of_a_docstring_are_read_with_all_their_names_and_lines():
-    doc = """What it is.
-
-    rows, cols  how many
-    name        goes on
-                and on
-
-    More of it.
-    """
-    assert meanings(doc) == {"rows": "how many", "cols": "how many", "name": "goes on and on"}
-    assert prose(doc) == "What it is.\n\nMore of it."
-    assert "- `rows`, `cols`: how many\n- `name`: goes on and on" in as_markdown(doc)
+def test_every_key_message_and_field_is_on_the_page():
+    page = wire_page.document()
+    for topic in TOPICS:
+        assert f"| `{topic.key}` |" in page
+        for message in filter(None, (topic.message, topic.request)):
+            assert f"### {message.__name__}\n" in page
+            assert f'"{message.__struct_config__.tag}"' in page
+            for field in message.__struct_fields__:
+                assert f"| `{field}` |" in page
 
 
 _FILE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|toml|md|sh|yml|json))`")

@@ -13,7 +13,21 @@ import pytest
 pytest.importorskip("mkdocs", reason="the documentation's packages (dependency group dev) are not installed")
 pytest.importorskip("mkdocstrings", reason="the documentation's packages (dependency group dev) are not installed")
 
+from docs.generate.site import as_markdown, packages
+
 ROOT = Path(__file__).parents[3]
+
+
+def test_rows_of_a_docstring_are_items_of_a_list_with_all_their_lines():
+    said = """What it is:
+    rows, cols  how many
+    name        goes on
+                and on
+
+    More of it.
+    """
+    items = "- `rows`, `cols`: how many\n- `name`: goes on\n            and on"
+    assert as_markdown(said) == f"What it is:\n\n{items}\n\nMore of it."
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +57,6 @@ def test_every_page_is_built_and_in_the_navigation(site):
 
 
 def test_a_page_of_the_python_api_stands_for_every_room(site):
-    from docs.generate.site import packages
-
     for package, modules in packages().items():
         page = (site / "reference" / "api" / f"{package}.html").read_text(encoding="utf-8")
         for module in modules:
