@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import click
+import typer
 from typer.cli import get_docs_for_click
 
 from docs.generate import scenario_page, wire_lock, wire_page
@@ -44,7 +44,7 @@ def command_line() -> str:
         if isinstance(each, Family):
             each.group.name = name
             root.commands[name] = each.group
-    text = get_docs_for_click(obj=root, ctx=click.Context(root, info_name="swarm"), name="swarm")
+    text = get_docs_for_click(obj=root, ctx=typer.Context(root, info_name="swarm"), name="swarm")
     text = _OF_EVERY_COMMAND.sub("", text.partition("\n")[2])
     text = _EXAMPLES.sub(lambda found: "```sh\n" + re.sub(r"\n+", "\n", found[0]) + "\n```", text)
     return filled("cli", commands=text.strip())

@@ -6,8 +6,8 @@ from __future__ import annotations
 import pytest
 from support.bus_world import Box, World, answering, asked, marks, note, pose, run_info
 
-from docs.generate.json_examples import example, key_fields, put_from_outside
 from docs.generate.wire_page import PATH as WIRE_PAGE
+from docs.generate.wire_page import example, key_fields, put_from_outside
 from shared_map.replication.mark_sets import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
