@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
@@ -21,16 +20,15 @@ from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
-from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
+from vehicle_agent.assigners import Assigner, Spread
+from vehicle_agent.assignment import AskCosts, Assignment, GroupCosts
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
-from vehicle_agent.driving.route_bounds import RouteBounds
-from vehicle_agent.group_costs import GroupCosts
-from vehicle_agent.sensing.empty_places import EmptyPlaces
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
-from vehicle_agent.traffic.cell_requests import Wishes
+from vehicle_agent.sensing.target_detector import EmptyPlaces
+from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
 
@@ -68,7 +66,8 @@ class Agent:
     dynamics   how fast vehicles drive; as the ground allows if not given
     group      what the other agents of the group told of their costs, if the assigner asks for it
 
-    stopped    whether an operator wants a vehicle to stand
+    stopped     whether an operator wants a vehicle to stand
+    assignment  asks for costs, and gives vehicles their targets
     """
 
     def __init__(
@@ -99,15 +98,9 @@ class Agent:
         grid, pace = local_map.grid, local_map.pace
         climb = local_map.climb
         self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.bodies, climb)
-        self._wishes = Wishes(
-            grid,
-            self._steering,
-            holdings,
-            self.bodies,
-            config.reserve_cells + 2,
-            self._target_cell,
-            self._in_reach,
-            f"{scenario.seed}/{plan.id}",
+        near_cells, seed = config.reserve_cells + 2, f"{scenario.seed}/{plan.id}"
+        self._wishes = CellRequests(
+            grid, self._steering, holdings, self.bodies, near_cells, self._target_cell, self._in_reach, seed
         )
         self._pulled = scenario.planner.routes == "pulled"
         self._driver = Driver(
@@ -119,9 +112,8 @@ class Agent:
             measures=scenario.map.learning,
         )
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies, climb)
-        self._routes = RouteBounds(grid.cols, 1)
         self._planners: dict[str, int] = {}
-        self._poses: dict[str, TargetPose] = {}
+        self._poses: dict[str | None, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
         self._empty = EmptyPlaces(self._trackings)
         self._unseen: set[str] = set()
@@ -129,7 +121,7 @@ class Agent:
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         assigner, stagger = assigner or Spread(), chance.random()
-        self._assignment = Assignment(self.targets, assigner, config.reassign_s, stagger, group)
+        self.assignment = Assignment(self.targets, assigner, config.reassign_s, stagger, group)
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -148,17 +140,17 @@ class Agent:
         if list(targets) == self.targets:
             return
         self.targets = list(targets)
-        self._assignment.set_targets(self.targets)
+        self.assignment.set_targets(self.targets)
         for vehicle in self.vehicles.values():
             if vehicle.target is not None and vehicle.target not in self.targets:
                 vehicle.release()
                 self._driver.stop_soon(vehicle)
-        self._assignment.ask_soon(now_ns)
+        self.assignment.ask_soon(now_ns)
 
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
         """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
         self._time_scale = time_scale
-        self._assignment.set_period(reassign_s)
+        self.assignment.set_period(reassign_s)
 
     # --- where vehicles start -------------------------------------------------------------------------------
 
@@ -258,7 +250,9 @@ class Agent:
         cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
         rows, east = np.divmod(np.array([vehicle.motion.cell for vehicle in vehicles], np.int64), cols)
         places = np.stack((rows - sight, east - sight, rows + sight, east + sight), 1)
-        routes = self._routes.bounds([vehicle.route for vehicle in vehicles])
+        # A cell wider on each side: a diagonal step ends where a cell beside it is closed.
+        routes = np.array([vehicle.route.bounds(cols) for vehicle in vehicles], np.int64)
+        routes += np.array((-1, -1, 1, 1))
         on_route, in_sight = meet(np.concatenate((routes, places)), changed).reshape(2, -1)
         for index in np.flatnonzero(on_route | in_sight).tolist():
             vehicle = vehicles[index]
@@ -286,7 +280,7 @@ class Agent:
         if self._empty.look(
             (each.target for each in self.vehicles.values() if each.target and each.in_reach), now_ns
         ):
-            self._assignment.ask_soon(now_ns)
+            self.assignment.ask_soon(now_ns)
         lost = self._trackings.lost(now_ns) | self._empty.of
         for target in self._empty.unseen(lost) - self._unseen:
             self._unseen.add(target)
@@ -294,7 +288,7 @@ class Agent:
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
         paths, cols, reach = self.holdings.paths, self._map.grid.cols, self._reach_cells
-        rows: dict[str | None, int] = {target: pose.cell // cols for target, pose in self._poses.items()}
+        rows = {target: pose.cell // cols for target, pose in self._poses.items()}
         waiting = self._steering.waiting_ns
         for vehicle in self.vehicles.values():
             motion, row = vehicle.motion, rows.get(vehicle.target)
@@ -324,31 +318,26 @@ class Agent:
         self._wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
-            request = AskRoutes(
-                self._requests,
-                target_id,
-                tuple(ask.vehicle for ask in batch),
-                tuple(ask.cell for ask in batch),
-                force,
-                sum(ask.reason.is_reroute for ask in batch),
-            )
+            ids, cells = tuple(ask.vehicle for ask in batch), tuple(ask.cell for ask in batch)
+            reroutes = sum(ask.reason.is_reroute for ask in batch)
+            request = AskRoutes(self._requests, target_id, ids, cells, force, reroutes)
             self._route_requests[request.request] = request
             actions.append(request)
         if self._unassigned:
             # A new life learns its vehicles' places one after the other, from several plots.
             self._unassigned = False
-            self._assignment.ask_soon(now_ns)
-        if self.vehicles and self._assignment.due(now_ns):
+            self.assignment.ask_soon(now_ns)
+        if self.vehicles and self.assignment.due(now_ns):
             self._requests += 1
-            actions.append(self._assignment.ask(self._requests, self.vehicles, now_ns))
+            actions.append(self.assignment.ask(self._requests, self.vehicles, now_ns))
         return actions
 
     def _target_cell(self, target: str | None) -> int | None:
-        pose = self._poses.get(target) if target is not None else None
+        pose = self._poses.get(target)
         return None if pose is None else pose.cell
 
     def _in_reach(self, target: str | None, cell: int) -> bool:
-        pose = self._poses.get(target) if target is not None else None
+        pose = self._poses.get(target)
         if pose is None:
             return False
         grid, reach = self._map.grid, self._reach_cells
@@ -397,7 +386,7 @@ class Agent:
                 if vehicle.target == pose.target:
                     self._check_reach(vehicle)
                     vehicle.target_jumped(now_ns)
-            self._assignment.target_jumped(now_ns)
+            self.assignment.target_jumped(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
         """Which planners live: target -> incarnation."""
@@ -411,7 +400,7 @@ class Agent:
             elif target in alive and (vehicle.planner_gone or before.get(target) != alive[target]):
                 vehicle.regain_planner(now_ns)
         if any(target not in before for target in alive):
-            self._assignment.ask_soon(now_ns)
+            self.assignment.ask_soon(now_ns)
 
     def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[Follow]:
         """A planner's answer to `AskRoutes`; returns the routes that vehicles have begun."""
@@ -487,17 +476,7 @@ class Agent:
 
     # --- which target ---------------------------------------------------------------------------------------
 
-    def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:
-        """One planner's answer to `AskCosts`: float32 seconds, one per vehicle asked for."""
-        self._assignment.costs_given(request, target, costs_s)
-
     def costs_ended(self, request: int, now_ns: int) -> SharedCosts | None:
         """No more answers to `AskCosts` will come; returns what to tell the other agents of the group."""
         standing = list(filter(self.stopped, self.vehicles))
-        return self._assignment.costs_ended(
-            request, self.vehicles, self._planners, now_ns, self._empty.of, standing
-        )
-
-    def hear_costs(self, told: SharedCosts, now_ns: int) -> None:
-        """What another agent of the group told of its vehicles."""
-        self._assignment.hear(told, now_ns)
+        return self.assignment.costs_ended(request, self.vehicles, self._planners, now_ns, self._empty.of, standing)

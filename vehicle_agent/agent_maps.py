@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,15 @@ from shared_map.class_maps import ClassMaps, for_class, read_marks
 from shared_map.cost_map import CostMap, merged
 from shared_map.learning.factors import Measured
 from shared_map.learning.words import Said
+from shared_map.replication.marks import NO_STATEMENTS, Statements, dense, is_zone, standing
+from shared_map.replication.merge import winners
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import grid_cells, tile_corners
 from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
+from swarm.wire.messages.map_data import MarkKind
+from vehicle_agent.sensing.sensor import Findings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,3 +161,144 @@ class Learning:
             return {}
         self._told_version, self._due_ns = measured.version, now_ns + _EVERY_NS
         return measured.said
+
+
+# What zones of operators mean to an agent: what is found in them is no news, and who stands in one drives out.
+
+_AGAIN_NS = NS_PER_S
+"""Ways out are looked for again so often while somebody needs one: what is around the zone changes, too."""
+
+
+class ZonesAround:
+    """The zones in an agent's map: those for all vehicles, and those for the class of its own.
+
+    ways_out  cell that only a zone closes -> straight steps from there to the nearest open cell
+    """
+
+    def __init__(self, replica: MapReplica, maps: AgentMaps) -> None:
+        self.ways_out: Mapping[int, int] = {}
+        self._replica = replica
+        self._maps = maps
+        self._cost_map = maps.own
+        self._version = 0
+        """Of the zones that `_cells` and `_tiles` are those of."""
+        self._cells: NDArray[np.int64] = np.empty(0, np.int64)
+        """Cells of zones for all vehicles, sorted."""
+        self._tiles: list[int] = []
+        """Tiles of the grid with a zone for all vehicles, or for the own class."""
+        self._due_ns = 0
+
+    def update(self, places: Collection[int], now_ns: int, shut: Collection[int] = ()) -> None:
+        """Take in what changed.
+
+        places  the cells that our vehicles hold
+        shut    cells over which no way out leads: bodies stand there, or vehicles have seen that they are lethal
+        """
+        if self._version != self._replica.zones_version:
+            self._version = self._replica.zones_version
+            self._find_zones()
+            self._due_ns = 0
+        pace = self._cost_map.pace_s_per_m.reshape(-1)
+        if not self._tiles or not np.isinf(pace[list(places)]).any():
+            self.ways_out = {}
+        elif now_ns >= self._due_ns or not self.ways_out:
+            self._due_ns = now_ns + _AGAIN_NS
+            self.ways_out = self._find_ways_out(shut)
+
+    def without(self, findings: Findings) -> Findings:
+        """Findings without those in zones: an operator's word stands, whatever a vehicle sees there. In a zone for
+        one class the others go by what is found."""
+        if not len(self._cells) or not len(findings):
+            return findings
+        free = ~np.isin(findings.cells, self._cells)
+        return Findings(findings.cells[free], findings.kinds[free], findings.paces[free])
+
+    def _find_zones(self) -> None:
+        replica, grid = self._replica, self._replica.grid
+        tiles: set[int] = set()
+        found = [np.empty(0, np.int64)]
+        for tile in replica.held.tiles:
+            zones = [each for each in replica.held.of_tile(tile) if is_zone(each.author)]
+            class_number, place = grid.class_of_tile(tile)
+            if zones and class_number in (0, self._maps.class_number):
+                tiles.add(place)
+            for each in zones if class_number == 0 else ():
+                found.append(self._cells_of(place, standing(each, replica.now_ns).cells))
+        self._tiles, self._cells = sorted(tiles), np.unique(np.concatenate(found))
+
+    def _cells_of(self, place: int, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Flat indices in the grid of cells of a tile."""
+        grid = self._replica.grid
+        return grid_cells(grid, tile_corners(grid, place), cells).astype(np.int64)
+
+    def _find_ways_out(self, shut: Collection[int]) -> dict[int, int]:
+        """Breadth first from the open cells around zones, along straight steps over cells that only zones close.
+        What is shut leads out too, as a vehicle may stand there, but nothing leads over it."""
+        closed = self._closed_by_zones()
+        cols, pace = self._cost_map.grid.cols, self._cost_map.pace_s_per_m.reshape(-1)
+        passable = ~np.isin(closed, list(shut))
+        depth = np.zeros(len(closed), np.int64)
+        beside = _straight(closed, cols, len(pace))
+        at = np.searchsorted(closed, beside.clip(0))
+        at[at == len(closed)] = 0
+        inside = (closed[at] == beside) if len(closed) else np.zeros_like(beside, bool)
+        outside = (beside >= 0) & np.isfinite(pace[beside.clip(0)]) & ~np.isin(beside, list(shut))
+        front = outside.any(axis=1)
+        level = 0
+        while front.any():
+            level += 1
+            depth[front] = level
+            reached = np.zeros(len(closed), bool)
+            reached[at[front & passable][inside[front & passable]]] = True
+            front = reached & (depth == 0)
+        led = depth > 0
+        return dict(zip(closed[led].tolist(), depth[led].tolist(), strict=True))
+
+    def _closed_by_zones(self) -> NDArray[np.int64]:
+        """Cells which are lethal, and would not be without the zones; sorted."""
+        grid, cost_map, found = self._replica.grid, self._cost_map, [np.empty(0, np.int64)]
+        ground = cost_map.ground_s_per_m.copy()
+        flat, prior = ground.reshape(-1), cost_map.terrain.ground_s_per_m.reshape(-1)
+        for place in self._tiles:
+            for_all, zones = self._said_without_zones(place)
+            own = NO_STATEMENTS
+            if self._maps.class_number:
+                own, own_zones = self._said_without_zones(grid.tile_for(place, self._maps.class_number))
+                zones += own_zones
+            for each in zones:
+                cells = self._cells_of(place, each)
+                flat[cells] = prior[cells]
+            inner = np.union1d(for_all.cells, own.cells)
+            cells = self._cells_of(place, inner)
+            spread, own_spread = dense(for_all), dense(own)
+            kinds, paces = self._maps.read(
+                cells,
+                spread.kinds[inner],
+                spread.paces[inner],
+                own_spread.kinds[inner],
+                own_spread.paces[inner],
+            )
+            marked = kinds != MarkKind.CLEAR
+            flat[cells[marked]] = np.where(kinds == MarkKind.LETHAL, np.inf, paces)[marked]
+        for place in self._tiles:
+            window = cost_map.padded(grid.tile_window(place))
+            pace = cost_map.inflated(ground, window)
+            here = cost_map.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
+            rows, cols = np.nonzero(np.isinf(here) & np.isfinite(pace))
+            found.append((rows + window.row0) * grid.cols + cols + window.col0)
+        return np.unique(np.concatenate(found))
+
+    def _said_without_zones(self, tile: int) -> tuple[Statements, list[NDArray[np.uint16]]]:
+        """What is said of a tile beside its zones, and the cells in it of each zone."""
+        sets, now_ns = self._replica.held.of_tile(tile), self._replica.now_ns
+        zones = [standing(each, now_ns).cells for each in sets if is_zone(each.author)]
+        return winners([each for each in sets if not is_zone(each.author)], now_ns), zones
+
+
+def _straight(cells: NDArray[np.int64], cols: int, area: int) -> NDArray[np.int64]:
+    """The four neighbours beside each cell, int64 (n, 4); -1 where the grid ends."""
+    col = cells % cols
+    beside = np.stack((cells - cols, np.where(col < cols - 1, cells + 1, -1), cells + cols, cells), axis=1)
+    beside[:, 3] = np.where(col > 0, cells - 1, -1)
+    beside[(beside < 0) | (beside >= area)] = -1
+    return beside

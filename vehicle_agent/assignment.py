@@ -1,31 +1,119 @@
-"""Which target each vehicle goes for: at low cost, shared out over the targets, if the change is worth it."""
+"""Asks planners what every vehicle would need to every target, and gives each vehicle the target to go for.
+
+Once a period (`vehicles.reassign_s`) an agent asks all planners for the costs of all its vehicles. When their
+answers have come, the assigner shares the targets out (`assigners`), and each vehicle takes its own if the change
+is worth it. Where the assigner asks for it, the agents of a group tell each other their costs (`GroupCosts`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
-from typing import Protocol
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.plugins.find import Plugin
-from swarm.plugins.guard import Guard, Nonsense, Tell
-from swarm.wire.messages.vehicles import SharedCosts, VehicleState
+from swarm.wire.fields import column, pack_column
+from swarm.wire.messages.vehicles import MOST_SHARED_TARGETS, NO_TARGET, SharedCosts, VehicleState
+from vehicle_agent.assigners import HYSTERESIS, Assigner, CostTable
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.group_costs import GroupCosts
-from vehicle_agent.matching import HYSTERESIS, need_first, spread
 
 _RETRY_NS = NS_PER_S // 2
+"""Vehicles for which no planner has answered ask again so soon: a planner needs about that long to start."""
 _STRANDED_RETRY_NS = 3 * NS_PER_S
+"""Vehicles without a way ask again so soon: only a changed map gives them one."""
 _JUMPS_APART_NS = NS_PER_S // 50
 """For each target: so long after a request a jump of a target may cause the next. With many targets one always
 jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
 _LEASE_PERIODS = 3
 """An agent of the group that has told no costs for so many periods is gone."""
+_MOST_AGENTS = 256
+"""The agents of one group that are listened to: strangers may invent as many as they like."""
+
+
+class GroupCosts:
+    """The newest words of the other agents of a group.
+
+    agent   id of this agent; what comes under it is not another's
+    """
+
+    def __init__(self, author: str, group: str, agent: str) -> None:
+        self._author = author
+        self._group = group
+        self._agent = agent
+        self._heard: dict[str, tuple[SharedCosts, int]] = {}
+        """Agent -> its newest word, and when that came."""
+
+    def tell(
+        self,
+        vehicles: Sequence[str],
+        costs_s: Mapping[str, NDArray[np.float32]],
+        chased: Sequence[str | None],
+        now_ns: int,
+    ) -> SharedCosts:
+        """The message with the costs of our vehicles.
+
+        costs_s  target -> float32 (vehicles,), s, inf where there is no way
+        chased   the target of each vehicle
+        """
+        targets = sorted(costs_s)[:MOST_SHARED_TARGETS]
+        table = [costs_s[target] for target in targets]
+        index = {target: n for n, target in enumerate(targets)}
+        return SharedCosts(
+            author=self._author,
+            group=self._group,
+            stamp_ns=now_ns,
+            ids=list(vehicles),
+            target_ids=targets,
+            costs_s=pack_column(np.stack(table, 1) if table else [], "<f4"),
+            targets=bytes(NO_TARGET if each is None else index.get(each, NO_TARGET) for each in chased),
+        )
+
+    def hear(self, message: SharedCosts, now_ns: int) -> None:
+        """Another agent's word; of two lives of an agent the one that spoke last counts."""
+        agent = message.agent
+        if agent == self._agent or message.group != self._group:
+            return
+        held = self._heard.get(agent)
+        if held is not None and message.stamp_ns < held[0].stamp_ns:
+            return
+        if held is None and len(self._heard) >= _MOST_AGENTS:
+            del self._heard[min(self._heard, key=lambda each: (self._heard[each][1], each))]
+        self._heard[agent] = message, now_ns
+
+    def expire(self, since_ns: int) -> None:
+        """Forget agents that were not heard since then: they are gone."""
+        self._heard = {agent: heard for agent, heard in self._heard.items() if heard[1] >= since_ns}
+
+    @property
+    def targets(self) -> set[str]:
+        """Those that others have told of."""
+        return {target for message, _ in self._heard.values() for target in message.target_ids}
+
+    def rows(self, targets: Sequence[str]) -> tuple[tuple[str, ...], NDArray[np.float64], tuple[int, ...]]:
+        """Ids of the others' vehicles, ascending; float64 (targets, vehicles) their costs in s, inf where nothing
+        was told; and the index of the target of each, -1 for none of these."""
+        ids: list[str] = []
+        parts: list[NDArray[np.float64]] = []
+        chased: list[int] = []
+        for message, _ in self._heard.values():
+            told = column(message.costs_s, "<f4").reshape(len(message.ids), len(message.target_ids))
+            part = np.full((len(targets), len(message.ids)), np.inf)
+            at = {target: n for n, target in enumerate(targets)}
+            for n, target in enumerate(message.target_ids):
+                if target in at:
+                    part[at[target]] = told[:, n]
+            ids += message.ids
+            parts.append(part)
+            names = (None if each == NO_TARGET else message.target_ids[each] for each in message.targets)
+            chased += [-1 if name is None else at.get(name, -1) for name in names]
+        if not ids:
+            return (), np.full((len(targets), 0), np.inf), ()
+        order = sorted(range(len(ids)), key=ids.__getitem__)
+        table = np.concatenate(parts, 1)[:, order]
+        return tuple(ids[n] for n in order), table, tuple(chased[n] for n in order)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,151 +166,6 @@ def choose(
     if current is not None and best_s > (1.0 - HYSTERESIS) * costs_s.get(current, math.inf):
         return Choice(current)
     return Choice(best)
-
-
-@dataclass(frozen=True, slots=True)
-class AssignmentWorld:
-    """What an assigner is made with.
-
-    agent    id of the agent whose vehicles it assigns
-    group    their group
-    targets  those that the group may chase at the start; operators add and remove some
-    seed     of the run
-    pursuers how many vehicles of the group each target shall get first
-    """
-
-    agent: str
-    group: str
-    targets: tuple[str, ...]
-    seed: int
-    pursuers: int = 1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CostTable:
-    """What each vehicle would need to each target.
-
-    targets   those whose planners have answered; where costs are shared, ascending, those that others told of too
-    vehicles  those that have a choice
-    costs_s   (targets, vehicles) float64, inf where there is no route
-    current   (vehicles,) index of the target of each now, -1 for none
-    others    where costs are shared: the same, of the vehicles of the group's other agents, as they told it last
-    """
-
-    targets: tuple[str, ...]
-    vehicles: tuple[str, ...]
-    costs_s: NDArray[np.float64]
-    current: tuple[int, ...]
-    others: CostTable | None = None
-
-
-class Assigner(Protocol):
-    """Says which vehicle of an agent goes for which target. A plug-in is made as
-    `Name(world: AssignmentWorld, options)`.
-
-    One that has an attribute `shares_costs`, and it is true, is told the costs of the whole group: its agents tell
-    each other theirs, once a period.
-    """
-
-    def assign(self, table: CostTable) -> NDArray[np.int64]:
-        """(vehicles,) index of a target that the vehicle has a route to; -1 lets it keep its target, or take the
-        cheapest."""
-        ...
-
-
-class Spread:
-    """Even shares: see `spread`."""
-
-    def assign(self, table: CostTable) -> NDArray[np.int64]:
-        return spread(table.costs_s, table.current)
-
-
-class Cheapest:
-    """Each vehicle the target that it reaches first, whatever the others do."""
-
-    def assign(self, table: CostTable) -> NDArray[np.int64]:
-        return np.full(len(table.vehicles), -1, np.int64)
-
-
-class Balanced:
-    """First every target's pursuers out of the whole group, then even shares: see `need_first` and `spread`.
-
-    All agents solve one problem, which does not depend on who solves it or in which order words came, and each
-    takes what it says of its own vehicles. Where they hold different words, a target may have more pursuers for a
-    period.
-    """
-
-    shares_costs = True
-
-    def __init__(self, pursuers: int) -> None:
-        self._pursuers = pursuers
-
-    def assign(self, table: CostTable) -> NDArray[np.int64]:
-        tables = [table] if table.others is None else [table, table.others]
-        ids = list(chain.from_iterable(each.vehicles for each in tables))
-        rows = sorted(range(len(table.targets)), key=table.targets.__getitem__)
-        columns = sorted(range(len(ids)), key=ids.__getitem__)
-        place = {row: n for n, row in enumerate(rows)} | {-1: -1}
-        costs_s = np.concatenate([each.costs_s for each in tables], 1)[np.ix_(rows, columns)]
-        now = list(chain.from_iterable(each.current for each in tables))
-        current = [place[now[n]] for n in columns]
-        shared = spread(costs_s, current, need_first(costs_s, current, self._pursuers))
-        chosen = np.full(len(ids), -1, np.int64)
-        chosen[columns] = [rows[each] if each >= 0 else -1 for each in shared.tolist()]
-        return chosen[: len(table.vehicles)]
-
-
-ASSIGNERS: Mapping[str, Callable[[AssignmentWorld], Assigner]] = {
-    "spread": lambda world: Spread(),
-    "cheapest": lambda world: Cheapest(),
-    "balanced": lambda world: Balanced(world.pursuers),
-}
-"""The built-in assigners."""
-
-
-def shares_costs(assigner: Assigner) -> bool:
-    """Whether the agents of a group tell each other their costs for it."""
-    return getattr(assigner, "shares_costs", False) is True
-
-
-def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
-    """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
-    if plugin.factory is None:
-        return ASSIGNERS[plugin.named.name](world)
-    return PluginAssigner(plugin.make(world), Guard(plugin, tell))
-
-
-class PluginAssigner:
-    """What a plug-in assigns; even shares once it has failed."""
-
-    def __init__(self, assigner: Assigner, guard: Guard) -> None:
-        self._assigner = assigner
-        self._guard = guard
-        self.shares_costs = shares_costs(assigner)
-
-    def assign(self, table: CostTable) -> NDArray[np.int64]:
-        others = table.others and replace(table.others, costs_s=table.others.costs_s.copy())
-        told = replace(table, costs_s=table.costs_s.copy(), others=others)
-        return self._guard.ask(
-            lambda: self._assigner.assign(told),
-            lambda chosen: _checked(chosen, table.costs_s),
-            lambda: spread(table.costs_s, table.current),
-        )
-
-
-def _checked(chosen: object, costs_s: NDArray[np.float64]) -> NDArray[np.int64]:
-    targets, vehicles = costs_s.shape
-    found = np.asarray(chosen)
-    if found.shape != (vehicles,) or found.dtype.kind not in "iu":
-        raise Nonsense(f"{found.dtype} {found.shape}, expected whole numbers, one for each of {vehicles} vehicles")
-    wrong = (found < -1) | (found >= targets)
-    if wrong.any():
-        raise Nonsense(f"target {found[wrong][0]}, expected -1 to {targets - 1}")
-    at = np.flatnonzero(found >= 0)
-    lost = at[~np.isfinite(costs_s[found[at].astype(np.intp), at])]
-    if lost.size:
-        raise Nonsense(f"target {found[lost[0]]} for vehicle {lost[0]}, which has no route to it")
-    return found.astype(np.int64)
 
 
 class Assignment:
@@ -328,11 +271,6 @@ class Assignment:
             retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
         return self._tell(asked, vehicles, empty, standing, now_ns)
-
-    def hear(self, told: SharedCosts, now_ns: int) -> None:
-        """What another agent of the group told of its vehicles."""
-        if self._group is not None:
-            self._group.hear(told, now_ns)
 
     def _tell(
         self,

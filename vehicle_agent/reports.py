@@ -13,7 +13,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import NO_TARGET, Chasers, Fleet
-from vehicle_agent.driving.positions import Places
+from vehicle_agent.driving.driven_vehicle import Places
 
 HEARTBEAT_NS = NS_PER_S
 """A target whose chasers stand still is told of them so often: the planner's lease is five times as long."""

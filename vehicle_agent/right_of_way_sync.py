@@ -3,25 +3,54 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from hashlib import blake2s
 
 from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.grid import REGION_CELLS, GridSpec
 from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
-from swarm.right_of_way.lock_regions import Plots
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.own_time import OwnTime
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
+
+# The time that a process has lived through: what leases of right of way are counted by.
+
+
+class OwnTime:
+    """A clock that counts of the time between two ticks one period at most.
+
+    A process that comes late to its ticks has not heard the others meanwhile, so it cannot say that they were
+    silent; and where one is late, for want of processors, the others are. By the time of the wall, on a machine on
+    which ticks come seconds apart, every lease had run out whenever somebody looked: wardens were replaced before
+    they could grant, for ever. On time it is the time of the wall. Nothing that is safe hangs on it.
+
+    period_ns  of ticks
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._ticked_ns: int | None = None
+        self._own_ns = 0
+
+    def at(self, now_ns: int) -> int:
+        """The own time, ns, between this tick and the next."""
+        if self._ticked_ns is None:
+            return now_ns
+        return self._own_ns + min(max(now_ns - self._ticked_ns, 0), self._period_ns)
+
+    def tick(self, now_ns: int) -> int:
+        """A tick begins. Returns the own time, ns."""
+        self._own_ns = self.at(now_ns)
+        self._ticked_ns = now_ns
+        return self._own_ns
+
 
 log = logging.getLogger(__name__)
 
@@ -40,36 +69,24 @@ _WAITING_AGAIN_NS = 10 * NS_PER_S
 class RightOfWaySync:
     """Carries an agent's right of way.
 
-    placed  called with the vehicles that have found their places
     warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
             "promises", for the file of promises
-    spawns    of the agents of the layer: agent -> vehicle -> cell
-    vehicles  of an agent that is not in `spawns`
-    layer, others  as of `Plots`
     """
 
     def __init__(
         self,
+        core: RightOfWay,
         setup: RoleSetup,
-        grid: GridSpec,
-        spawns: Mapping[str, Mapping[str, int]],
         store: PromiseStore,
         bus: Bus,
         post: Post,
-        placed: Callable[[Sequence[str]], None],
         warn: Callable[[str, str], None],
-        vehicles: Collection[str] = (),
-        layer: int = 0,
-        others: Collection[str] = (),
     ) -> None:
-        side = setup.scenario.map.plot_regions * REGION_CELLS
-        plots = Plots(grid, list(spawns), side, layer=layer, others=others)
-        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved, vehicles=vehicles)
+        self.core = core
         self._id = setup.id
         self._store = store
         self._bus = bus
         self._post = post
-        self._placed = placed
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
@@ -131,11 +148,12 @@ class RightOfWaySync:
                 return False
         return True
 
-    def hear_granted(self, now_ns: int) -> None:
-        """Take in what wardens have granted since the last time. Called before vehicles drive."""
+    def take_granted(self, now_ns: int) -> Iterator[list[str]]:
+        """Takes in what wardens have granted since the last time, before vehicles drive. Yields the vehicles that
+        have found their places by each message; they are to be placed before the next."""
         for heard in self._bus.collected(GRANTED):
             assert isinstance(heard.message, Granted)
-            self._placed(self.core.hear_granted(heard.message, self._own_time.at(now_ns)))
+            yield self.core.hear_granted(heard.message, self._own_time.at(now_ns))
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
         own_ns = self._own_time.tick(now_ns)

@@ -1,34 +1,28 @@
-"""The shell of an agent: messages to calls of its cores, and what they return to the bus."""
+"""The shell of an agent: carries messages to its parts, and what they decide to the bus.
+
+What is acted on at ticks is collected by the bus (`Bus.collect`); all else comes as an event. Each kind of message
+has one handler, named after what it tells.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.class_grounds import class_grounds
-from shared_map.replication.filter import MarkFilter, author_of, readable_groups
-from shared_map.replication.interest import Interest
-from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
-from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import AgentPlan, plan_agents
-from swarm.config.classes import GROUND, class_named, class_numbers, flies, of_class
-from swarm.config.plugin_names import assignment_key
-from swarm.errors import ConfigError
 from swarm.liveness import Roster, job_of
-from swarm.plugins.find import named_plugin
-from swarm.runtime.membership import Member
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column, pack_column
+from swarm.wire.messages import Message
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (
     CostReply,
@@ -54,40 +48,34 @@ from swarm.wire.topics import (
     SHARED_COSTS,
     SIGHTED,
     TRUE_POSE,
+    Topic,
 )
-from vehicle_agent.agent import Agent, AgentAction, AskRoutes
-from vehicle_agent.agent_maps import AgentMaps
-from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of, shares_costs
-from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.driven_vehicle import Follow
-from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
-from vehicle_agent.driving.positions import Places
-from vehicle_agent.group_costs import GroupCosts
-from vehicle_agent.known_zones import ZonesAround
-from vehicle_agent.placement import entry_cells, spawn_cells
+from vehicle_agent.agent import AgentAction, AskRoutes
+from vehicle_agent.assemble import assemble
+from vehicle_agent.assignment import AskCosts
+from vehicle_agent.driving.driven_vehicle import Follow, Places
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.reports import ChasersReport, FleetReport
-from vehicle_agent.right_of_way_sync import RightOfWaySync
-from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
-from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
-from vehicle_agent.spawning import Entering
-from vehicle_agent.target_bodies import TargetBodies
 
 log = logging.getLogger(__name__)
 
 _LONGEST_AGE_NS = 10 * NS_PER_S
+"""An older report was stamped by a clock that does not agree with ours: no delay is measured by it."""
 _GAUGES = [
     *((int(state), f"vehicles_{state.name.lower()}") for state in VehicleState),
     (int(VehicleState.STRANDED), "stranded"),
     (int(VehicleState.LOST), "lost"),
 ]
 """State of a vehicle -> the gauge that counts vehicles in it."""
-_LEAD_CELLS = 24
-"""Marks are followed so far ahead of the vehicles at least."""
+_COUNTED_FROM_0 = ("reroute_requests", "routes_received", "marks", "blocked_ticks")
+
+M = TypeVar("M", bound=Message)
 
 
 class AgentService:
     """Drives the vehicles of one agent, marks what they find, and publishes where they are.
+
+    agent      the core
+    when_over  called once all vehicles of an added agent have left
 
     Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
     """
@@ -101,247 +89,154 @@ class AgentService:
         post: Post,
         store: PromiseStore,
     ) -> None:
-        scenario = setup.scenario
-        plan = _plan_of(setup) if setup.added is None else setup.added.plan
-        grid = terrain.grid
-        self._class = plan.group.vehicle_class
-        grounds = class_grounds(scenario, terrain, truth, load_homes(setup, terrain, truth))
-        common, own, as_class = grounds[GROUND], grounds[self._class], of_class(scenario, self._class)
-        spawns = spawn_cells(scenario, grid, grounds)
-        self._member = Member(setup.info(grid, terrain.digest), bus, post, setup.before)
+        self._bus, self._post, self._setup = bus, post, setup
+        self._parts = parts = assemble(setup, terrain, truth, bus, post, store, self._warn)
+        self.agent, self._member, self._replica, self._sync = parts.agent, parts.member, parts.replica, parts.sync
+        self._maps, self._right_of_way, self._detector = parts.maps, parts.right_of_way, parts.detector
+        self._author, self._class = parts.author, self.agent.plan.group.vehicle_class
         self.counters = self._member.counters
-        for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):
+        for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
-        self._bus = bus
-        self._post = post
-        self._setup = setup
-        self._maps = AgentMaps(
-            common,
-            own,
-            learning=scenario.map.learning,
-            class_number=class_numbers(scenario).get(self._class, 0),
-        )
-        group = plan.group.name
-        self._author = author_of(group, setup.author)
-        self._replica = MapReplica(
-            grid,
-            self._maps.sink,
-            author=self._author,
-            group=group,
-            filter=MarkFilter(grid, readable_groups(scenario, group)),
-        )
-        near = scenario.map.interest == "near"
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
-        self._faults: list[str] = []
-        """What plug-ins did wrong and nobody has been told yet."""
-        world = SensorWorld(grid, truth, as_class.vehicles.sense_range_m, setup.id, scenario.seed)
-        sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), world, self._faults.append)
-        self._target_bodies = TargetBodies(scenario, grid)
-        self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
-        self._detector = TargetDetector(
-            grid,
-            self._author,
-            group,
-            as_class.vehicles.sense_range_m,
-        )
-        self._flies = flies(scenario, self._class)
-        layer_of = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
-        around = {agent: cells for agent, cells in spawns.items() if layer_of[agent] is self._flies}
-        self._right_of_way = RightOfWaySync(
-            setup,
-            grid,
-            around,
-            store,
-            bus,
-            post,
-            self._place,
-            self._warn,
-            plan.vehicle_ids,
-            int(self._flies),
-            spawns.keys() - around.keys(),
-        )
-        bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
-        targets = plan.group.targets or tuple(scenario.target_ids)
-        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed, plan.group.pursuers)
-        named = named_plugin(scenario, assignment_key(scenario, group))
-        assigner = assigner_of(named, assigned, self._faults.append)
-        self._group_costs = GroupCosts(self._author, group, setup.id) if shares_costs(assigner) else None
-        driven = DynamicsWorld(setup.id, grid, scenario.seed)
-        dynamics = own_dynamics(class_named(scenario, self._class), driven) or dynamics_of(
-            named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append
-        )
-        self._agent = Agent(
-            plan,
-            as_class,
-            self._maps.local,
-            sensor,
-            self._right_of_way.core.holdings,
-            bodies,
-            assigner,
-            dynamics,
-            self._group_costs,
-        )
-        lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
-        # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
-        reach_m = max(scenario.map.interest_m, 2 * as_class.vehicles.sense_range_m)
-        self._zones = ZonesAround(self._replica, self._maps)
         self._obedience = OrderClient(setup, bus, post, self._obeys)
-        self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
         self.when_over: Callable[[], None] | None = None
-        """Called once all vehicles of an added agent have left."""
         self._removed: set[str] = set()
         """Vehicles that an operator has let leave."""
-        self._entering: Entering | None = None
-        if setup.added is not None:
-            cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
-            self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings, self._agent.is_open)
-        self._fleet = FleetReport(self._author, group, self._class)
-        self._chasers = ChasersReport(self._author, self._class)
         self._member.needs("the shared map", lambda: self._sync.joined)
         self._member.needs("the orders of this run", lambda: self._obedience.known)
         self._member.needs("places for its vehicles", lambda: self._has_places)
 
     @property
-    def agent(self) -> Agent:
-        return self._agent
-
-    @property
     def over(self) -> bool:
-        """Whether all vehicles of an agent that was added have left."""
-        return self._entering is not None and self._entering.over and self._agent.holdings.gone
+        """True if all vehicles of an agent that was added have left."""
+        spawning = self._parts.spawning
+        return spawning is not None and spawning.over and self.agent.holdings.gone
 
     @property
     def _has_places(self) -> bool:
-        """Whether all vehicles stand somewhere that have not left. Those that are added enter as there is space."""
-        if self._entering is not None:
+        """True if all vehicles stand somewhere that have not left. Those that are added enter as there is space."""
+        if self._parts.spawning is not None:
             return self._right_of_way.core.informed
-        return len(self._agent.vehicles.keys() | self._removed) == len(self._agent.plan.vehicle_ids)
+        return len(self.agent.vehicles.keys() | self._removed) == len(self.agent.plan.vehicle_ids)
 
     def lacks(self) -> list[str]:
         return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
-        self._bus.watch_alive(self._post, role="planner")
+        bus, post, id = self._bus, self._post, self._setup.id
+        bus.watch_alive(post, role="planner")
         self._right_of_way.start(now_ns)  # whoever sees our token asks at once what we know
         self._member.join()
         self._sync.start(now_ns)
         self._obedience.start(now_ns)
-        self._bus.collect(POSE)
-        if not self._flies:  # bodies are on the ground
-            self._bus.collect(BODY)
-        self._agent.bodies.listen_anew(now_ns)
-        if self._untracked.targets:
-            self._bus.collect(TRUE_POSE)
-            for target in sorted(self._untracked.targets):
-                self._bus.subscribe(SIGHTED, self._post, target=target)
-        self._bus.collect(PUSHED_ROUTE, agent=self._setup.id)
-        if self._group_costs is not None:
-            self._bus.collect(SHARED_COSTS, group=self._agent.plan.group.name)
-        self._bus.serve(LEAVE, self._post, agent=self._setup.id)
+        bus.collect(POSE)
+        if not self._parts.flies:  # bodies are on the ground
+            bus.collect(BODY)
+        self.agent.bodies.listen_anew(now_ns)
+        if untracked := self._parts.untracked.targets:
+            bus.collect(TRUE_POSE)
+            for target in sorted(untracked):
+                bus.subscribe(SIGHTED, post, target=target)
+        bus.collect(PUSHED_ROUTE, agent=id)
+        if self._parts.costs is not None:
+            bus.collect(SHARED_COSTS, group=self.agent.plan.group.name)
+        bus.serve(LEAVE, post, agent=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, LinkChanged) and event.up:
-            self._agent.bodies.listen_anew(now_ns)
+            self.agent.bodies.listen_anew(now_ns)
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
-        agent = self._agent
         match event:
             case Asked(topic=topic, request=RemoveVehicles() as request) if topic is LEAVE:
-                event.answer(self._remove(request.vehicles), agent=self._setup.id)
+                event.answer(self._on_leave(request.vehicles), agent=self._setup.id)
                 event.end()
             case Heard(message=Sighted() as sighted):
-                self._hear_sighted(sighted, now_ns)
-            case Replied(tag=tag, message=RouteReply() as reply, took_s=took_s):
-                self.counters.observe("route_query_ms", took_s * 1e3)
-                self.counters.count("routes_received", len(reply.routes))
-                self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
+                self._on_sighted(sighted, now_ns)
+            case Replied(message=RouteReply() as reply):
+                self._on_routes(event, reply, now_ns)
             case Replied(tag=tag, message=CostReply() as reply):
-                costs_s = column(reply.cost_to_go_s, "<f4")
-                if reply.target_cell is not None or np.isfinite(costs_s).any():  # never seen, and searched for
-                    agent.costs_given(_number(tag), reply.target, costs_s)
+                self._on_costs(_number(tag), reply)
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
-                agent.routes_ended(_number(tag), now_ns)
+                self.agent.routes_ended(_number(tag), now_ns)
             case AskEnded(tag=tag, topic=topic) if topic is COST:
-                told = agent.costs_ended(_number(tag), now_ns)
-                if told is not None:
-                    self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
-            case Appeared(peer):
-                self._roster.appeared(peer)
-                if peer.role == "planner":
-                    self._detector.retell(job_of(peer.id), now_ns)
-                agent.set_planners(self._planners(), now_ns)
-            case Disappeared(peer):
-                self._roster.gone(peer)
-                agent.set_planners(self._planners(), now_ns)
+                self._on_costs_ended(_number(tag), now_ns)
+            case Appeared() | Disappeared():
+                self._on_planner(event, now_ns)
             case _:
                 pass
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = now_ns
-        self._agent.bodies.tick(now_ns)
-        for heard in (*self._bus.collected(POSE), *self._bus.collected(TRUE_POSE)):
-            self._hear_pose(heard, now_ns)
+        agent, parts = self.agent, self._parts
+        agent.bodies.tick(now_ns)
+        for pose in self._collected(POSE, TargetPose):
+            self._on_pose(pose, now_ns)
+        for pose in self._collected(TRUE_POSE, TargetPose):
+            self._detector.set_truth(pose, now_ns)
         self._member.tick(now_ns)
         self._sync.tick(now_ns)
-        agent = self._agent
-        self._hear_pushed(now_ns)
-        if self._group_costs is not None:
-            for heard in self._bus.collected(SHARED_COSTS):
-                assert isinstance(heard.message, SharedCosts)
-                agent.hear_costs(heard.message, now_ns)
-        self._right_of_way.hear_granted(now_ns)
-        if self._entering is not None:
-            self._entering.tick(self._right_of_way.core.informed, now_ns)
+        for pushed in self._collected(PUSHED_ROUTE, PushedRoute):
+            self.counters.count("routes_pushed")
+            self._publish_followed(agent.route_pushed(pushed, now_ns))
+        if parts.costs is not None:
+            for told in self._collected(SHARED_COSTS, SharedCosts):
+                parts.costs.hear(told, now_ns)
+        for placed in self._right_of_way.take_granted(now_ns):
+            self._place(placed)
+        if parts.spawning is not None:
+            parts.spawning.tick(self._right_of_way.core.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         places = agent.places
-        self._zones.update(places, now_ns, agent.bodies.standing | agent.seen_lethal)
-        agent.set_ways_out(self._zones.ways_out)
+        parts.zones.update(places, now_ns, agent.bodies.standing | agent.seen_lethal)
+        agent.set_ways_out(parts.zones.ways_out)
         self._obey(now_ns)
         agent.map_changed(self._maps.take_dirty(), now_ns, look=True)
         if places:
-            self._sync.enter(self._near_marks.update(places))
-        self._hear_bodies(now_ns)
-        agent.begin_drive(now_ns)
-        while (found := agent.drive()) is not None:
-            if len(findings := self._zones.without(found)):
-                self.counters.count("marks", len(findings))
-                self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
-                agent.map_changed(self._maps.take_dirty(), now_ns)
-        learning = self._maps.learning
-        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
-            self._sync.publish(self._replica.write_learned(said, now_ns))
+            self._sync.enter(parts.near_marks.update(places))
+        self._take_bodies(now_ns)
+        self._drive(now_ns)
         columns = Places(self._replica.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
-        for region, fleet in self._fleet.reports(columns, now_ns):
+        for region, fleet in parts.fleet.reports(columns, now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
         paths = agent.holdings.paths
         chasing = [(id, vehicle.target, paths[id]) for id, vehicle in agent.vehicles.items()]
-        for chasers in self._chasers.reports(chasing, now_ns):
+        for chasers in parts.chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
-        self._member.tell_faults(self._faults, now_ns)
-        self._gauge()
+        self._member.tell_faults(parts.faults, now_ns)
+        states = bytes([vehicle.state for vehicle in agent.vehicles.values()])
+        for state, name in _GAUGES:
+            self.counters.gauge(name, float(states.count(state)))
         if self.over and self.when_over is not None:
             self.when_over()
 
     def stop(self, now_ns: int) -> None:
-        if self._entering is not None:
-            self._remove([])  # whoever ends this process takes its vehicles away; one that is killed leaves them
-            self._right_of_way.tick(self._agent.wishes, now_ns)
+        if self._parts.spawning is not None:
+            self._on_leave([])  # whoever ends this process takes its vehicles away; one that is killed leaves them
+            self._right_of_way.tick(self.agent.wishes, now_ns)
         self._member.publish_stats(now_ns)
+
+    def _collected(self, topic: Topic, kind: type[M]) -> Iterator[M]:
+        """What the bus has kept on a topic since the last tick."""
+        for heard in self._bus.collected(topic):
+            assert isinstance(heard.message, kind)
+            yield heard.message
+
+    # --- orders and places ----------------------------------------------------------------------------------
 
     def _obey(self, now_ns: int) -> None:
         """Go by what is ordered."""
-        orders, agent = self._obedience, self._agent
+        orders, agent = self._obedience, self.agent
         agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
         if self._obeyed_version != orders.book.version:
             self._obeyed_version = orders.book.version
@@ -358,27 +253,26 @@ class AgentService:
             return self._obeyed_version == self._obedience.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns)
 
-    # --- places ---------------------------------------------------------------------------------------------
-
     def _place(self, vehicles: Sequence[str]) -> None:
-        if self._entering is not None:
-            holdings, may_stand = self._agent.holdings, self._entering.may_stand
+        """These have found their places."""
+        if self._parts.spawning is not None:
+            holdings, may_stand = self.agent.holdings, self._parts.spawning.may_stand
             closed = [id for id in vehicles if not may_stand(id, holdings.path(id)[0])]
-            self._agent.remove(closed)
+            self.agent.remove(closed)
             vehicles = [id for id in vehicles if id not in closed]
         if vehicles:
-            self._agent.place(vehicles)
-            log.info("%d vehicles have their places", len(self._agent.vehicles))
+            self.agent.place(vehicles)
+            log.info("%d vehicles have their places", len(self.agent.vehicles))
 
-    def _remove(self, asked: Sequence[str]) -> Removed:
+    def _on_leave(self, asked: Sequence[str]) -> Removed:
         """Let vehicles leave, all if none is named; of those that have left already say how far it is."""
-        ours = self._agent.plan.vehicle_ids
+        ours = self.agent.plan.vehicle_ids
         left = [id for id in ours if id in asked or not asked]
-        self._agent.remove([id for id in left if id not in self._removed])
+        self.agent.remove([id for id in left if id not in self._removed])
         self._removed.update(left)
-        if self._entering is not None:
-            self._entering.remove(left)
-        held = sum(self._agent.holdings.is_granted(id) for id in left)
+        if self._parts.spawning is not None:
+            self._parts.spawning.remove(left)
+        held = sum(self.agent.holdings.is_granted(id) for id in left)
         unknown = sorted(set(asked).difference(ours))
         return Removed(agent=self._setup.id, left=left, unknown=unknown, held=held)
 
@@ -387,74 +281,102 @@ class AgentService:
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
-        self._agent.stand_down()
+        self.agent.stand_down()
         text = f"agent {self._setup.id} runs elsewhere, too, and that one is younger: this one drives no more"
         log.warning(text)
         self._member.note(now_ns, "replaced", text)
 
-    # --- targets in sight -----------------------------------------------------------------------------------
+    # --- targets and bodies ---------------------------------------------------------------------------------
+
+    def _on_pose(self, pose: TargetPose, now_ns: int) -> None:
+        """A tracker says where its target is."""
+        if pose.target in self._parts.untracked.targets:
+            return
+        counts = self.agent.hear_pose(pose, now_ns)
+        if counts is not None:  # for the simulated sensor of targets it is the truth
+            self._detector.set_truth(counts, now_ns)
+            self._take_target_bodies(counts, now_ns)
+
+    def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
+        """A vehicle, of ours or of others, has seen a target."""
+        self._detector.hear(sighted)
+        pose = self._parts.untracked.hear(sighted, now_ns)
+        if pose is not None:
+            self.agent.see_target(pose, now_ns)
+            self._take_target_bodies(pose, now_ns)
 
     def _tell_sighted(self, places: Places, now_ns: int) -> None:
-        self._untracked.expire(now_ns)
-        self._detector.lose(self._agent.lost(now_ns) - self._untracked.targets)
-        for sighted in self._detector.look(places, now_ns):
-            self.counters.count("targets_sighted")
+        untracked = self._parts.untracked
+        untracked.expire(now_ns)
+        self._detector.lose(self.agent.lost(now_ns) - untracked.targets)
+        seen = self._detector.look(places, now_ns)
+        if seen:
+            self.counters.count("targets_sighted", len(seen))
+        for sighted in (*seen, *self._detector.retold(now_ns)):
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
-            self._hear_sighted(sighted, now_ns)
-        for sighted in self._detector.retold(now_ns):
-            self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
+        for sighted in seen:
+            self._on_sighted(sighted, now_ns)
 
-    def _hear_pose(self, heard: Heard, now_ns: int) -> None:
-        pose = heard.message
-        assert isinstance(pose, TargetPose)
-        if heard.topic is TRUE_POSE:
-            self._detector.set_truth(pose, now_ns)
-        elif pose.target not in self._untracked.targets:
-            counts = self._agent.hear_pose(pose, now_ns)
-            if counts is not None:  # for the simulated sensor of targets it is the truth
-                self._detector.set_truth(counts, now_ns)
-                self._hear_target_bodies(counts, now_ns)
+    def _take_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
+        for body in () if self._parts.flies else self._parts.target_bodies.bodies_of(pose, now_ns):
+            self.agent.bodies.hear(body, now_ns)
 
-    def _hear_pushed(self, now_ns: int) -> None:
-        for heard in self._bus.collected(PUSHED_ROUTE):
-            assert isinstance(heard.message, PushedRoute)
-            self.counters.count("routes_pushed")
-            self._publish_followed(self._agent.route_pushed(heard.message, now_ns))
-
-    def _hear_bodies(self, now_ns: int) -> None:
-        bodies = self._agent.bodies
-        for heard in self._bus.collected(BODY):
-            assert isinstance(heard.message, Body)
-            bodies.hear(heard.message, now_ns)
-            age_ns = now_ns - heard.message.stamp_ns
+    def _take_bodies(self, now_ns: int) -> None:
+        bodies = self.agent.bodies
+        for body in self._collected(BODY, Body):
+            bodies.hear(body, now_ns)
+            age_ns = now_ns - body.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
                 self.counters.observe("body_ms", age_ns / 1e6)
-        self._agent.bodies_moved()
+        self.agent.bodies_moved()
         self.counters.counts["bodies_refused"] = bodies.refused
-        self.counters.counts["detours"] = self._agent.detours.found
+        self.counters.counts["detours"] = self.agent.detours.found
         for text in bodies.complaints:
             self._warn("body", text)
         bodies.complaints.clear()
 
-    def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
-        self._detector.hear(sighted)
-        pose = self._untracked.hear(sighted, now_ns)
-        if pose is not None:
-            self._agent.see_target(pose, now_ns)
-            self._hear_target_bodies(pose, now_ns)
+    # --- driving and planners -------------------------------------------------------------------------------
 
-    def _hear_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
-        for body in () if self._flies else self._target_bodies.bodies_of(pose, now_ns):
-            self._agent.bodies.hear(body, now_ns)
+    def _drive(self, now_ns: int) -> None:
+        """Drive cell by cell, and write what is found on each into the map before driving on."""
+        agent, learning = self.agent, self._maps.learning
+        agent.begin_drive(now_ns)
+        while (found := agent.drive()) is not None:
+            if len(findings := self._parts.zones.without(found)):
+                self.counters.count("marks", len(findings))
+                self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
+                agent.map_changed(self._maps.take_dirty(), now_ns)
+        if learning is not None and (said := learning.tick(agent.take_driven(), now_ns)):
+            self._sync.publish(self._replica.write_learned(said, now_ns))
 
-    def _planners(self) -> dict[str, int]:
-        """Target -> incarnation of its living planner, or of the first of its standbys that lives."""
+    def _on_planner(self, event: Appeared | Disappeared, now_ns: int) -> None:
+        """A planner has come or gone: each target has the planner of the best rank that lives."""
+        if isinstance(event, Appeared):
+            self._roster.appeared(event.peer)
+            if event.peer.role == "planner":
+                self._detector.retell(job_of(event.peer.id), now_ns)
+        else:
+            self._roster.gone(event.peer)
         alive = self._roster.alive("planner")
-        return {job_of(id): alive[id] for id in sorted(alive, reverse=True)}
+        self.agent.set_planners({job_of(id): alive[id] for id in sorted(alive, reverse=True)}, now_ns)
 
-    # --- doing what was decided -----------------------------------------------------------------------------
+    def _on_routes(self, replied: Replied, reply: RouteReply, now_ns: int) -> None:
+        self.counters.observe("route_query_ms", replied.took_s * 1e3)
+        self.counters.count("routes_received", len(reply.routes))
+        self._publish_followed(self.agent.routes_given(_number(replied.tag), reply, now_ns))
+
+    def _on_costs(self, request: int, reply: CostReply) -> None:
+        costs_s = column(reply.cost_to_go_s, "<f4")
+        if reply.target_cell is not None or np.isfinite(costs_s).any():  # never seen, and searched for
+            self.agent.assignment.costs_given(request, reply.target, costs_s)
+
+    def _on_costs_ended(self, request: int, now_ns: int) -> None:
+        told = self.agent.costs_ended(request, now_ns)
+        if told is not None:
+            self._bus.publish(SHARED_COSTS, told, group=told.group, author=told.author)
 
     def _perform(self, actions: list[AgentAction]) -> None:
+        """Ask planners what the core wants to know."""
         for action in actions:
             match action:
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
@@ -494,20 +416,6 @@ class AgentService:
                 legs=pack_column(route.legs, "<u4"),
             )
             self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
-
-    def _gauge(self) -> None:
-        states = bytes([vehicle.state for vehicle in self._agent.vehicles.values()])
-        for state, name in _GAUGES:
-            self.counters.gauge(name, float(states.count(state)))
-
-
-def _plan_of(setup: RoleSetup) -> AgentPlan:
-    plans = plan_agents(setup.scenario)
-    plan = next((plan for plan in plans if plan.id == setup.id), None)
-    if plan is None:
-        ids = ", ".join(plan.id for plan in plans[:20])
-        raise ConfigError(f"scenario {setup.scenario.name} has no agent {setup.id}; it has {ids}")
-    return plan
 
 
 def _number(tag: str) -> int:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.effort import few
 from support.traffic_world import TICK_NS, Faults, TrafficWorld
 
-from vehicle_agent.traffic.own_time import OwnTime
+from vehicle_agent.right_of_way_sync import OwnTime
 
 TICKS = 120
 

@@ -73,7 +73,7 @@ def test_a_planner_that_begins_anew_is_told_by_agents_where_its_target_was_last(
     agent = next(node.service for node in simulation.nodes.values() if isinstance(node.service, AgentService))
     now_ns = simulation.scheduler.clock.now_ns()
     seen = Sighted(
-        author=agent._author, group=agent._agent.plan.group.name, target="h", seq=1,
+        author=agent._author, group=agent.agent.plan.group.name, target="h", seq=1,
         stamp_ns=now_ns - 40 * NS_PER_S, until_ns=now_ns - 10 * NS_PER_S,
         cell=1234, x_m=0.0, y_m=0.0, uncertainty_m=1.0,
     )  # fmt: skip

@@ -23,7 +23,7 @@ from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Granted, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
-from vehicle_agent.traffic.cell_requests import Wishes
+from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.grants import Grants
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.warden import SILENT_NS, Warden, _is_entering, _turn
@@ -69,9 +69,9 @@ WORLDS = pytest.mark.parametrize(
 @WORLDS
 def test_in_every_tick_wishes_and_stands_are_as_if_made_anew(name, seed, monkeypatch):
     compared, kept_wishes = 0, 0
-    make = Wishes.make
+    make = CellRequests.make
 
-    def make_twice(wishes: Wishes, vehicles: list[Vehicle], now_ns: int) -> None:
+    def make_twice(wishes: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
         nonlocal compared, kept_wishes
         before = dict(wishes._made_of)
         make(wishes, vehicles, now_ns)
@@ -93,7 +93,7 @@ def test_in_every_tick_wishes_and_stands_are_as_if_made_anew(name, seed, monkeyp
             kept = {plot: [*stands.items()] for plot, stands in agent.holdings._stands.items() if stands}
             assert kept == by_plot
 
-    monkeypatch.setattr(Wishes, "make", make_twice)
+    monkeypatch.setattr(CellRequests, "make", make_twice)
     simulation = simulation_of(name, seed)
     simulation.after_tick.append(compare_stands)
     simulation.run_until(SECONDS)
@@ -175,9 +175,9 @@ def test_wardens_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name,
 
 
 def keep_nothing(patch: pytest.MonkeyPatch) -> None:
-    make, standings = Wishes.make, Holdings.standings
+    make, standings = CellRequests.make, Holdings.standings
 
-    def make_all(wishes: Wishes, *args: Any) -> None:
+    def make_all(wishes: CellRequests, *args: Any) -> None:
         wishes.make_anew()
         make(wishes, *args)
 
@@ -186,7 +186,7 @@ def keep_nothing(patch: pytest.MonkeyPatch) -> None:
         holdings._say_all_again()
         return standings(holdings, *args)
 
-    patch.setattr(Wishes, "make", make_all)
+    patch.setattr(CellRequests, "make", make_all)
     patch.setattr(Holdings, "standings", say_all)
 
 

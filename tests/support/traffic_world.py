@@ -16,8 +16,8 @@ from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Stored, Table
+from vehicle_agent.right_of_way_sync import OwnTime
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.own_time import OwnTime
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 MS = NS_PER_S // 1000

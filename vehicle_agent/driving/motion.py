@@ -28,21 +28,6 @@ class Motion:
     heading_rad  clockwise from north
     """
 
-    __slots__ = (
-        "_at",
-        "_grid",
-        "_to",
-        "_via",
-        "at_rest",
-        "border_m",
-        "cell",
-        "done_m",
-        "head",
-        "heading_rad",
-        "length_m",
-        "tail",
-    )
-
     def __init__(self, grid: GridSpec, cell: int) -> None:
         self._grid = grid
         self.heading_rad = 0.0

@@ -8,6 +8,8 @@ from itertools import pairwise
 
 from swarm.grid import bounds_of
 
+_NOWHERE = (9, 9, 0, 0)
+"""A rectangle that holds nothing, nor does the one that is a cell wider on each side."""
 _SKIPPED_CELLS = 24
 """A vehicle that others push may come back to its route so far on."""
 _LEAST_PART = 1e-9
@@ -21,8 +23,6 @@ class Follower:
     changes  how often it has been another route: begun, dropped or cut
     version  how often it, or how far along it the vehicle is, has changed
     """
-
-    __slots__ = ("_at", "_bounds", "_cells", "_turn_cells", "_turns", "changes", "left", "partial", "version")
 
     def __init__(self) -> None:
         self._cells: list[int] = []
@@ -64,9 +64,9 @@ class Follower:
 
     def bounds(self, cols: int) -> tuple[int, int, int, int]:
         """The smallest (row, col) and the greatest of all its cells in a grid of so many columns; of no cells a
-        rectangle that holds nothing."""
+        rectangle that holds nothing. Kept, as a route changes seldom and the map all the time."""
         if self._bounds is None:
-            self._bounds = bounds_of(self._cells, cols) if self._cells else (1, 1, 0, 0)
+            self._bounds = bounds_of(self._cells, cols) if self._cells else _NOWHERE
         return self._bounds
 
     def moved(self, cell: int) -> None:

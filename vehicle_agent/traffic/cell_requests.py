@@ -2,7 +2,7 @@
 
 `Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, bodies, and what others hold)
 and of nothing else, so a wish that is kept is the one that would be made anew. What it is made of is found out in
-one place, `Wishes.make`: arguments are compared, and each kind of cell tells in which places it has changed.
+one place, `CellRequests.make`: arguments are compared, and each kind of cell tells in which places it has changed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from swarm.right_of_way.holdings import Holdings, Wish
 from vehicle_agent.agent_maps import meet
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.traffic.grants import cells_beside
 from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S
@@ -29,7 +30,7 @@ _MS = NS_PER_S // 1000
 _STAYS = Wish()
 
 
-class Wishes:
+class CellRequests:
     """Makes and keeps the wishes of vehicles.
 
     near_cells   how far from a vehicle the ground may lie on which its wish depends
@@ -71,11 +72,10 @@ class Wishes:
         """The cells that vehicles held when wishes were made."""
         self._since_ns: dict[str, int] = {}
         """Vehicle -> since when it has been on its way."""
-        self._phases_ns: dict[str, int] = {}
 
     def forget(self, vehicle: str) -> None:
         """It is not driven any more."""
-        for known in (self.of, self._made_of, self._beside, self._since_ns, self._phases_ns):
+        for known in (self.of, self._made_of, self._beside, self._since_ns):
             known.pop(vehicle, None)
 
     def ground_changed(self, windows: Iterable[Window]) -> None:
@@ -100,7 +100,7 @@ class Wishes:
         self._held = held
         self._forget_near(vehicles)
         ways_out, known, beside = steering.ways_out, self._made_of, self._beside
-        paths, pushed, phases_ns, since_all_ns = holdings.paths, holdings.pushed, self._phases_ns, self._since_ns
+        paths, pushed, since_all_ns = holdings.paths, holdings.pushed, self._since_ns
         for vehicle in vehicles:
             id, target, near = vehicle.id, vehicle.target, vehicle.in_reach
             path = paths[id]
@@ -114,9 +114,7 @@ class Wishes:
                 continue
             idle = (near or target is None) and path[0] not in ways_out
             turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
-            phase_ns = phases_ns.get(id)
-            if phase_ns is None:
-                phase_ns = phases_ns[id] = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
+            phase_ns = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
             turn = (now_ns + phase_ns) // turn_ns
             since_ns = None
             if not idle:
@@ -127,7 +125,7 @@ class Wishes:
             known[id] = made_of, began_ns, began_ns + turn_ns
             lot = 0
             if still:
-                beside[id] = self._around(path[0])
+                beside[id] = cells_beside(path[0], self._cols)
                 lot = crc32(f"{self._seed}/{id}/{turn}".encode())
             age_ms = 0 if since_ns is None else max(began_ns - since_ns, 0) // _MS
             wish = steering.wish(vehicle, path, pushed_ms, age_ms, held, self._in_reach, lot)
@@ -145,8 +143,3 @@ class Wishes:
         places = np.stack((row - near, col - near, row + near, col + near), 1)
         for index in np.flatnonzero(meet(places, changed)).tolist():
             self._made_of.pop(vehicles[index].id, None)
-
-    def _around(self, cell: int) -> frozenset[int]:
-        """The cells beside a cell; at a border of the grid also some that are far away, which does no harm."""
-        north, south = cell - self._cols, cell + self._cols
-        return frozenset((north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1))

@@ -18,7 +18,7 @@ from swarm.config.agents import agent_of
 from swarm.right_of_way.incarnations import BEAT_NS, is_far_ahead
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted, Shut, Stamp, Stand, Standing, Table
-from vehicle_agent.traffic.grants import Grants
+from vehicle_agent.traffic.grants import Grants, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
@@ -34,7 +34,6 @@ MOST_CELLS_OF_GUEST = 1024
 """Cells of one plot that one guest holds."""
 MOST_CELLS_OF_GUESTS = 1 << 14
 """Cells of one plot that all guests together hold: a quarter of one as large as a region."""
-_MOST_BESIDE = 1 << 12
 _NO_CELLS: Sequence[int] = []
 _NO_GRANTS: Mapping[str, list[int]] = {}
 _MOST_CELLS = 64
@@ -84,21 +83,6 @@ class _Host:
     told_ns: int = 0
 
 
-class _Beside(dict[int, frozenset[int]]):
-    """Cell -> the cells beside it in a grid of so many columns, of cells that were asked for lately."""
-
-    def __init__(self, cols: int) -> None:
-        self._cols = cols
-
-    def __missing__(self, cell: int) -> frozenset[int]:
-        if len(self) >= _MOST_BESIDE:
-            self.clear()
-        north, south = cell - self._cols, cell + self._cols
-        around = frozenset((north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1))
-        self[cell] = around
-        return around
-
-
 class Warden:
     """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
 
@@ -120,7 +104,6 @@ class Warden:
         self._grants = Grants(table.grants)
         self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
         self._hosts: dict[str, _Host] = {}
-        self._beside = _Beside(plots.grid.cols)
         self._pushed: dict[str, int] = {}
         self._before: dict[str, Sequence[int]] = {}
         """Vehicle -> what it was granted before the plan that is being made has granted it more."""
@@ -291,7 +274,7 @@ class Warden:
         current = table is self._told and not (self._granted or self._changed)
         grants_of = self._grants if current else Grants(table.grants)
         shut = {cell for shut in table.shut for cell in shut.cells}
-        held = shut.union(*grants_of.cells.values())
+        held, cols = shut.union(*grants_of.cells.values()), self._plots.grid.cols
         for name, host in self._hosts.items():
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
@@ -300,7 +283,7 @@ class Warden:
             # Also around those under way: what they want once they come to rest depends on who is there.
             stands = () if host.standing is None else host.standing.vehicles
             others = held.difference(grants_of.cells.get(name, ())) | shut
-            near = [around for stand in stands if not others.isdisjoint(around := self._beside[stand.end])]
+            near = [around for stand in stands if not others.isdisjoint(around := cells_beside(stand.end, cols))]
             occupied = sorted(others.intersection(chain.from_iterable(near)))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             says = (life, grants, pushed, occupied, 0 if stands else heard)

@@ -328,7 +328,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
         grant(tick + 2, [*holdings.path("a0-00"), *(wish.ahead or wish.wants[: wish.better][:1])])
         for asked in asks:
             if isinstance(asked, AskCosts):
-                agent.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))
+                agent.assignment.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))
                 agent.costs_ended(asked.request, now_ns)
             elif isinstance(asked, AskRoutes):
                 routes = tree.routes(asked.cells)

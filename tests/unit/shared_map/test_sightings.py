@@ -18,8 +18,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
-from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.driving.positions import Places
+from vehicle_agent.driving.driven_vehicle import Places, Vehicle
 from vehicle_agent.sensing.target_detector import TargetDetector
 
 GRID = GridSpec(40, 40, 10.0, west_m=1000.0, north_m=5000.0)

@@ -28,8 +28,7 @@ from swarm.wire.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
-from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.driving.positions import Places
+from vehicle_agent.driving.driven_vehicle import Places, Vehicle
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.reports import FleetReport
 from vehicle_agent.sensing.sensor import TruthSensor
@@ -82,7 +81,7 @@ def pose(target: str, row: int, col: int, seq: int = 1, jumps: int = 0) -> Targe
 
 def answer_costs(agent: Agent, asked: AskCosts, now_ns: int, **costs_s: list[float]) -> None:
     for target, values in costs_s.items():
-        agent.costs_given(asked.request, target, np.array(values, np.float32))
+        agent.assignment.costs_given(asked.request, target, np.array(values, np.float32))
     agent.costs_ended(asked.request, now_ns)
 
 
@@ -148,8 +147,8 @@ def test_a_reply_too_short_for_its_request_makes_the_rest_ask_again(agent: Agent
 def test_costs_of_the_wrong_length_or_request_are_nobodys(agent: Agent) -> None:
     (asked,) = agent.decide(0)
     assert isinstance(asked, AskCosts)
-    agent.costs_given(asked.request, "t0", np.array([1.0], np.float32))
-    agent.costs_given(asked.request + 7, "t0", np.array([1.0, 1.0], np.float32))
+    agent.assignment.costs_given(asked.request, "t0", np.array([1.0], np.float32))
+    agent.assignment.costs_given(asked.request + 7, "t0", np.array([1.0, 1.0], np.float32))
     agent.costs_ended(asked.request, 0)
     assert {vehicle.target for vehicle in agent.vehicles.values()} == {None}
 

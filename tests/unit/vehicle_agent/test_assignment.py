@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.plugins.find import Plugin
-from vehicle_agent.assignment import AssignmentWorld, CostTable, assigner_of
-from vehicle_agent.matching import HYSTERESIS, spread
+from vehicle_agent.assigners import HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
 
 
 @st.composite

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from vehicle_agent.assignment import Assignment, Spread
+from vehicle_agent.assigners import Spread
+from vehicle_agent.assignment import Assignment
 from vehicle_agent.driving.driven_vehicle import Vehicle
 
 PERIOD_S, SOON_S, TICK_S = 5.0, 0.5, 0.1

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import directions_of
 from vehicle_agent.driving.motion import Motion
-from vehicle_agent.driving.route_bounds import RouteBounds
 from vehicle_agent.driving.route_follower import Follower
 
 GRID = GridSpec(10, 10, 10.0)
@@ -77,23 +76,21 @@ def test_directions_from_the_network_become_cells_and_back_or_nothing(cols: int,
         assert directions_of(cells, cols) == directions_of(np.array(cells), cols) == codes
 
 
-@given(st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(0, 99), max_size=4)), max_size=20))
-def test_bounds_of_many_routes_are_those_of_each_whatever_has_changed(changes: list[tuple[int, list[int]]]) -> None:
-    routes, columns = [Follower() for _ in range(3)], RouteBounds(GRID.cols, 2)
-    for which, cells in changes:
-        if which == len(routes):
-            routes.append(Follower())  # a vehicle is placed, or leaves
-        elif cells:
-            assert routes[which].begin(cells, cells)
+@given(st.lists(st.lists(st.integers(0, 99), max_size=4), max_size=20))
+def test_bounds_of_a_route_are_those_of_its_cells_whatever_has_changed(routes: list[list[int]]) -> None:
+    route = Follower()
+    for cells in routes:
+        if not cells:
+            route.drop()
         else:
-            routes[which].drop()
-        assert all(route.left == len(route.ahead()) for route in routes)
-        alone = [route.bounds(GRID.cols) for route in routes]
-        around = [(north - 2, west - 2, south + 2, east + 2) for north, west, south, east in alone]
-        expected = [
-            wide if route.near(1) else none for route, wide, none in zip(routes, around, alone, strict=True)
-        ]
-        assert columns.bounds(routes).tolist() == [list(each) for each in expected]
+            assert route.begin(cells, cells)
+        assert route.left == len(route.ahead())
+        north, west, south, east = route.bounds(GRID.cols)
+        rows, cols = [cell // GRID.cols for cell in cells], [cell % GRID.cols for cell in cells]
+        if cells:
+            assert (north, west, south, east) == (min(rows), min(cols), max(rows), max(cols))
+        else:
+            assert north - 1 > south + 1  # nothing is in it, nor in one that is a cell wider
 
 
 # --- motion -------------------------------------------------------------------------------------------------

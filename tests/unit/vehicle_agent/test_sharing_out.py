@@ -22,19 +22,19 @@ from swarm.plugins.find import Plugin
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import MOST_SHARED_TARGETS, NO_TARGET, SharedCosts
-from vehicle_agent.assignment import (
+from vehicle_agent.assigners import (
+    HYSTERESIS,
     Assigner,
-    Assignment,
     AssignmentWorld,
     Balanced,
     Cheapest,
     CostTable,
     assigner_of,
+    need_first,
     shares_costs,
 )
+from vehicle_agent.assignment import Assignment, GroupCosts
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.group_costs import GroupCosts
-from vehicle_agent.matching import HYSTERESIS, need_first
 
 Costs = NDArray[np.float64]
 Problem = tuple[Costs, list[int], int]
@@ -217,15 +217,14 @@ class Two:
             agent: {f"{agent}-{n:02d}": Vehicle(f"{agent}-{n:02d}", grid, n) for n in range(len(rows[0]))}
             for agent, rows in costs_s.items()
         }
+        self.costs = {agent: GroupCosts(f"all.{agent}.1", "all", agent) for agent in costs_s}
         self.agents = {
-            agent: Assignment(
-                self.targets, Balanced(pursuers), PERIOD_S, 0.5, GroupCosts(f"all.{agent}.1", "all", agent)
-            )
+            agent: Assignment(self.targets, Balanced(pursuers), PERIOD_S, 0.5, self.costs[agent])
             for agent in costs_s
         }
         self.requests = 0
 
-    def reassign(self, agent: str, now_ns: int, standing: tuple[str, ...] = (), deaf: bool = False) -> None:
+    def reassign(self, agent: str, now_ns: int, standing: tuple[str, ...] = ()) -> None:
         assignment, vehicles = self.agents[agent], self.vehicles[agent]
         self.requests += 1
         assignment.ask(self.requests, vehicles, now_ns)
@@ -234,9 +233,9 @@ class Two:
         alive = dict.fromkeys(self.targets, 1)
         told = assignment.costs_ended(self.requests, vehicles, alive, now_ns, (), standing)
         assert told is not None
-        for other, hears in self.agents.items():
-            if other != agent and not deaf:
-                hears.hear(decode(encode(told), SharedCosts), now_ns)
+        for other, costs in self.costs.items():
+            if other != agent:
+                costs.hear(decode(encode(told), SharedCosts), now_ns)
 
     def chased(self, agent: str) -> list[str | None]:
         return [vehicle.target for vehicle in self.vehicles[agent].values()]

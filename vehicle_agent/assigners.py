@@ -1,12 +1,21 @@
-"""Who chases what, from the costs of all: even shares, or need first, each target's pursuers by a matching of least
-total cost."""
+"""The assigners: which of an agent's vehicles goes for which target, from the costs of all.
+
+`spread` gives even shares, `cheapest` each vehicle its nearest, `balanced` each target its pursuers first, by a
+matching of least total cost; a plug-in may do otherwise. An assigner is a function of its table: it keeps nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from swarm.plugins.find import Plugin
+from swarm.plugins.guard import Guard, Nonsense, Tell
 
 Costs = NDArray[np.float64]
 
@@ -16,6 +25,154 @@ change of the map."""
 
 _LONGEST_S = 1e7
 """Longer ways count as so long, so that all sums in whole milliseconds are exact in float64."""
+
+
+@dataclass(frozen=True, slots=True)
+class AssignmentWorld:
+    """What an assigner is made with.
+
+    agent    id of the agent whose vehicles it assigns
+    group    their group
+    targets  those that the group may chase at the start; operators add and remove some
+    seed     of the run
+    pursuers how many vehicles of the group each target shall get first
+    """
+
+    agent: str
+    group: str
+    targets: tuple[str, ...]
+    seed: int
+    pursuers: int = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CostTable:
+    """What each vehicle would need to each target.
+
+    targets   those whose planners have answered; where costs are shared, ascending, those that others told of too
+    vehicles  those that have a choice
+    costs_s   (targets, vehicles) float64, inf where there is no route
+    current   (vehicles,) index of the target of each now, -1 for none
+    others    where costs are shared: the same, of the vehicles of the group's other agents, as they told it last
+    """
+
+    targets: tuple[str, ...]
+    vehicles: tuple[str, ...]
+    costs_s: NDArray[np.float64]
+    current: tuple[int, ...]
+    others: CostTable | None = None
+
+
+class Assigner(Protocol):
+    """Says which vehicle of an agent goes for which target. A plug-in is made as
+    `Name(world: AssignmentWorld, options)`.
+
+    One that has an attribute `shares_costs`, and it is true, is told the costs of the whole group: its agents tell
+    each other theirs, once a period.
+    """
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        """(vehicles,) index of a target that the vehicle has a route to; -1 lets it keep its target, or take the
+        cheapest."""
+        ...
+
+
+class Spread:
+    """Even shares: see `spread`."""
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        return spread(table.costs_s, table.current)
+
+
+class Cheapest:
+    """Each vehicle the target that it reaches first, whatever the others do."""
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        return np.full(len(table.vehicles), -1, np.int64)
+
+
+class Balanced:
+    """First every target's pursuers out of the whole group, then even shares: see `need_first` and `spread`.
+
+    All agents solve one problem, which does not depend on who solves it or in which order words came, and each
+    takes what it says of its own vehicles. Where they hold different words, a target may have more pursuers for a
+    period.
+    """
+
+    shares_costs = True
+
+    def __init__(self, pursuers: int) -> None:
+        self._pursuers = pursuers
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        tables = [table] if table.others is None else [table, table.others]
+        ids = list(chain.from_iterable(each.vehicles for each in tables))
+        rows = sorted(range(len(table.targets)), key=table.targets.__getitem__)
+        columns = sorted(range(len(ids)), key=ids.__getitem__)
+        place = {row: n for n, row in enumerate(rows)} | {-1: -1}
+        costs_s = np.concatenate([each.costs_s for each in tables], 1)[np.ix_(rows, columns)]
+        now = list(chain.from_iterable(each.current for each in tables))
+        current = [place[now[n]] for n in columns]
+        shared = spread(costs_s, current, need_first(costs_s, current, self._pursuers))
+        chosen = np.full(len(ids), -1, np.int64)
+        chosen[columns] = [rows[each] if each >= 0 else -1 for each in shared.tolist()]
+        return chosen[: len(table.vehicles)]
+
+
+ASSIGNERS: Mapping[str, Callable[[AssignmentWorld], Assigner]] = {
+    "spread": lambda world: Spread(),
+    "cheapest": lambda world: Cheapest(),
+    "balanced": lambda world: Balanced(world.pursuers),
+}
+"""The built-in assigners."""
+
+
+def shares_costs(assigner: Assigner) -> bool:
+    """Whether the agents of a group tell each other their costs for it."""
+    return getattr(assigner, "shares_costs", False) is True
+
+
+def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
+    """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    if plugin.factory is None:
+        return ASSIGNERS[plugin.named.name](world)
+    return PluginAssigner(plugin.make(world), Guard(plugin, tell))
+
+
+class PluginAssigner:
+    """What a plug-in assigns; even shares once it has failed."""
+
+    def __init__(self, assigner: Assigner, guard: Guard) -> None:
+        self._assigner = assigner
+        self._guard = guard
+        self.shares_costs = shares_costs(assigner)
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        others = table.others and replace(table.others, costs_s=table.others.costs_s.copy())
+        told = replace(table, costs_s=table.costs_s.copy(), others=others)
+        return self._guard.ask(
+            lambda: self._assigner.assign(told),
+            lambda chosen: _checked(chosen, table.costs_s),
+            lambda: spread(table.costs_s, table.current),
+        )
+
+
+def _checked(chosen: object, costs_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    targets, vehicles = costs_s.shape
+    found = np.asarray(chosen)
+    if found.shape != (vehicles,) or found.dtype.kind not in "iu":
+        raise Nonsense(f"{found.dtype} {found.shape}, expected whole numbers, one for each of {vehicles} vehicles")
+    wrong = (found < -1) | (found >= targets)
+    if wrong.any():
+        raise Nonsense(f"target {found[wrong][0]}, expected -1 to {targets - 1}")
+    at = np.flatnonzero(found >= 0)
+    lost = at[~np.isfinite(costs_s[found[at].astype(np.intp), at])]
+    if lost.size:
+        raise Nonsense(f"target {found[lost[0]]} for vehicle {lost[0]}, which has no route to it")
+    return found.astype(np.int64)
+
+
+# --- even shares, and need first ---
 
 
 def spread(costs_s: Costs, current: Sequence[int], before: NDArray[np.int64] | None = None) -> NDArray[np.int64]:

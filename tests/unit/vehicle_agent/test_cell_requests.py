@@ -17,7 +17,7 @@ from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Body
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
-from vehicle_agent.traffic.cell_requests import Wishes
+from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.steering import Steering
 
 GRID = GridSpec(24, 24, 10.0, 0.0, 240.0)
@@ -26,7 +26,7 @@ RESERVE = 1
 
 
 class Held:
-    """What `Wishes` asks of a host's holdings."""
+    """What `CellRequests` asks of a host's holdings."""
 
     def __init__(self) -> None:
         self.paths: dict[str, list[int]] = {}
@@ -49,7 +49,7 @@ class Place:
         self.bodies.tick(self.now_ns)
         self.steering = Steering(GRID, self.pace, PlannerConfig(), RESERVE, self.bodies)
         self.target = GRID.cell(12, 12)
-        self.wishes = Wishes(
+        self.wishes = CellRequests(
             GRID,
             self.steering,
             self.held,  # type: ignore[arg-type]
@@ -168,7 +168,7 @@ def test_one_that_stands_or_leaves_leaves_nothing_behind():
     assert wishes.of[first.id] != Wish()
     for vehicle in place.vehicles:
         wishes.forget(vehicle.id)
-    assert not any((wishes.of, wishes._made_of, wishes._beside, wishes._since_ns, wishes._phases_ns))
+    assert not any((wishes.of, wishes._made_of, wishes._beside, wishes._since_ns))
     assert others
 
 

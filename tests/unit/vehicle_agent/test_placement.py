@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swarm.clock import NS_PER_S
-from vehicle_agent.spawning import Entering
+from vehicle_agent.placement import Spawning
 
 
 class Held:
@@ -21,9 +21,9 @@ class Held:
         self.asked.append((vehicle, cell))
 
 
-def entering(closed: set[int]) -> tuple[Entering, Held]:
+def entering(closed: set[int]) -> tuple[Spawning, Held]:
     held = Held()
-    made = Entering(["v"], [1, 2, 3], held, lambda cell: cell not in closed)  # type: ignore[arg-type]
+    made = Spawning(["v"], [1, 2, 3], held, lambda cell: cell not in closed)  # type: ignore[arg-type]
     made.tick(False, 0)
     return made, held
 
