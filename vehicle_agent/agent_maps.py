@@ -1,4 +1,8 @@
-"""The map of an agent, and which places a change of it concerns."""
+"""The maps of an agent, what its vehicles learn of the ground, and the zones of operators in them.
+
+What a vehicle finds is marked as for the class "ground", which any class can read; a vehicle drives by the map of its
+own class. What is found in a zone is no news, and a vehicle that stands in one drives out.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,6 @@ from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import MarkKind
-from vehicle_agent.sensing.sensor import Findings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +75,6 @@ def meet(boxes: NDArray[np.int64], windows: Sequence[Window]) -> NDArray[np.bool
     met &= row0 <= row1
     return met
 
-
-# The maps of an agent: that of the class "ground", for which marks speak, and that of its vehicles' own class.
 
 _OWN = "own"
 
@@ -132,9 +133,8 @@ class AgentMaps:
         return for_class(self.own.terrain, cells, *read, own_kinds, own_paces)
 
 
-# What an agent has learned while its vehicles drove, and when to say it.
-
 _EVERY_NS = 5 * NS_PER_S
+"""What is learned is told so often: kinds of ground do not change while a vehicle looks."""
 
 
 class Learning:
@@ -162,8 +162,6 @@ class Learning:
         self._told_version, self._due_ns = measured.version, now_ns + _EVERY_NS
         return measured.said
 
-
-# What zones of operators mean to an agent: what is found in them is no news, and who stands in one drives out.
 
 _AGAIN_NS = NS_PER_S
 """Ways out are looked for again so often while somebody needs one: what is around the zone changes, too."""
@@ -205,13 +203,10 @@ class ZonesAround:
             self._due_ns = now_ns + _AGAIN_NS
             self.ways_out = self._find_ways_out(shut)
 
-    def without(self, findings: Findings) -> Findings:
-        """Findings without those in zones: an operator's word stands, whatever a vehicle sees there. In a zone for
-        one class the others go by what is found."""
-        if not len(self._cells) or not len(findings):
-            return findings
-        free = ~np.isin(findings.cells, self._cells)
-        return Findings(findings.cells[free], findings.kinds[free], findings.paces[free])
+    def free(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which cells are in no zone for all vehicles. In one an operator's word stands, whatever a vehicle sees
+        there; in a zone for one class the others go by what is found."""
+        return ~np.isin(cells, self._cells)
 
     def _find_zones(self) -> None:
         replica, grid = self._replica, self._replica.grid

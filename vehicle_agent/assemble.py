@@ -30,7 +30,7 @@ from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import AgentMaps, ZonesAround
 from vehicle_agent.assigners import AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.assignment import GroupCosts
-from vehicle_agent.bodies import Bodies
+from vehicle_agent.bodies import Bodies, TargetBodies
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
 from vehicle_agent.placement import Spawning, entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
@@ -38,7 +38,6 @@ from vehicle_agent.reports import ChasersReport, FleetReport
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
-from vehicle_agent.target_bodies import TargetBodies
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 
 _LEAD_CELLS = 24

@@ -13,11 +13,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 
+from msgspec.structs import replace
+
 from swarm.clock import NS_PER_S
+from swarm.config.scenario import Scenario, ids_of
+from swarm.errors import ConfigError
 from swarm.grid import GridSpec, Window
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body
 from vehicle_agent.discs import Capsule
 
@@ -331,3 +336,68 @@ class Bodies:
     def reports(self) -> list[Body]:
         """The newest report of each body, by each of its senders."""
         return [known.report for known in self._known.values()]
+
+
+# --- targets as bodies ---
+
+_LEASE_S = 2.0
+"""A pose comes twice a second at least, and three of four may be lost."""
+_LONGEST_NS = NS_PER_S
+"""A pose that is older tells no speed."""
+_CELLS_BETWEEN = 2
+"""From the middle of a cell beside a closed one to what closes it, at most, rounded up."""
+
+
+class TargetBodies:
+    """Makes bodies of the poses of those targets that vehicles must not drive into, as the scenario says. A pose
+    tells no heading and no speed: both are taken from the pose before.
+
+    Raises ConfigError if a target's body leaves no cell within capture range.
+    """
+
+    def __init__(self, scenario: Scenario, grid: GridSpec) -> None:
+        self._radii_m: Mapping[str, float] = {
+            id: each.body_radius_m
+            for each in scenario.targets
+            if each.body_radius_m is not None
+            for id in ids_of(each)
+        }
+        self._last: dict[str, tuple[TargetPose, int, int]] = {}
+        """Target -> its last pose, when that was heard, and the number of its body's report."""
+        for id, radius_m in self._radii_m.items():
+            needed_m = radius_m + scenario.cost.vehicle_radius_m + _CELLS_BETWEEN * grid.resolution_m
+            range_m = scenario.vehicles.capture_range_m
+            if range_m < needed_m:
+                raise ConfigError(
+                    f"targets: {id}: with body_radius_m = {radius_m:g} no vehicle comes near enough to capture it: "
+                    f"vehicles.capture_range_m is {range_m:g}, expected at least {needed_m:g}"
+                )
+
+    def bodies_of(self, pose: TargetPose, now_ns: int) -> list[Body]:
+        """What a pose says about bodies: nothing of a target that is none."""
+        radius_m = self._radii_m.get(pose.target)
+        if radius_m is None:
+            return []
+        before, heard_ns, seq = self._last.get(pose.target, (None, 0, 0))
+        self._last[pose.target] = pose, now_ns, seq + 1
+        body = Body(
+            id=f"target.{pose.target}"[:64],
+            incarnation=pose.jumps,
+            seq=seq + 1,
+            stamp_ns=pose.stamp_ns,
+            x_m=pose.x_m,
+            y_m=pose.y_m,
+            heading_rad=0.0,
+            radius_m=radius_m,
+            lease_s=_LEASE_S,
+        )
+        if before is None:
+            return [body]
+        if before.jumps != pose.jumps:  # it is at its new place, and no more at its old one
+            return [replace(body, incarnation=before.jumps, lease_s=0.0), body]
+        passed_ns = now_ns - heard_ns
+        if not 0 < passed_ns <= _LONGEST_NS:
+            return [body]
+        east_m, north_m = pose.x_m - before.x_m, pose.y_m - before.y_m
+        speed = min(math.hypot(east_m, north_m) * NS_PER_S / passed_ns, 1e6)
+        return [replace(body, heading_rad=math.atan2(east_m, north_m), speed_m_per_s=speed)]

@@ -342,7 +342,7 @@ class AgentService:
         agent, learning = self.agent, self._maps.learning
         agent.begin_drive(now_ns)
         while (found := agent.drive()) is not None:
-            if len(findings := self._parts.zones.without(found)):
+            if len(findings := found.where(self._parts.zones.free(found.cells))):
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._maps.take_dirty(), now_ns)

@@ -37,6 +37,10 @@ class Findings:
     def __len__(self) -> int:
         return len(self.cells)
 
+    def where(self, chosen: NDArray[np.bool_]) -> Findings:
+        """Those that are chosen."""
+        return Findings(self.cells[chosen], self.kinds[chosen], self.paces[chosen])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorWorld:

@@ -40,7 +40,7 @@ from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Body, Fleet, VehicleState
-from vehicle_agent.target_bodies import TargetBodies
+from vehicle_agent.bodies import TargetBodies
 
 LISTEN_NS = NS_PER_S
 """A starting process asks planners where their targets are before it places them itself: it waits so long for a

@@ -11,8 +11,7 @@ from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import TargetPose
-from vehicle_agent.bodies import Bodies
-from vehicle_agent.target_bodies import TargetBodies
+from vehicle_agent.bodies import Bodies, TargetBodies
 
 GRID = GridSpec(20, 20, 10.0)
 NOW = 10**18
