@@ -1,7 +1,7 @@
 """The maps of an agent, what its vehicles learn of the ground, and the zones of operators in them.
 
-What a vehicle finds is marked as for the class "ground", which any class can read; a vehicle drives by the map of its
-own class. What is found in a zone is no news, and a vehicle that stands in one drives out.
+What a vehicle finds is marked as for the class "ground", which any class can read; a vehicle drives by the map of
+its own class. What is found in a zone is no news, and a vehicle that stands in one drives out.
 """
 
 from __future__ import annotations
