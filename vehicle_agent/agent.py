@@ -20,14 +20,14 @@ from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
-from vehicle_agent.assigners import Assigner, Spread
-from vehicle_agent.assignment import AskCosts, Assignment, GroupCosts
+from vehicle_agent.assignment import Assigner, Spread
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces
+from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
 from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering

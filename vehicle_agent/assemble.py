@@ -28,8 +28,7 @@ from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import AgentMaps, ZonesAround
-from vehicle_agent.assigners import AssignmentWorld, assigner_of, shares_costs
-from vehicle_agent.assignment import GroupCosts
+from vehicle_agent.assignment import AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.bodies import Bodies, TargetBodies
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
 from vehicle_agent.placement import Spawning, entry_cells, spawn_cells
@@ -38,6 +37,7 @@ from vehicle_agent.reports import ChasersReport, FleetReport
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.right_of_way_core import RightOfWay
 
 _LEAD_CELLS = 24

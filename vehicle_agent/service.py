@@ -52,9 +52,9 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import AgentAction, AskRoutes
 from vehicle_agent.assemble import assemble
-from vehicle_agent.assignment import AskCosts
 from vehicle_agent.driving.driven_vehicle import Follow, Places
 from vehicle_agent.promise_store import PromiseStore
+from vehicle_agent.target_choice import AskCosts
 
 log = logging.getLogger(__name__)
 

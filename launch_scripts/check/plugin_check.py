@@ -25,7 +25,7 @@ from swarm.errors import ConfigError, SwarmError
 from swarm.grid import GridSpec, walk
 from swarm.plugins.find import Plugin, find_plugin
 from swarm.wire.routes import RouteStatus
-from vehicle_agent.assigners import AssignmentWorld, CostTable, assigner_of
+from vehicle_agent.assignment import AssignmentWorld, CostTable, assigner_of
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of

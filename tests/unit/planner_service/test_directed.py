@@ -30,8 +30,8 @@ from swarm.wire.messages.traffic import Granted
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
-from vehicle_agent.assignment import AskCosts
 from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.target_choice import AskCosts
 
 RES = 10.0
 

@@ -27,11 +27,11 @@ from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
-from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.reports import FleetReport
 from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.target_choice import UNSETTLED, AskCosts, Choice, choose
 
 GRID = GridSpec(12, 12, 10.0)
 LEVEL = np.full((12, 12), 0.1, np.float32)

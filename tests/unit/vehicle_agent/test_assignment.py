@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.plugins.find import Plugin
-from vehicle_agent.assigners import HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
+from vehicle_agent.assignment import HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
 
 
 @st.composite

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from vehicle_agent.assigners import Spread
-from vehicle_agent.assignment import Assignment
+from vehicle_agent.assignment import Spread
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.target_choice import Assignment
 
 PERIOD_S, SOON_S, TICK_S = 5.0, 0.5, 0.1
 TICKS = 300

@@ -22,7 +22,7 @@ from swarm.plugins.find import Plugin
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import MOST_SHARED_TARGETS, NO_TARGET, SharedCosts
-from vehicle_agent.assigners import (
+from vehicle_agent.assignment import (
     HYSTERESIS,
     Assigner,
     AssignmentWorld,
@@ -33,8 +33,8 @@ from vehicle_agent.assigners import (
     need_first,
     shares_costs,
 )
-from vehicle_agent.assignment import Assignment, GroupCosts
 from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.target_choice import Assignment, GroupCosts
 
 Costs = NDArray[np.float64]
 Problem = tuple[Costs, list[int], int]
