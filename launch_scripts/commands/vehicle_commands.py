@@ -21,7 +21,7 @@ from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.places import read_place
-from swarm.right_of_way.removal import say_gone
+from swarm.right_of_way.guest_session import say_gone
 from swarm.runtime.operator import replies_to
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles

@@ -12,7 +12,7 @@ from swarm.client.frame import Frame
 from swarm.client.observer import Mark, Observer, SeenTarget, SeenVehicle
 from swarm.client.orders import Orders
 from swarm.client.route import Route
-from swarm.client.stream import Stream
+from swarm.client.session import Stream
 from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError

@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING
 from swarm.client.frame import Frame
 from swarm.client.observer import EVERY_S, Observer
 from swarm.client.orders import Orders
-from swarm.client.right_of_way import RightOfWay
 from swarm.client.route import Route
-from swarm.client.route_question import ask_route
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
-from swarm.wire.fields import check_id
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.planning import GROUND, POSE_LEASE_S
 from swarm.wire.messages.processes import RunInfo
@@ -126,22 +123,18 @@ class Swarm:
         if right_of_way:
             file = None if right_of_way is True else Path(right_of_way)
             try:
-                vehicle.give_way(RightOfWay(self._guest(id, file)))
+                vehicle.give_way(self._guest(id, file))
             except BaseException:
                 vehicle.leave()
                 raise
         return vehicle
 
     def _guest(self, id: str, file: Path | None) -> GuestSession:
-        """Raises ConfigError if the id is none, StoreError if another program has the file."""
+        """Raises StoreError if another program has the file."""
         from swarm.right_of_way.guest_session import GuestSession
-        from swarm.right_of_way.life_file import LifeFile
+        from swarm.right_of_way.incarnations import LifeFile
         from swarm.runtime.run_secret import state_folder
 
-        try:
-            check_id("id", id)
-        except ValueError as error:
-            raise self._session.refused(str(error)) from error
         lives = LifeFile(file or state_folder() / "vehicles" / self.run_id / id)
         try:
             guest = GuestSession(id, self.frame.grid, self._open_trusted(), lives)
@@ -167,7 +160,7 @@ class Swarm:
 
         Its failure is a BusError. Raises ConfigError on a place outside the terrain.
         """
-        return ask_route(self._session, target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
+        return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
     def orders(self) -> Orders:
         """Orders to the swarm: pause, close areas, add targets ... With certificates for `operator.NAME` only."""
@@ -178,10 +171,7 @@ class Swarm:
 
         every_s  positions of the swarm's vehicles are read once in so many seconds
         """
-        every_s = self._session.number("every_s", every_s)
-        if not 0 < every_s < 1e6:
-            raise self._session.refused(f"every_s is {every_s!r}, expected seconds, more than 0")
-        return Observer(self._session, every_s)
+        return Observer(self._session, self._session.number("every_s", every_s, 0, 1e6, more=True))
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
         """Call with a sentence when something goes wrong that no call can raise: another process uses one of our

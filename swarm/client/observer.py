@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from swarm.bus.bus import Event, Heard, LinkChanged, Replied
-from swarm.client.stream import Stream
+from swarm.client.session import Session, Stream
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec, walk
 from swarm.runtime.tracking import Trackings
@@ -16,9 +15,6 @@ from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.vehicles import NO_TARGET, Body, Fleet, Followed, VehicleState
 from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
-
-if TYPE_CHECKING:
-    from swarm.client.session import Session
 
 CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
@@ -188,7 +184,7 @@ class Observer:
         """Call with the note of every capture, on the connection's thread."""
         self.on_note(lambda note: callback(note) if note.kind == CAPTURE else None)
 
-    def handle(self, event: Event, now_ns: int) -> None:
+    def on_event(self, event: Event, now_ns: int) -> None:
         match event:
             case Heard(message=Fleet() as fleet):
                 self._fleets[fleet.author, fleet.region] = fleet, now_ns
@@ -198,15 +194,15 @@ class Observer:
                 if self._trackings.hear(pose, now_ns) is not None:
                     self._targets[pose.target] = None
             case Heard(message=Followed() as followed):
-                self._hear_followed(followed)
+                self._on_followed(followed)
             case Heard(message=Note() as note):
                 self.notes.put(note)
                 for callback in self._on_note:
                     self._session.call(lambda callback=callback, note=note: callback(note))  # type: ignore[misc]
             case Heard(message=MarkSet() as marks):
-                self._hear_marks(marks)
+                self._on_marks(marks)
             case Replied(tag=tag, message=MarkSet() as marks) if tag == _MARKS_TAG:
-                self._hear_marks(marks)
+                self._on_marks(marks)
             case LinkChanged(up=True):
                 self._ask_marks()
 
@@ -224,7 +220,7 @@ class Observer:
     def _ask_marks(self) -> None:
         self._session.bus.ask(MARKS, MarksRequest(), self._session.post, tag=_MARKS_TAG, timeout_s=5.0)
 
-    def _hear_marks(self, marks: MarkSet) -> None:
+    def _on_marks(self, marks: MarkSet) -> None:
         held = self._sets.get((marks.tile, marks.author))
         newer = held is None or (marks.epoch, marks.seq) > (held.epoch, held.seq)
         grid = self._session.frame.grid
@@ -235,7 +231,7 @@ class Observer:
             self._sets[marks.tile, marks.author] = marks
             self._new_sets[marks.tile, marks.author] = None
 
-    def _hear_followed(self, followed: Followed) -> None:
+    def _on_followed(self, followed: Followed) -> None:
         try:
             walk(self._session.frame.grid, followed.start, followed.directions)
         except ValueError:

@@ -1,24 +1,32 @@
-"""A connection to a running swarm: what vehicles, targets and observers of a program share."""
+"""A connection to a running swarm: what vehicles, targets and observers of a program share, and its streams."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
+import math
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Future
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
 from swarm.client.frame import Frame, number
+from swarm.client.route import Route
 from swarm.clock import NS_PER_S, Clock
 from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
 from swarm.wire.codec import M, decode, encode
+from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
+from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import RUN, Topic
+from swarm.wire.topics import ROUTE, RUN, Topic
+
+if TYPE_CHECKING:
+    import asyncio
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +42,7 @@ _MOST_SAID = 1024
 class Part(Protocol):
     """A vehicle, a target or an observer, on its swarm's thread and under its lock."""
 
-    def handle(self, event: Event, now_ns: int) -> None: ...
+    def on_event(self, event: Event, now_ns: int) -> None: ...
     def tick(self, now_ns: int) -> None: ...
     def leave(self) -> None: ...
 
@@ -120,12 +128,30 @@ class Session:
         self.counts["refused"] += 1
         return ConfigError(sentence)
 
-    def number(self, name: str, value: Any) -> float:
-        """A number that a program gives. Raises ConfigError, and counts it, on anything else."""
+    def number(
+        self, name: str, value: Any, least: float = -math.inf, most: float = math.inf, *, more: bool = False
+    ) -> float:
+        """A number that a program gives. Raises ConfigError, and counts it, on anything else or beyond its bounds.
+
+        more  the least is itself too little
+        """
         try:
-            return number(name, value)
+            found = number(name, value)
         except ConfigError as error:
             raise self.refused(str(error)) from None
+        if not least <= found <= most or (more and found == least):
+            bounds = f"more than {least:g} and at most {most:g}" if more else f"{least:.4g} ... {most:g}"
+            raise self.refused(f"{name} is {found!r}, expected {bounds}")
+        return found
+
+    def check_ids(self, **ids: str | None) -> None:
+        """Raises ConfigError, and counts it, where one of these is no id."""
+        for name, id in ids.items():
+            try:
+                if id is not None:
+                    check_id(name, id)
+            except ValueError as error:
+                raise self.refused(str(error)) from error
 
     def class_number(self, name: str, argument: str) -> int:
         """The number of one of the scenario's classes, by which marks name it. Raises ConfigError, and counts it,
@@ -145,6 +171,29 @@ class Session:
             self._asked[tag] = (waiting, [])
         self.bus.ask(topic, request, self.post, tag=tag, timeout_s=timeout_s, **fields)
         return waiting
+
+    def ask_route(self, target: str, cell: int, vehicle_class: str, timeout_s: float) -> Future[Route]:
+        """The best route of a class of vehicles from a cell. Its failure is a BusError.
+
+        Raises ConfigError if the target's id is none.
+        """
+        self.check_ids(target=target)
+        request = RouteRequest(cells=[cell], vehicle_class=vehicle_class)
+        found: Future[Route] = Future()
+
+        def finish(done: Future[list[Any]]) -> None:
+            error = done.exception()
+            if error is not None:
+                found.set_exception(BusError(f"no route to {target!r}: {error}"))
+                return
+            reply: RouteReply = done.result()[0]
+            try:
+                found.set_result(Route.of(self.frame, reply.routes[0], reply))
+            except (ValueError, IndexError) as error:
+                found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
+
+        self.ask(ROUTE, request, timeout_s, target=target).add_done_callback(finish)
+        return found
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
         """Wait for what was asked. Raises BusError; ConfigError on the thread that would have to bring it."""
@@ -196,10 +245,10 @@ class Session:
                     if up:
                         self._compare_run()
                     for part in self._parts:
-                        part.handle(event, now_ns)
+                        part.on_event(event, now_ns)
                 case _:
                     for part in self._parts:
-                        part.handle(event, now_ns)
+                        part.on_event(event, now_ns)
         self._call_later()
 
     def tick(self) -> None:
@@ -281,3 +330,85 @@ class SwarmThread:
         self._ended.set()
         if self._thread is not threading.current_thread():
             self._thread.join(2.0)
+
+
+T = TypeVar("T")
+MOST_WAITING = 1024
+"""Values that wait to be read; the oldest are dropped first."""
+
+
+class Stream(Generic[T]):
+    """Values in the order of their arrival. One reader takes each value; a slow one misses the oldest.
+
+    It ends when it is closed, or the connection is: loops over it end then.
+    """
+
+    def __init__(self, most: int = MOST_WAITING, on_close: Callable[[], None] = lambda: None) -> None:
+        self._waiting: deque[T] = deque(maxlen=most)
+        self._changed = threading.Condition()
+        self._sleepers: list[tuple[asyncio.AbstractEventLoop, asyncio.Future[None]]] = []
+        """Readers in asyncio that wait for a value; each is woken once."""
+        self._on_close = on_close
+        self.closed = False
+        self.newest: T | None = None
+        """The value that came last, whether it was read or not; None before the first."""
+
+    def put(self, value: T) -> None:
+        """Add a value, from any thread. Dropped once the stream is closed."""
+        with self._changed:
+            if not self.closed:
+                self._waiting.append(value)
+                self.newest = value
+            self._wake()
+
+    def close(self) -> None:
+        """End it: readers take what waits, and then stop."""
+        with self._changed:
+            if self.closed:
+                return
+            self.closed = True
+            self._wake()
+        self._on_close()
+
+    def next(self, timeout_s: float | None = None) -> T | None:
+        """The next value; None if there is none within the timeout, or it has ended."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self.closed, timeout_s)
+            return self._waiting.popleft() if self._waiting else None
+
+    def __iter__(self) -> Iterator[T]:
+        while (value := self.next()) is not None:
+            yield value
+
+    async def __aiter__(self) -> AsyncIterator[T]:
+        from asyncio import get_running_loop  # whose import takes as long as all of ours
+
+        loop = get_running_loop()
+        while True:
+            with self._changed:
+                value = self._waiting.popleft() if self._waiting else None
+                if value is None and self.closed:
+                    return
+                if value is None:
+                    sleeper = loop.create_future()
+                    self._sleepers.append((loop, sleeper))
+            if value is not None:
+                yield value
+                continue
+            try:
+                await sleeper
+            finally:
+                with self._changed, contextlib.suppress(ValueError):
+                    self._sleepers.remove((loop, sleeper))
+
+    def _wake(self) -> None:
+        self._changed.notify_all()
+        for loop, sleeper in self._sleepers:
+            with contextlib.suppress(RuntimeError):  # its loop was closed meanwhile
+                loop.call_soon_threadsafe(_release, sleeper)
+        self._sleepers.clear()
+
+
+def _release(sleeper: asyncio.Future[None]) -> None:
+    if not sleeper.done():
+        sleeper.set_result(None)

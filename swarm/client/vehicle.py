@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
-from typing import Any
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged
-from swarm.client.frame import checked_cells, number
+from swarm.client.frame import checked_cells
 from swarm.client.own_marks import OwnMarks
-from swarm.client.right_of_way import RightOfWay
+from swarm.client.reported import Reported
 from swarm.client.route import Route
-from swarm.client.route_question import ask_route, check_target
-from swarm.client.session import Session
-from swarm.client.stream import Stream
+from swarm.client.session import Session, Stream
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import ConfigError
-from swarm.wire.fields import check_id
 from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKind, MarkSet, MarksRequest
 from swarm.wire.messages.planning import GROUND, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
 from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE, ROUTE
 
+if TYPE_CHECKING:
+    from swarm.right_of_way.guest_session import GuestSession
+
+_REPEAT_NS = NS_PER_S // 2
+"""Time between two reports of a vehicle that stands. A new agent listens for a second before it drives."""
 _ASK_AGAIN_NS = NS_PER_S
 """A follower asks again so often, from where it is: planners forget vehicles that were silent for five seconds."""
 _DIGEST_NS = NS_PER_S
@@ -32,7 +32,7 @@ _TIMEOUT_S = 5.0
 _NEAR_END_CELLS = 16
 
 
-class Vehicle:
+class Vehicle(Reported):
     """One vehicle. Made by `Swarm.vehicle`; use it in a `with`, or `leave` at the end.
 
     id           of the vehicle; no other process may report one of the same id
@@ -52,31 +52,14 @@ class Vehicle:
         lease_s: float,
         vehicle_class: str = GROUND,
     ) -> None:
-        for name, value in (("id", id), ("group", group), ("vehicle_class", vehicle_class)):
-            try:
-                check_id(name, value)
-            except ValueError as error:
-                raise session.refused(str(error)) from error
+        session.check_ids(id=id, group=group, vehicle_class=vehicle_class)
         if agent_of(id) != id:
             raise session.refused(f"id {id!r} has a '-', by which the swarm names vehicles of its own agents")
-        radius_m, lease_s = session.number("radius_m", radius_m), session.number("lease_s", lease_s)
-        if not 0 < lease_s <= LONGEST_BODY_LEASE_S:
-            raise session.refused(
-                f"lease_s is {lease_s!r}, expected more than 0 and at most {LONGEST_BODY_LEASE_S:g}"
-            )
-        if not 0 <= radius_m <= MOST_RADIUS_M:
-            raise session.refused(f"radius_m is {radius_m!r}, expected 0 ... {MOST_RADIUS_M:g} metres")
-        self.id = id
         self.group = group
-        self.radius_m = radius_m
-        self.lease_s = lease_s
+        self.radius_m = session.number("radius_m", radius_m, 0, MOST_RADIUS_M)
         self.vehicle_class = vehicle_class
-        self.incarnation = session.now_ns()
-        self._session = session
-        self._body: Body | None = None
-        """What was said last; None before the first `at`."""
-        self._seq = 0
-        self._repeat_due_ns = 0
+        lease_s = session.number("lease_s", lease_s, 0, LONGEST_BODY_LEASE_S, more=True)
+        super().__init__(session, BODY, "vehicle", id, lease_s, _REPEAT_NS)
         self._target: str | None = None
         self._route: Route | None = None
         self._ask_due_ns = 0
@@ -85,15 +68,7 @@ class Vehicle:
         self._on_route: list[Callable[[Route], None]] = []
         self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
         self._digest_due_ns = 0
-        self._way: RightOfWay | None = None
-        session.add(self)
-        session.bus.subscribe(BODY, session.post, id=id)
-
-    def __enter__(self) -> Vehicle:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.leave()
+        self._way: GuestSession | None = None
 
     # --- place --------------------------------------------------------------------------------------------------
 
@@ -109,49 +84,30 @@ class Vehicle:
         """
         session = self._session
         with session.lock:
-            try:
-                session.frame.cell(x_m, y_m)
-                heading_rad = None if heading_rad is None else number("heading_rad", heading_rad)
-                if not 0 <= (speed_m_per_s := number("speed_m_per_s", speed_m_per_s)) <= MOST_M_PER_S:
-                    raise ConfigError(f"speed_m_per_s is {speed_m_per_s!r}, expected 0 ... {MOST_M_PER_S:g}")
-            except ConfigError as error:
-                raise session.refused(f"vehicle {self.id}: {error}") from None
-            body = Body(
-                id=self.id,
+            cell = self._cell_at(x_m, y_m)
+            if heading_rad is not None:
+                heading_rad = session.number("heading_rad", heading_rad)
+            self._say(
+                x_m,
+                y_m,
                 group=self.group,
-                incarnation=self.incarnation,
-                seq=self._seq + 1,
-                stamp_ns=session.now_ns(),
-                x_m=float(x_m),
-                y_m=float(y_m),
                 heading_rad=heading_rad,
-                speed_m_per_s=speed_m_per_s,
+                speed_m_per_s=session.number("speed_m_per_s", speed_m_per_s, 0, MOST_M_PER_S),
                 radius_m=self.radius_m,
-                lease_s=self.lease_s,
             )
-            self._body = session.publish(BODY, body, id=self.id)
-            self._seq += 1
-            self._repeat_due_ns = body.stamp_ns + self._repeat_ns
-            cell = self.cell
         if self._way is not None and not self._way.stands(cell):
             session.problem("unreserved", f"vehicle {self.id} is in cell {cell}, into which it was not let: stop")
 
     @property
     def cell(self) -> int:
         """The cell that it said it is in. Raises ConfigError before the first `at`."""
-        body = self._body
-        if body is None:
+        if self._word is None:
             raise ConfigError(f"vehicle {self.id} has not said where it is: call at() first")
-        return self._session.frame.cell(body.x_m, body.y_m)
-
-    @property
-    def _repeat_ns(self) -> int:
-        # An agent that has just begun listens for a second before it drives.
-        return min(int(self.lease_s * NS_PER_S / 4), NS_PER_S // 2)
+        return self._session.frame.cell(self._word.x_m, self._word.y_m)
 
     # --- right of way -------------------------------------------------------------------------------------------
 
-    def give_way(self, way: RightOfWay) -> None:
+    def give_way(self, way: GuestSession) -> None:
         """Let it reserve cells from now on. Called once, before the first `at`."""
         self._way = way
 
@@ -165,16 +121,19 @@ class Vehicle:
         way, here = self._has_way(), self.cell
         path = [here, *(cells[1:] if cells and cells[0] == here else cells)]
         try:
-            return way.reserve(path, timeout_s)
+            way.want(path)
         except ValueError as error:
             raise self._session.refused(f"vehicle {self.id}: {error}") from error
+        if len(path) > 1:
+            way.may_enter(path[1], timeout_s)
+        return list(way.cells[1:])
 
     def may_enter(self, cell: int, timeout_s: float = 0.0) -> bool:
         """Whether the vehicle may drive into a cell now, after waiting for it for so long. Raises ConfigError
         unless it was made with `right_of_way`."""
         return self._has_way().may_enter(cell, timeout_s)
 
-    def _has_way(self) -> RightOfWay:
+    def _has_way(self) -> GuestSession:
         if self._way is None:
             raise ConfigError(
                 f"vehicle {self.id} has no right of way: make it with swarm.vehicle({self.id!r}, right_of_way=True)"
@@ -190,7 +149,7 @@ class Vehicle:
 
     def route_soon(self, target: str, timeout_s: float = _TIMEOUT_S) -> Future[Route]:
         """As `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
-        return ask_route(self._session, target, self.cell, self.vehicle_class, timeout_s)
+        return self._session.ask_route(target, self.cell, self.vehicle_class, timeout_s)
 
     def follow(self, target: str) -> Stream[Route]:
         """Routes to a target from now on: the first one, and a newer one whenever the target moves, the map changes
@@ -198,7 +157,7 @@ class Vehicle:
         session = self._session
         with session.lock:
             session.check_open()
-            check_target(session, target)
+            session.check_ids(target=target)
             _ = self.cell
             self.unfollow()
             self._target, self._ask_due_ns = target, 0
@@ -295,12 +254,10 @@ class Vehicle:
         session = self._session
         if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
             raise session.refused("mark states one thing: lethal=True, pace_s_per_m=... or clear=True")
-        pace_s_per_m = None if pace_s_per_m is None else session.number("pace_s_per_m", pace_s_per_m)
-        for_s = None if for_s is None else session.number("for_s", for_s)
-        if pace_s_per_m is not None and not PACE_LEAST <= pace_s_per_m <= PACE_MOST:
-            raise session.refused(f"pace_s_per_m is {pace_s_per_m!r}, expected {PACE_LEAST:.4g} ... {PACE_MOST:g}")
-        if for_s is not None and not 0 < for_s < 1e9:
-            raise session.refused(f"for_s is {for_s!r}, expected seconds, more than 0")
+        if pace_s_per_m is not None:
+            pace_s_per_m = session.number("pace_s_per_m", pace_s_per_m, PACE_LEAST, PACE_MOST)
+        if for_s is not None:
+            for_s = session.number("for_s", for_s, 0, 1e9, more=True)
         class_number = 0 if only_for is None else session.class_number(only_for, "only_for")
         kind = MarkKind.LETHAL if lethal else MarkKind.CLEAR if clear else MarkKind.PACE
         with session.lock:
@@ -331,10 +288,10 @@ class Vehicle:
 
     # --- a part of its session ----------------------------------------------------------------------------------
 
-    def handle(self, event: Event, now_ns: int) -> None:
+    def on_event(self, event: Event, now_ns: int) -> None:
         match event:
             case Heard(message=Body() as body) if body.id == self.id and body.incarnation != self.incarnation:
-                self._hear_double(body)
+                self._on_double(body)
             case Heard(message=PushedRoute() as pushed) if (
                 pushed.vehicle == self.id and pushed.target == self._target
             ):
@@ -348,7 +305,7 @@ class Vehicle:
             case LinkChanged(up=True):
                 self._repeat_due_ns = self._ask_due_ns = self._digest_due_ns = 0
 
-    def _hear_double(self, other: Body) -> None:
+    def _on_double(self, other: Body) -> None:
         if other.lease_s == 0:
             return
         who = (
@@ -359,34 +316,22 @@ class Vehicle:
         self._session.problem("doubles_heard", f"another process reports vehicle {self.id}, {who}")
 
     def tick(self, now_ns: int) -> None:
-        session = self._session
-        if self._body is not None and now_ns >= self._repeat_due_ns:
-            self._repeat_due_ns = now_ns + self._repeat_ns
-            self._seq += 1
-            self._body = msgspec.structs.replace(self._body, seq=self._seq, stamp_ns=now_ns)
-            session.bus.publish(BODY, self._body, id=self.id)
+        super().tick(now_ns)
         if self._target is not None and now_ns >= self._ask_due_ns:
             self._ask(now_ns)
         if self._marks.any and now_ns >= self._digest_due_ns:
             self._digest_due_ns = now_ns + _DIGEST_NS
-            session.bus.publish(DIGEST, self._marks.digest(), author=self._marks.author)
+            self._session.bus.publish(DIGEST, self._marks.digest(), author=self._marks.author)
 
     def leave(self) -> None:
         """Take the vehicle away: its place is free at once. What it marked stays. May be repeated."""
         session = self._session
         with session.lock:
             self.unfollow()
-            if self._body is not None and session.ended is None:
-                gone = msgspec.structs.replace(
-                    self._body, seq=self._seq + 1, stamp_ns=session.now_ns(), lease_s=0.0
-                )
-                session.bus.publish(BODY, gone, id=self.id)
-            self._body = None
+            super().leave()
             if self._way is not None:
                 self._way.close()
                 self._way = None
-            session.bus.unsubscribe(BODY, id=self.id)
             if self._marks.any:
                 session.bus.unserve(MARKS, author=self._marks.author)
                 session.bus.unsubscribe(MARKS, author=self._marks.author)
-            session.remove(self)

@@ -1,1 +1,51 @@
-"""Right of way for who drives: which cells may be entered, and how to ask for them (decisions 25 and 40)."""
+"""Right of way: no two vehicles are on one cell, whatever is lost, late, repeated, stopped or started again.
+
+The map is cut into *plots* (`lock_regions`): lock regions. Three agents are the *members* of a plot, and one of
+them is its *warden*: the leader, by epoch and majority. A *host* is a process with vehicles in a plot or at its
+border. It asks the warden for cells and drives into those only that were granted. A *life* is one incarnation
+of a host. A grant is never revoked and never runs out: a cell is free again by the word of its host alone. Only
+authority is leased.
+
+This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in decision
+25, and decision 40 says how guests come into it. All but `guest_session` is pure: time and chance are
+arguments.
+
+Duties of a host (`Host`, which keeps what it holds in `Holdings`):
+
+1. Begin with a life whose number is greater than all that anybody knows, and have it on file before the first
+   word. So ask all agents first (`KnownRequest`), until of every plot so many members have answered that one of
+   them has its newest usable table.
+2. Tell each plot that concerns it everything about its vehicles there, whenever that is news and once a beat.
+   What is left out is given back.
+3. Enter a cell only if a `Granted` for this life, newer than all that it knows of the plot, adds it to the path
+   of the vehicle. Never go back to an older table of a plot, not even after the vehicles have left it.
+4. Never ask for a cell that it has given up while a table still grants it: granted anew, the cell could not be
+   told from one that is about to be freed.
+5. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
+6. Speak to the warden, and to all members where no warden was heard for half a second.
+
+Messages (`swarm.wire.messages.traffic`), each of which carries the whole state of its key:
+
+`Standing`      Host to warden: all vehicles of the host that hold or want a cell of one plot, each with its
+                next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
+                what that granted, the host holds no more than it lists. `dead` are lives that are proved to
+                have ended, by which their cells are opened.
+`Table`         Warden to members: who may be where in one plot. Its stamp is (epoch, seq).
+`Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable.
+`Granted`       Warden to host: what a usable table says of the vehicles of one host, under its stamp. A host
+                takes the cells that follow the path of the vehicle, and passes over the others, which gives
+                them back. `pushed` asks a vehicle to make way into another plot; `occupied` are the cells of
+                others around.
+`Claim`         Member to members, where no warden was heard for 0.6 s: who answers with its table promises to
+                store nothing of a lower epoch. Two promises make a warden, which goes on from the newest table
+                of the two.
+`KnownRequest`  New life to all agents: what is on file of this host?
+`Known`         The answer: the greatest life in any table, the plots that grant cells to the host or keep them
+                shut, and, for a guest, who the agents are and how large plots are.
+
+A *guest* (`Guest`) is a host that is not in the scenario. It is a member of no plot, so who joins and leaves
+changes no majority. It enters from nowhere: a standing asks for its first cell and holds nothing. It leaves by
+a standing without the vehicle. One that dies keeps its cells shut until its next life proves, by the file which
+that has locked, that it has ended, or until an operator says that it is gone (`Removal`): a life that names all
+lives as ended, itself among them.
+"""

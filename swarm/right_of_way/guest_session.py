@@ -1,24 +1,212 @@
-"""Right of way for a program of one's own: a thread that keeps it, and calls that may be made from any other."""
+"""Right of way of a vehicle that is not in the scenario, on the bus.
+
+`GuestSession` is what a program of one's own uses: a thread that keeps the right of way, and calls that may be
+made from any other. `GuestService` is the same without the thread, for another loop to drive. `say_gone` is the
+word of an operator that such a vehicle is gone.
+"""
 
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 from collections.abc import Callable, Sequence
-from types import TracebackType
+from hashlib import blake2s
 
-from swarm.bus.bus import Bus
+from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S, Clock, MonotonicClock
-from swarm.errors import BusError
+from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.right_of_way.guest_service import GuestService
-from swarm.right_of_way.life_file import Lives
+from swarm.liveness import Peer
+from swarm.right_of_way.guest import Guest, Removal, SaveLives
+from swarm.right_of_way.holdings import Tell
+from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.incarnations import MemoryLives
+from swarm.right_of_way.lock_regions import Plots
 from swarm.runtime.inbox import Inbox
+from swarm.wire.fields import check_id
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest
+from swarm.wire.topics import GRANTED, KNOWN, STANDING
+
+_NOBODY_NS = 10 * NS_PER_S
+"""A guest that nobody has answered for so long is told so."""
+_ANSWERS_S = 0.3
+"""A new life waits so long for the agents' answers before it begins."""
+_ASK_AGAIN_NS = NS_PER_S
+_ROLE = "rover"
+
+
+class GuestService:
+    """Right of way of one vehicle that is not in the scenario, on a bus that may carry other things, too.
+
+    `handle` and `tick` are called by one thread, `tick` some ten times a second. The bus needs the run's secret, or
+    a certificate of the guest, `rover.GROUP.NAME`.
+
+    name         of the guest, as in its certificate; no agent of the scenario has it
+    incarnation  nanosecond of this process's start, which tells its liveliness token from that of another
+    warn         called with a sentence about what cannot be, or why the vehicle waits
+
+    Raises ConfigError if the name is none.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        grid: GridSpec,
+        incarnation: int,
+        lives: MemoryLives,
+        bus: Bus,
+        post: Post,
+        warn: Callable[[str], None],
+    ) -> None:
+        try:
+            check_id("guest", f"{name}-00")
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        self.name = name
+        self.guest: Guest | None = None
+        """None until an agent has said which agents there are."""
+        self._grid = grid
+        self._incarnation = incarnation
+        self._lives = lives
+        self._bus = bus
+        self._post = post
+        self._warn = warn
+        self._warned: set[str] = set()
+        self._tag = f"known-{name}"
+        self._asking = False
+        self._ask_due_ns = 0
+        self._tokens: set[Peer] = set()
+        self._began_ns = 0
+        self._cell: int | None = None
+        """Where to enter, once there is a guest."""
+
+    def start(self, now_ns: int) -> None:
+        self._bus.watch_alive(self._post, role=_ROLE)
+        self._bus.subscribe(GRANTED, self._post, host=self.name)
+        self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
+        self._began_ns = now_ns
+        self._ask(now_ns)
+
+    def stop(self) -> None:
+        self._bus.unsubscribe(GRANTED, host=self.name)
+
+    def enter(self, cell: int, now_ns: int) -> None:
+        """Ask for the cell on which the vehicle stands. Raises as `Guest.enter`."""
+        if not 0 <= cell < self._grid.cells:
+            raise ValueError(f"cell {cell} is outside the map of {self._grid.cells} cells")
+        self._cell = cell
+        if self.guest is not None:
+            self.guest.enter(cell)
+            if self.guest.needs_life and not self._asking:
+                self._ask(now_ns)
+        self.tell(now_ns)
+
+    def leave(self, now_ns: int) -> None:
+        """Give all cells back."""
+        self._cell = None
+        if self.guest is not None:
+            self.guest.leave()
+        self.tell(now_ns)
+
+    def handle(self, event: Event, now_ns: int) -> bool:
+        """True if the event was about the right of way of this guest."""
+        match event:
+            case Heard(topic=topic, message=Granted() as granted) if topic is GRANTED and granted.host == self.name:
+                if self.guest is not None:
+                    self.guest.hear_granted(granted, now_ns)
+            case Replied(tag=self._tag, message=Known() as known):
+                self._hear_known(known)
+            case AskEnded(tag=self._tag):
+                self._asking = False
+                self._ask_due_ns = now_ns + _ASK_AGAIN_NS
+                if self.guest is not None:
+                    self._perform(self.guest.begin(self._chance(now_ns)), now_ns)
+                    self.tell(now_ns)
+            case Appeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
+                self._hear_token(peer, up=True)
+            case Disappeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
+                self._hear_token(peer, up=False)
+            case _:
+                return False
+        return True
+
+    def tick(self, now_ns: int) -> None:
+        settled = self.guest is not None and self.guest.settled
+        if not settled and not self._asking and now_ns >= self._ask_due_ns:
+            self._ask(now_ns)
+        if self.guest is None and now_ns - self._began_ns > _NOBODY_NS:
+            self._warn_once(
+                (f"no agent answers {self.name}: a guest needs one that drives in this run, and a name of its own",)
+            )
+        self.tell(now_ns)
+        if self.guest is not None:
+            self._warn_once((*self.guest.refused, *self.guest.unled(now_ns)))
+            self.guest.refused.clear()
+
+    def tell(self, now_ns: int) -> None:
+        """Send what is new, without waiting for the next tick."""
+        if self.guest is not None:
+            self._perform(self.guest.tick(now_ns), now_ns)
+
+    def _hear_known(self, known: Known) -> None:
+        if known.agents and (self.guest is None or _tells_of_larger(known, self.guest)):
+            if self.name in known.agents:
+                self._warn_once((f"{self.name} is an agent of this run's scenario: a guest needs another name",))
+                return
+            plots = Plots(self._grid, known.agents, known.plot_cells)
+            self.guest = Guest(plots, self.name, self._lives.lives)
+            for peer in self._tokens:
+                self.guest.hear_token(peer, up=True)
+            if self._cell is not None:
+                self.guest.enter(self._cell)
+        if self.guest is not None and known.plot_cells == self.guest.plots.side:
+            self.guest.hear_known(known)
+
+    def _hear_token(self, peer: Peer, *, up: bool) -> None:
+        (self._tokens.add if up else self._tokens.discard)(peer)
+        if self.guest is not None:
+            self.guest.hear_token(peer, up=up)
+
+    def _ask(self, now_ns: int) -> None:
+        self._asking = True
+        request = KnownRequest(agent=self.name, disk=0)
+        self._bus.ask(KNOWN, request, self._post, tag=self._tag, timeout_s=_ANSWERS_S)
+
+    def _perform(self, actions: Sequence[object], now_ns: int) -> None:
+        for action in actions:
+            match action:
+                case AskKnown():
+                    self._ask(now_ns)
+                case SaveLives(lives):
+                    self._lives.save(lives)
+                case Tell(members, standing):
+                    for member in members:
+                        self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self.name)
+
+    def _chance(self, now_ns: int) -> int:
+        seed = f"{self.name}/{self._incarnation}/{now_ns}".encode()
+        return int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
+
+    def _warn_once(self, texts: Sequence[str]) -> None:
+        for text in texts:
+            if text not in self._warned and len(self._warned) < 100:
+                self._warned.add(text)
+                self._warn(text)
+
+
+def _tells_of_larger(known: Known, guest: Guest) -> bool:
+    """Whether plots are larger than the guest takes them to be. An agent says so only if this is so for the whole
+    run; one that says less may not belong."""
+    return known.plot_cells > guest.plots.side and not guest.cells
+
 
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.1
-_LEAVE_S = 3.0
+_ENTER_S, _LEAVE_S = 5.0, 3.0
+"""Longest waits for the first cell, and at the end for the word that all cells are free: a few hops, or an election
+of a warden, which takes a second."""
 
 
 class GuestSession:
@@ -41,12 +229,14 @@ class GuestSession:
     lives  the vehicle's file; closed with this session, as the bus is
     """
 
-    def __init__(self, name: str, grid: GridSpec, bus: Bus, lives: Lives, clock: Clock | None = None) -> None:
+    def __init__(self, name: str, grid: GridSpec, bus: Bus, lives: MemoryLives, clock: Clock | None = None) -> None:
         self._clock = clock or MonotonicClock()
         self._inbox = Inbox()
         self._changed = threading.Condition(threading.RLock())
         """Guards the service; notified whenever it may have come to hold other cells."""
         self._closed = threading.Event()
+        self._entered = False
+        """Whether `stands` was called."""
         self._bus = bus
         self._lives = lives
         self._failure: BaseException | None = None
@@ -61,9 +251,7 @@ class GuestSession:
     def __enter__(self) -> GuestSession:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # --- what the driver asks and says ----------------------------------------------------------------------
@@ -121,6 +309,19 @@ class GuestSession:
             guest.left(cell)
             self._service.tell(self._clock.now_ns())
 
+    def stands(self, cell: int) -> bool:
+        """The vehicle is in a cell: those behind it are given back. Returns whether it was let in there.
+
+        The first cell is asked for, and waited for: somebody else may be there.
+        """
+        if not self._entered:
+            self._entered = True
+            return self.enter(cell, _ENTER_S)
+        held = self.cells
+        for behind in held[: held.index(cell)] if cell in held else ():
+            self.left(behind)
+        return cell in held
+
     def leave(self, timeout_s: float | None = _LEAVE_S) -> bool:
         """The vehicle stands on no cell any more. Returns whether that is known where it counts, so that others may
         drive there."""
@@ -172,3 +373,54 @@ class GuestSession:
     def _warn(self, text: str) -> None:
         log.warning(text)
         self.warnings.append(text)
+
+
+_WORDS_S = 0.5
+"""An operator waits for agents' answers for so long, and asks again: one round is enough where no agent hangs."""
+
+
+def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
+    """Say that a guest is gone, and wait until its cells are free. Returns whether they are within the timeout.
+
+    bus  opened with the run's secret, or the guest's own certificate
+
+    Raises ConfigError where no such guest is known, or it is no guest, or its program still runs.
+    """
+    inbox = Inbox()
+    clock = MonotonicClock()
+    bus.watch_alive(inbox.post)
+    bus.subscribe(GRANTED, inbox.post, host=name)
+    bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
+    removal: Removal | None = None
+    begun, due_ns = False, 0
+    until_ns = clock.now_ns() + int(timeout_s * NS_PER_S)
+    while (now_ns := clock.now_ns()) < until_ns:
+        match inbox.take(_TICK_S):
+            case Appeared(peer) if peer.id == name:
+                raise ConfigError(f"{name} is alive: end its program, or let it leave with `swarm vehicle remove`")
+            case Replied(message=Known() as known) if known.agents:
+                if name in known.agents:
+                    raise ConfigError(f"{name} is an agent of the scenario, not a guest: start it again instead")
+                if removal is None or (not begun and known.plot_cells > removal.plots.side):
+                    removal = Removal(Plots(grid, known.agents, known.plot_cells), name)
+                if known.plot_cells == removal.plots.side:
+                    removal.hear_known(known)
+            case AskEnded() if removal is not None and not begun and removal.settled:
+                if not removal.known:
+                    raise ConfigError(f"no agent has ever heard of a guest {name!r}")
+                removal.begin(secrets.randbits(32))
+                begun = True
+            case AskEnded() if not begun:
+                bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
+            case Heard(message=Granted() as granted) if removal is not None:
+                removal.hear_granted(granted, now_ns)
+            case _:
+                pass
+        if removal is not None and begun and now_ns >= due_ns:
+            due_ns = now_ns + int(_TICK_S * NS_PER_S)
+            for told in removal.tick(now_ns):
+                for member in told.members:
+                    bus.publish(STANDING, told.standing, plot=told.standing.plot, member=member, agent=name)
+            if removal.done:
+                return True
+    return False

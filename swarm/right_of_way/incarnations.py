@@ -1,8 +1,14 @@
-"""Numbers of right of way that hosts, members and wardens agree on: lives, epochs, how often somebody speaks."""
+"""Incarnations of hosts, here called lives: their numbers, their file, and the bounds on which all agree."""
 
 from __future__ import annotations
 
+import fcntl
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
 from swarm.clock import NS_PER_S
+from swarm.errors import StoreError
 
 BEAT_NS = NS_PER_S // 5
 """What has not changed is told again so often: so the members know of a warden, and a warden of its hosts."""
@@ -20,3 +26,63 @@ def first_life(after: int, chance: int) -> int:
 def is_far_ahead(life: int, known: int) -> bool:
     """Whether a number is further ahead than a host can have been restarted."""
     return life >> _LIFE_BITS > (known >> _LIFE_BITS) + _FURTHEST_LIFE
+
+
+_MOST_BYTES = 1 << 16
+"""A file of lives has 32 numbers (`LIVES_KEPT`); more of it is not read."""
+
+
+class MemoryLives:
+    """The lives of a guest that have begun here, the oldest first: by them a new life proves that those before it
+    have ended.
+
+    These survive a simulated process, not this one. What was granted to a life that is forgotten stays shut until
+    an operator says that it is gone.
+    """
+
+    def __init__(self) -> None:
+        self.lives: list[int] = []
+
+    def save(self, lives: Sequence[int]) -> None:
+        self.lives = list(lives)
+
+    def close(self) -> None:
+        """Let another process have it."""
+
+
+class LifeFile(MemoryLives):
+    """A file, locked for as long as the process lives: so an earlier life that ran on it has ended.
+
+    Raises StoreError if the file is in use, is not ours or cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        try:
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._lock = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            text = path.read_bytes()[:_MOST_BYTES] if path.exists() else b""
+        except BlockingIOError as error:
+            raise StoreError(f"{path} is in use: this vehicle has right of way here already") from error
+        except OSError as error:
+            raise StoreError(f"cannot open {path}: {error.strerror}") from error
+        try:
+            self.lives = [int(line) for line in text.split()]
+        except ValueError as error:
+            raise StoreError(f"{path} is damaged: expected one number a line, found {text[:40]!r}") from error
+
+    def save(self, lives: Sequence[int]) -> None:
+        super().save(lives)
+        draft = self._path.with_name(f"{self._path.name}.draft")
+        try:
+            draft.write_text("".join(f"{life}\n" for life in lives))
+            draft.replace(self._path)
+        except OSError as error:
+            raise StoreError(f"cannot write {draft}: {error.strerror}") from error
+
+    def close(self) -> None:
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1

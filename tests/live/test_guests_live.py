@@ -20,7 +20,7 @@ from support.processes import eventually
 from swarm.bus.zenoh_bus import open_bus
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest_session import GuestSession
-from swarm.right_of_way.life_file import LifeFile
+from swarm.right_of_way.incarnations import LifeFile
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest

@@ -10,8 +10,8 @@ from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import crowd, seeded
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
-from swarm.right_of_way.guest_service import GuestService
-from swarm.right_of_way.life_file import MemoryLives
+from swarm.right_of_way.guest_session import GuestService
+from swarm.right_of_way.incarnations import MemoryLives
 from swarm.wire.messages.orders import ZoneOrder
 from swarm.wire.messages.vehicles import Body, Removed, RemoveVehicles
 from swarm.wire.topics import BODY, LEAVE

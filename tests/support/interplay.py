@@ -20,8 +20,8 @@ from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.agents import added_agent
 from swarm.config.scenario import RoverConfig
-from swarm.right_of_way.guest_service import GuestService
-from swarm.right_of_way.life_file import MemoryLives
+from swarm.right_of_way.guest_session import GuestService
+from swarm.right_of_way.incarnations import MemoryLives
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 from swarm.wire.messages.vehicles import Body, RemoveVehicles
 from swarm.wire.topics import BODY, LEAVE

@@ -9,9 +9,9 @@ import pytest
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest import Guest, Removal
-from swarm.right_of_way.guest_service import GuestService
+from swarm.right_of_way.guest_session import GuestService
 from swarm.right_of_way.holdings import Tell
-from swarm.right_of_way.life_file import LifeFile, MemoryLives
+from swarm.right_of_way.incarnations import LifeFile, MemoryLives
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.traffic import Granted, Known, Shut, Stand, Standing, Table

@@ -13,8 +13,8 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 import swarm.right_of_way.lock_regions
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import MOST_PLOTS, REGION_CELLS, GridSpec
-from swarm.right_of_way.guest_service import GuestService
-from swarm.right_of_way.life_file import MemoryLives
+from swarm.right_of_way.guest_session import GuestService
+from swarm.right_of_way.incarnations import MemoryLives
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
