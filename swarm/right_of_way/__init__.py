@@ -7,8 +7,8 @@ of a host. A grant is never revoked and never runs out: a cell is free again by 
 authority is leased.
 
 This package is the side of hosts. Members and wardens are in `vehicle_agent/traffic`; the proof is in decision
-25, and decision 40 says how guests come into it. All but `guest_session` is pure: time and chance are
-arguments.
+25, and decision 40 says how guests come into it. All but `guest_session` and the file of lives is pure: time
+and chance are arguments.
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
