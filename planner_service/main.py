@@ -11,7 +11,7 @@ from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader, needed_kernels
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
-from shared_map.prepared_classes import load_classes
+from shared_map.class_grounds import load_classes
 from shared_map.terrain.store import kept_key, load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from shared_map import arrays
-from shared_map.arrays import Bytes, Floats, open_array, private_copy, save_array
-from shared_map.source_digest import source_digest
+from shared_map.arrays import Bytes, Floats, open_array, private_copy, save_array, source_digest
 from shared_map.terrain.store import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig

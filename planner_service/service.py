@@ -22,7 +22,7 @@ from planner_service.tree.strides import StrideSearch
 from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps
 from shared_map.cost_map import CostMap
-from shared_map.learning.gauges import LearnedGauges
+from shared_map.learning.factors import LearnedGauges
 from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica

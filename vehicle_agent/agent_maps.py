@@ -16,8 +16,7 @@ from shared_map.arrays import Floats
 from shared_map.class_grounds import ClassGround
 from shared_map.class_maps import ClassMaps, for_class, read_marks
 from shared_map.cost_map import CostMap, merged
-from shared_map.learning.factors import Measured
-from shared_map.learning.words import Said
+from shared_map.learning.measurements import Measured, Measurement
 from shared_map.replication.marks import NO_STATEMENTS, Statements, dense, is_zone, standing
 from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
@@ -149,7 +148,7 @@ class Learning:
         self._told_version = 0
         self._due_ns = 0
 
-    def tick(self, driven: Iterable[tuple[int, float]], now_ns: int) -> Mapping[int, Said]:
+    def tick(self, driven: Iterable[tuple[int, float]], now_ns: int) -> Mapping[int, Measurement]:
         """What to tell now, of all that was measured so far; nothing if nothing is new, or it is too early.
 
         driven  (cell, s/m) of each step since the last call
@@ -160,7 +159,7 @@ class Learning:
         if measured.version == self._told_version or now_ns < self._due_ns:
             return {}
         self._told_version, self._due_ns = measured.version, now_ns + _EVERY_NS
-        return measured.said
+        return measured.by_key
 
 
 _AGAIN_NS = NS_PER_S

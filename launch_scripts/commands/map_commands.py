@@ -21,7 +21,7 @@ from launch_scripts.report.exporter import FORMATS, Layer, write_layers, write_r
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.learning.learned import learned_kinds
+from shared_map.learning.factors import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame

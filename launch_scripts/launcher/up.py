@@ -40,7 +40,7 @@ from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
-from shared_map.prepared_classes import prepare_classes
+from shared_map.class_grounds import prepare_classes
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of

@@ -26,9 +26,8 @@ from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.web.server import Audience
 from shared_map.arrays import give_back_memory
-from shared_map.class_grounds import class_terrains
+from shared_map.class_grounds import class_terrains, load_classes
 from shared_map.cost_map import CostMap
-from shared_map.prepared_classes import load_classes
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.store import load_terrain, load_truth

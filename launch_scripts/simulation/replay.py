@@ -18,9 +18,9 @@ from launch_scripts.simulation.world.service import TargetsService
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
 from shared_map.arrays import Floats
+from shared_map.class_grounds import load_classes
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.prepared_classes import load_classes
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Bus, Event, Worker

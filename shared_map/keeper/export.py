@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.learning.factors import name_of
-from shared_map.learning.words import Said, stated, told
+from shared_map.learning.measurements import Measurement, columns_of, measurements_in
 from shared_map.replication.marks import Statements, fault, is_zone, mark_set, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile, grid_cells, tile_cells, tile_corners
@@ -95,7 +95,7 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet], classes: Sequ
 
 
 def _learned(each: MarkSet) -> dict[str, Any]:
-    said = told(each) or {}
+    said = measurements_in(each) or {}
     newest_ns = max(statements(each).stamps_ns.tolist(), default=0)
     return {"learned": [[key, name_of(key), *said[key]] for key in sorted(said)], "stamp_ns": newest_ns}
 
@@ -163,14 +163,14 @@ def _set(each: _Set, grid: GridSpec) -> MarkSet:
 
 
 def _word(each: _Set) -> MarkSet:
-    said = {one.key: Said(one.cells, one.mean, one.variance) for one in each.learned}
+    said = {one.key: Measurement(one.cells, one.mean, one.variance) for one in each.learned}
     if each.marks or len(said) < len(each.learned):
         raise ValueError(f"tile {each.tile} holds what is learned, each kind of ground once, and no marks")
     made = mark_set(
-        each.author, each.group, each.tile, each.epoch, each.seq, Statements(*stated(said, each.stamp_ns))
+        each.author, each.group, each.tile, each.epoch, each.seq, Statements(*columns_of(said, each.stamp_ns))
     )
     made.check()
-    if is_zone(each.author) or told(made) != said:
+    if is_zone(each.author) or measurements_in(made) != said:
         raise ValueError("what is learned is not as an author says it")
     return made
 

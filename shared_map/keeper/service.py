@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import msgspec
 
-from shared_map.keeper.base_map_transfer import BaseMapServer
+from shared_map.keeper.base_map import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.last_words import LastWords
 from shared_map.keeper.mark_store import Keeper, KeeperStore

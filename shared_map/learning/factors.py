@@ -1,9 +1,5 @@
-"""From what authors have measured to one factor for each kind of ground, in integers.
-
-A kind of ground is a class and a bin of slopes of five degrees. An author says of a kind on how many cells it has
-driven, and the mean and the variance of y = ln(driven pace / prior pace) there, of the middle half of the cells.
-Every replica that holds the same words has the same factors, bit for bit: no step of `log_factors` rounds as a
-machine likes.
+"""From what authors have measured to one factor for each kind of ground, in integers: no step of `log_steps` rounds
+as a machine likes.
 
 The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section 2.5).
 """
@@ -12,15 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats
-from shared_map.learning.middle import Middle, rounded
-from shared_map.learning.words import KEYS, MOST, MOST_CELLS, ONE, Said
+from shared_map.learning.measurements import KEYS, MOST_CELLS, ONE, Measurement, measurements_in, rounded
 from shared_map.terrain.layers import TerrainClass, slope_deg
-from swarm.wire.messages.map_data import owner_of
+from swarm.runtime.stats import LEARNED, Counters
+from swarm.wire.messages.map_data import MarkSet, owner_of
+
+Voice = Mapping[int, Measurement]
+"""What one process states: key of a kind of ground -> measurement."""
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 
 SLOPE_BINS = 6
 """0-5, 5-10 ... 20-25 degrees, and all that is steeper."""
@@ -29,15 +31,17 @@ SLOPE_BIN_DEG = 5
 _PRIOR_VARIANCE = ONE * 49 // 100
 """Of ln(factor) before anything is measured: tau of 0.7."""
 _USUAL_VARIANCE = ONE // 10
+"""Of y from cell to cell: paces of one kind differ by a third."""
 _USUAL_CELLS = 20
 """A variance of few cells is uncertain: it is taken together with this many cells of the usual one. With five, six
 cells that happened to be alike moved a class that was right."""
 _FEWEST_CELLS = 5
+"""A kind of which fewer cells are known keeps its prior, or the factor of its class."""
 _GATE = 20
 """Square of the number of standard errors that a mean must be away from 0: 4.5 of them. At two, one in twenty kinds
 that are right in the prior would be moved."""
 _MEDIAN_FROM = 5
-"""So many authors are judged by their median."""
+"""So many authors are judged by their median: of fewer, two that agree could be two lies."""
 STEPS_PER_10TH = 6246
 """ln(1.1) in `ONE`: factors are powers of 1.1."""
 MOST_STEPS = 14
@@ -61,92 +65,156 @@ def name_of(key: int) -> str:
     return f"{kind} {low}-{low + SLOPE_BIN_DEG}" if key % SLOPE_BINS < SLOPE_BINS - 1 else f"{kind} {low}+"
 
 
-def log_steps(said: Sequence[Said]) -> int:
-    """The factor of one kind of ground as a power of 1.1, by the words of all authors about it, in any order."""
-    cells, mean, variance = estimate(said)
+def log_steps(stated: Sequence[Measurement]) -> int:
+    """The factor of one kind of ground as a power of 1.1, from the measurements of all authors, in any order."""
+    cells, mean, variance = estimate(stated)
     if cells < _FEWEST_CELLS or mean * mean * cells <= _GATE * variance * ONE:
         return 0
     shrunk = rounded(mean * _PRIOR_VARIANCE * cells, _PRIOR_VARIANCE * cells + variance)
     return max(-MOST_STEPS, min(MOST_STEPS, rounded(shrunk, STEPS_PER_10TH)))
 
 
-def estimate(said: Sequence[Said]) -> Said:
-    """What all authors together say of one kind of ground: the cells that count, the mean, and the variance of one
-    cell. No cells if nobody says anything.
+def estimate(stated: Sequence[Measurement]) -> Measurement:
+    """What all authors together state of one kind of ground: the cells that count, the mean, and the variance of one
+    cell. No cells if nobody states anything.
 
     No author's mean counts for more than the largest factor there is. Five authors or more that know five cells
-    each count by their median: less than half of them cannot move it beyond what an honest one says. Of fewer none
+    each count by their median: less than half of them cannot move it beyond what an honest one states. Of fewer none
     has a weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1) of
     the largest factor at most where all know as many cells.
     """
-    words = sorted(each for each in said if each.cells > 0)
-    knowing = [each for each in words if each.cells >= _FEWEST_CELLS]
-    if not words:
-        return Said(0, 0, _USUAL_VARIANCE)
+    known = sorted(each for each in stated if each.cells > 0)
+    knowing = [each for each in known if each.cells >= _FEWEST_CELLS]
+    if not known:
+        return Measurement(0, 0, _USUAL_VARIANCE)
     if len(knowing) >= _MEDIAN_FROM:
         mean = _within(_median([each.mean for each in knowing]))
         variance = _median([each.variance for each in knowing])
         cells = len(knowing) * _median([each.cells for each in knowing])
     else:
         # Of those that know something: one that has hardly begun must not take the weight of all others.
-        counted = [each.cells for each in knowing or words]
-        cap = 2 * counted[(len(counted) - 1) // 2] if len(words) > 1 else MOST_CELLS
-        bounded = [each._replace(mean=_within(each.mean)) for each in words]
-        cells, mean, variance = _together(bounded, [min(each.cells, cap) for each in words])
+        counted = [each.cells for each in knowing or known]
+        cap = 2 * counted[(len(counted) - 1) // 2] if len(known) > 1 else MOST_CELLS
+        bounded = [each._replace(mean=_within(each.mean)) for each in known]
+        cells, mean, variance = _together(bounded, cap)
     variance = (variance * cells + _USUAL_VARIANCE * _USUAL_CELLS) // (cells + _USUAL_CELLS)
-    return Said(cells, mean, variance)
+    return Measurement(cells, mean, variance)
 
 
-def factors_of(words: Sequence[Mapping[int, Said]]) -> Floats:
+def factors_of(voices: Sequence[Voice]) -> Floats:
     """What to multiply the prior pace of each kind of ground by: float32 (KEYS,). A kind that is hardly driven yet
-    has the factor of its class.
-
-    words  of each process (`by_process`), key -> what it says
-    """
-    by_key: dict[int, list[Said]] = {}
-    for each in words:
-        for key, one in each.items():
-            by_key.setdefault(key, []).append(one)
+    has the factor of its class."""
+    of_classes = [
+        (kind, _together(parts))
+        for voice in voices
+        for kind, parts in _grouped((key // SLOPE_BINS, each) for key, each in voice.items()).items()
+    ]
     factors = np.ones(KEYS, np.float32)
-    for kind, said in _of_classes(words).items():
+    for kind, stated in _grouped(of_classes).items():
         first = kind * SLOPE_BINS
-        factors[first : first + SLOPE_BINS] = FACTORS[log_steps(said) + MOST_STEPS]
-    for key, said in by_key.items():
-        if estimate(said).cells >= _FEWEST_CELLS:  # those that count: a few words of one cell each are not enough
-            factors[key] = FACTORS[log_steps(said) + MOST_STEPS]
+        factors[first : first + SLOPE_BINS] = FACTORS[log_steps(stated) + MOST_STEPS]
+    for key, stated in _by_key(voices).items():
+        if (
+            estimate(stated).cells >= _FEWEST_CELLS
+        ):  # those that count: a few authors of one cell each are not enough
+            factors[key] = FACTORS[log_steps(stated) + MOST_STEPS]
     return factors
 
 
-def by_process(words: Iterable[tuple[str, Mapping[int, Said]]]) -> list[Mapping[int, Said]]:
-    """The words of authors, those of all lives of one process together: it has one voice, however often it was
-    started, or says that it was.
+def factors_in(sets: Iterable[MarkSet]) -> Floats:
+    """What to multiply the prior pace of each kind of ground by: float32 (KEYS,).
 
-    words  (author, key -> what it says)
+    sets  about the tile beyond the map; what carries no measurements is left out
     """
-    lives: dict[str, list[Mapping[int, Said]]] = {}
-    for author, word in words:
-        lives.setdefault(owner_of(author), []).append(word)
-    return [of[0] if len(of) == 1 else _of_lives(of) for of in lives.values()]
+    return factors_of(_voices(sets))
 
 
-def _of_lives(words: Sequence[Mapping[int, Said]]) -> dict[int, Said]:
-    parts: dict[int, list[Said]] = {}
-    for word in words:
-        for key, said in word.items():
-            parts.setdefault(key, []).append(said)
-    return {key: _together(of, [each.cells for each in of]) for key, of in parts.items()}
+class LearnedKind(NamedTuple):
+    """What is known of one kind of ground.
+
+    kind            its class and its slopes in degrees, such as `forest 10-15`
+    cells           driven cells, as all authors say together
+    authors         processes that have driven there
+    measured        driven over prior pace, geometric mean of what counts
+    standard_error  of ln(measured)
+    factor          what the prior pace is multiplied by
+    """
+
+    kind: str
+    cells: int
+    authors: int
+    measured: float
+    standard_error: float
+    factor: float
 
 
-def _of_classes(words: Sequence[Mapping[int, Said]]) -> dict[int, list[Said]]:
-    """Class -> what each author has measured of all of its slopes together."""
-    by_class: dict[int, list[Said]] = {}
-    for word in words:
-        of: dict[int, list[Said]] = {}
-        for key, said in word.items():
-            of.setdefault(key // SLOPE_BINS, []).append(said)
-        for kind, parts in of.items():
-            by_class.setdefault(kind, []).append(_together(parts, [part.cells for part in parts]))
-    return by_class
+def learned_kinds(sets: Iterable[MarkSet]) -> list[LearnedKind]:
+    """Each kind of ground that was driven, in order of class and slope.
+
+    sets  as of `factors_in`
+    """
+    voices = _voices(sets)
+    factors = factors_of(voices)
+    rows = []
+    for key, parts in sorted(_by_key(voices).items()):
+        if key < SLOPE_BINS * (max(TerrainClass) + 1):
+            cells, mean, variance = estimate(parts)
+            known = sum(each.cells for each in parts)
+            error = math.sqrt(variance / ONE / cells)
+            rows.append(
+                LearnedKind(name_of(key), known, len(parts), math.exp(mean / ONE), error, float(factors[key]))
+            )
+    return rows
+
+
+class LearnedGauges:
+    """Publishes by what the prior pace of each class is multiplied: the mean over its cells, of all slopes. A class
+    whose prior stands has no gauge.
+
+    keys  the kind of ground of each cell; None if nothing is learned
+    """
+
+    def __init__(self, keys: Bytes | None, counters: Counters) -> None:
+        self._counters = counters
+        self._published: Floats | None = None
+        self._cells = None if keys is None else np.bincount(keys.reshape(-1), minlength=KEYS)
+
+    def tick(self, factors: Floats) -> None:
+        """Publishes what is new.
+
+        factors  float32 (KEYS,)  another array whenever they have changed
+        """
+        if self._cells is None or factors is self._published:
+            return
+        self._published = factors
+        for kind in TerrainClass:
+            part = slice(kind * SLOPE_BINS, (kind + 1) * SLOPE_BINS)
+            name = LEARNED + kind.name.lower()
+            self._counters.gauges.pop(name, None)
+            if (factors[part] != 1).any() and self._cells[part].any():
+                self._counters.gauge(name, round(float(np.average(factors[part], weights=self._cells[part])), 3))
+
+
+def _voices(sets: Iterable[MarkSet]) -> list[Voice]:
+    """The measurements of authors, those of all lives of one process together: it has one voice, however often it
+    was started, or says that it was."""
+    lives = _grouped((owner_of(each.author), stated) for each in sets if (stated := measurements_in(each)))
+    return [
+        of[0] if len(of) == 1 else {k: _together(parts) for k, parts in _by_key(of).items()}
+        for of in lives.values()
+    ]
+
+
+def _by_key(voices: Iterable[Voice]) -> dict[int, list[Measurement]]:
+    """Key -> what each voice that knows this kind states of it."""
+    return _grouped(pair for voice in voices for pair in voice.items())
+
+
+def _grouped(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
+    groups: dict[_Key, list[_Value]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
 
 
 def _within(mean: int) -> int:
@@ -155,41 +223,16 @@ def _within(mean: int) -> int:
     return max(-most, min(most, mean))
 
 
-def _together(parts: Sequence[Said], weights: Sequence[int]) -> Said:
-    """Mean and variance of what several words measured, each of which counts for so many cells."""
+def _together(parts: Sequence[Measurement], cap: int | None = None) -> Measurement:
+    """Mean and variance of what several have measured, each with the weight of its cells.
+
+    cap  no part has a larger weight
+    """
+    weights = [each.cells if cap is None else min(each.cells, cap) for each in parts]
     cells = sum(weights)
     mean = rounded(sum(w * part.mean for w, part in zip(weights, parts, strict=True)), cells)
     off = (w * (part.variance + (part.mean - mean) ** 2 // ONE) for w, part in zip(weights, parts, strict=True))
-    return Said(cells, mean, sum(off) // cells)
-
-
-class Measured:
-    """What one author has measured. A cell counts once, the first time that it is driven.
-
-    version  grows with every cell that counts
-    """
-
-    def __init__(self, keys: Bytes) -> None:
-        self.version = 0
-        self._keys = keys.reshape(-1)
-        self._driven = np.zeros(len(self._keys), np.bool_)
-        self._middles: dict[int, Middle] = {}  # by key
-
-    def add(self, cell: int, driven_s_per_m: float, prior_s_per_m: float) -> None:
-        """A cell was driven at this pace. What is no pace, or lethal by the prior, says nothing."""
-        if self._driven[cell] or not (0 < driven_s_per_m < math.inf and 0 < prior_s_per_m < math.inf):
-            return
-        self._driven[cell] = True
-        y = max(-MOST, min(MOST, round(math.log(driven_s_per_m / prior_s_per_m) * ONE)))
-        middle = self._middles.setdefault(int(self._keys[cell]), Middle())
-        if middle.cells < MOST_CELLS:
-            middle.add(y)
-            self.version += 1
-
-    @property
-    def said(self) -> dict[int, Said]:
-        """Key -> what to say of it."""
-        return {key: middle.said for key, middle in sorted(self._middles.items())}
+    return Measurement(cells, mean, sum(off) // cells)
 
 
 def _median(values: Sequence[int]) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shared_map.learning.words import told
+from shared_map.learning.measurements import measurements_in
 from shared_map.replication.digest import Held, Ledger, fingerprint
 from shared_map.replication.limits import Capacity
 from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
@@ -103,7 +103,7 @@ class HeldSets:
         """Whether a set states something about cells which this grid does not have. What is learned is told about
         the tile beyond the last one, as `words` has it, and not by operators."""
         if received.tile == self._tile_count:
-            return is_zone(received.author) or told(received) is None
+            return is_zone(received.author) or measurements_in(received) is None
         known = received.tile < self._tile_count and not self._ragged
         return not known and fault(received, self._grid) is not None
 

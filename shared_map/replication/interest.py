@@ -5,6 +5,7 @@ The squares are regions, the unit of subscription, or others of one size.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable
 
 import numpy as np
@@ -63,3 +64,86 @@ class Interest:
             for row in range(top, bottom + 1)
             for col in range(left, right + 1)
         }
+
+
+# Whose digests a replica that holds a part of the map listens to. Pure: time is an argument.
+#
+# A digest concerns replicas that hold tiles of which its author has put sets lately. Which those are is not known
+# beforehand. A replica listens to
+#
+# - keepers, whose digests name all sets;
+# - authors of which sets about its own regions came in the last `_NAMED_FOR` periods;
+# - everybody, while no keeper is heard, after a link came back, and now and then.
+#
+# A set that was lost is found by the next digest of its author if the author is known, else by that of the keeper. If
+# the keeper is gone, full or cut off from the author, it is found when the replica next listens to everybody.
+
+_KEEPER_FOR = 3
+_NAMED_FOR = 30
+_ALL_EVERY = 90
+_ALL_FOR = 5
+"""In periods of whole digests: how long a keeper or author counts as near after it spoke; how often and how long
+everybody is listened to. The last is longer than an author is silent before it counts as gone."""
+_MOST_NAMES = 1024
+
+
+class DigestInterest:
+    """Decides whose digests are listened to.
+
+    name       of the listener: those with different names do not all listen to everybody at the same time
+    period_ns  of whole digests
+    """
+
+    def __init__(self, name: str, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._phase_ns = _ALL_EVERY * period_ns * zlib.crc32(name.encode()) >> 32
+        self._keepers: dict[str, int] = {}  # keeper -> until when it counts as heard
+        self._authors: dict[str, int] = {}  # author -> until when it counts as near
+        self._all_until_ns = 0  # listen to everybody until then, at least
+        self._all_due_ns = 0  # and again from then on
+        self._all_since_ns: int | None = None  # when that began; None: only those of `_named` are listened to
+        self._named: dict[str, int] = {}  # sender -> since when it has been listened to, of those by name
+
+    def start(self, now_ns: int) -> None:
+        """Everybody is listened to from now on, until a keeper is heard."""
+        self._all_since_ns = now_ns
+        self._all_until_ns = now_ns + _ALL_FOR * self._period_ns
+        self._all_due_ns = self._all_until_ns + self._phase_ns
+
+    def listen_to_all(self, now_ns: int) -> None:
+        """A link came back: what was missed meanwhile may be of anybody."""
+        self._all_until_ns = now_ns + _ALL_FOR * self._period_ns
+
+    def keeper_spoke(self, keeper: str, now_ns: int) -> None:
+        """A keeper told all sets that it holds."""
+        _note(self._keepers, keeper, now_ns + _KEEPER_FOR * self._period_ns)
+
+    def author_is_near(self, author: str, now_ns: int) -> None:
+        """An author put a set about tiles that are held here."""
+        _note(self._authors, author, now_ns + _NAMED_FOR * self._period_ns)
+
+    def update(self, now_ns: int) -> frozenset[str] | None:
+        """Whose digests to listen to from now on; None for those of everybody."""
+        self._keepers = {keeper: until for keeper, until in self._keepers.items() if now_ns <= until}
+        self._authors = {author: until for author, until in self._authors.items() if now_ns <= until}
+        if now_ns >= self._all_due_ns:
+            self._all_due_ns = now_ns + _ALL_EVERY * self._period_ns
+            self.listen_to_all(now_ns)
+        if not self._keepers or now_ns < self._all_until_ns:
+            if self._all_since_ns is None:
+                self._all_since_ns = now_ns
+            return None
+        since_ns = now_ns if self._all_since_ns is None else self._all_since_ns
+        self._named = {each: min(self._named.get(each, now_ns), since_ns) for each in self._keepers | self._authors}
+        self._all_since_ns = None
+        return frozenset(self._named)
+
+    def since_ns(self, author: str) -> int | None:
+        """Since when an author's digests have been listened to; None if they are not."""
+        found = [each for each in (self._all_since_ns, self._named.get(author)) if each is not None]
+        return min(found, default=None)
+
+
+def _note(known: dict[str, int], name: str, until_ns: int) -> None:
+    if name in known or len(known) < _MOST_NAMES:
+        known[name] = until_ns

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared_map.learning.words import Said, stated
+from shared_map.learning.measurements import Measurement, columns_of
 from shared_map.replication.digest import Held
 from shared_map.replication.filter import MarkFilter
 from shared_map.replication.held_sets import HeldSets
@@ -395,9 +395,9 @@ class MapReplica:
         self.counts["marks_written"] += len(cells)
         self._put_own(tile, sparse(own))
 
-    def write_learned(self, said: Mapping[int, Said], now_ns: int) -> list[PublishSet]:
-        """State what we have learned (`shared_map.learning.words`), instead of what we said of it before."""
-        self._put_own(beyond_tile(self.grid), Statements(*stated(said, now_ns)))
+    def write_learned(self, said: Mapping[int, Measurement], now_ns: int) -> list[PublishSet]:
+        """State what we have learned (`shared_map.learning.measurements`), instead of what we said of it before."""
+        self._put_own(beyond_tile(self.grid), Statements(*columns_of(said, now_ns)))
         return self.tick(now_ns)
 
     def retract(self, cells: ArrayLike, now_ns: int) -> list[PublishSet]:

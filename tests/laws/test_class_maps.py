@@ -8,7 +8,7 @@ from support.effort import few
 
 from shared_map.class_maps import ClassMaps
 from shared_map.cost_map import CostMap
-from shared_map.learning.words import Said
+from shared_map.learning.measurements import Measurement
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
@@ -72,7 +72,7 @@ class History:
     def learn(self) -> None:
         author = MapReplica(self.grid, author=f"all.l{self.rng.integers(3)}.{self.rng.integers(1, 1 << 20)}")
         said = {
-            int(key): Said(int(self.rng.integers(50, 500)), int(self.rng.integers(-60_000, 60_000)), 10)
+            int(key): Measurement(int(self.rng.integers(50, 500)), int(self.rng.integers(-60_000, 60_000)), 10)
             for key in range(4)
         }
         self.replica.merge([each.mark_set for each in author.write_learned(said, 10)])

@@ -12,7 +12,7 @@ from support.effort import few
 from shared_map.arrays import Floats
 from shared_map.cost_map import CostMap
 from shared_map.learning.factors import factors_of, keys_of
-from shared_map.learning.words import MOST, ONE, Said
+from shared_map.learning.measurements import MOST, ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
@@ -21,8 +21,8 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSe
 
 SIDE = 40
 """More than a tile."""
-Words = list[dict[int, Said]]
-SAID = st.builds(Said, st.integers(1, 500), st.integers(-MOST, MOST), st.integers(0, ONE))
+Words = list[dict[int, Measurement]]
+SAID = st.builds(Measurement, st.integers(1, 500), st.integers(-MOST, MOST), st.integers(0, ONE))
 WORDS = st.lists(st.dictionaries(st.integers(0, 5), SAID, max_size=4), min_size=1, max_size=6)
 """Of each author, about slopes of the class that `terrain_of_pace` knows."""
 

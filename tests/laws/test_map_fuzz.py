@@ -14,8 +14,7 @@ from support.map_strategies import GRID, Acknowledged, Composite, held_winners, 
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.replication.mark_sets import packed, unpacked
-from shared_map.replication.marks import fault
+from shared_map.replication.marks import fault, packed, unpacked
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, decode_many, encode

@@ -11,8 +11,7 @@ from support.map_strategies import GRID, Composite, held_winners, mark_sets, mer
 from shared_map.replication import merge as merge_module
 from shared_map.replication import replica as replica_module
 from shared_map.replication.limits import Capacity
-from shared_map.replication.mark_sets import packed, unpacked
-from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.marks import Statements, mark_set, packed, unpacked
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode

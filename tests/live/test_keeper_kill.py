@@ -19,7 +19,7 @@ import pytest
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.learning.words import ONE, Said, stated
+from shared_map.learning.measurements import ONE, Measurement, columns_of
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.tiles import beyond_region, beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
@@ -90,8 +90,8 @@ class Load:
     def _learn(self) -> None:
         """Say what was measured of two kinds of ground by now: sets of marks as all others, but about no cell."""
         self.put += 1
-        said = {0: Said(self.put, ONE, ONE // 10), 7: Said(5, -ONE, 0)}
-        word = mark_set("load.1", "all", LEARNED, 1, self.put * SEQ_STEP, Statements(*stated(said, self.put)))
+        said = {0: Measurement(self.put, ONE, ONE // 10), 7: Measurement(5, -ONE, 0)}
+        word = mark_set("load.1", "all", LEARNED, 1, self.put * SEQ_STEP, Statements(*columns_of(said, self.put)))
         self._bus.publish(MARKS, word, region=beyond_region(GRID), tile=LEARNED, author="load.1")
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from launch_scripts.commands.map_commands import app
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.learning.words import ONE, Said
+from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_region, beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
@@ -39,7 +39,7 @@ def test_a_running_swarm_says_what_was_learned(tmp_path: Path) -> None:
     scenario = Scenario(network=network, map=MapConfig(learning=True))
     setup = RoleSetup(scenario, "run", "keeper", "k", time.time_ns(), 0)
     (word,) = MapReplica(terrain.grid, author="all.a1.1").write_learned(
-        {0: Said(400, ONE, ONE // 10)}, time.time_ns()
+        {0: Measurement(400, ONE, ONE // 10)}, time.time_ns()
     )
     processes: list[Process] = []
 
@@ -56,14 +56,14 @@ def test_a_running_swarm_says_what_was_learned(tmp_path: Path) -> None:
         try:
             tile = beyond_tile(terrain.grid)
 
-            def told() -> list[dict[str, object]]:
+            def measurements_in() -> list[dict[str, object]]:
                 region = beyond_region(terrain.grid)
                 bus.publish(MARKS, word.mark_set, region=region, tile=tile, author="all.a1.1")
                 result = CliRunner().invoke(app, ["learned", "--connect", endpoint, "--json"])
                 return json.loads(result.stdout)["kinds"] if result.exit_code == 0 else []
 
             eventually(told, 30, "the keeper")
-            (row,) = told()
+            (row,) = measurements_in()
             assert (row["kind"], row["cells"], row["authors"]) == ("unknown 0-5", 400, 1)
         finally:
             for process in processes:

@@ -8,7 +8,7 @@ from support.bus_world import Box, World, answering, asked, marks, note, pose, r
 
 from docs.generate.wire_page import PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
-from shared_map.replication.mark_sets import packed
+from shared_map.replication.marks import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
 from swarm.wire.codec import encode, encode_json

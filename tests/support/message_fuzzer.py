@@ -18,8 +18,8 @@ from typing import Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from shared_map.learning.words import KEYS, MOST, MOST_CELLS, ONE, Said, stated
-from shared_map.replication.mark_sets import packed
+from shared_map.learning.measurements import KEYS, MOST, MOST_CELLS, ONE, Measurement, columns_of
+from shared_map.replication.marks import packed
 from shared_map.replication.tiles import beyond_tile, region_of
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
@@ -201,12 +201,12 @@ class MessageFuzzer:
         """The word of an author about kinds of ground."""
         choice = self._chance.choice
         said = {
-            choice((0, 1, self._chance.randrange(KEYS), KEYS - 1)): Said(
+            choice((0, 1, self._chance.randrange(KEYS), KEYS - 1)): Measurement(
                 choice((1, 30, MOST_CELLS)), choice((-MOST, 0, ONE, MOST)), choice((0, 1, ONE, MOST * MOST // ONE))
             )
             for _ in range(choice((1, 3, 40)))
         }
-        columns = stated(said, self._stamp_ns(0, (1 << 62) - 1))
+        columns = columns_of(said, self._stamp_ns(0, (1 << 62) - 1))
         return {name: each.tobytes() for name, each in columns._asdict().items()}
 
     def _legs(self, steps: int) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from launch_scripts.simulation.world.service import TICK_HZ, TargetsService
-from shared_map.prepared_classes import load_classes
+from shared_map.class_grounds import load_classes
 from shared_map.terrain.store import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock

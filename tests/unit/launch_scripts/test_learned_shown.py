@@ -15,8 +15,8 @@ from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.map_figure import QUICKER, SLOWER, learned_pixels
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.cost_map import CostMap
-from shared_map.learning.gauges import LearnedGauges
-from shared_map.learning.words import ONE, Said
+from shared_map.learning.factors import LearnedGauges
+from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.load import parse_scenario
@@ -39,8 +39,8 @@ def half_steep() -> Terrain:
 GROUND = half_steep()
 
 
-def said(times: float) -> Said:
-    return Said(400, round(np.log(times) * ONE), ONE // 10)
+def said(times: float) -> Measurement:
+    return Measurement(400, round(np.log(times) * ONE), ONE // 10)
 
 
 def learned(**keys: float) -> tuple[CostMap, list[MarkSet]]:

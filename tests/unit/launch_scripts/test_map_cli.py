@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from launch_scripts.commands.map_commands import app
 from shared_map.keeper.export import from_json, to_bands, to_json
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.learning.words import Said
+from shared_map.learning.measurements import Measurement
 from shared_map.replication.replica import MapReplica
 from swarm.errors import StoreError
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
@@ -152,13 +152,13 @@ def test_a_garbled_export_is_refused_with_the_place(change: dict[str, object], p
         from_json(text)
 
 
-def learned_sets(author: str, *said: Said) -> list[MarkSet]:
+def learned_sets(author: str, *said: Measurement) -> list[MarkSet]:
     replica = MapReplica(GRID, author=author)
     return [each.mark_set for each in replica.write_learned(dict(enumerate(said)), 1)]
 
 
 def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:
-    store = stored(tmp_path / "map.sqlite", [*SETS, *learned_sets("all.a1.1", Said(400, 72_000, 6_500))])
+    store = stored(tmp_path / "map.sqlite", [*SETS, *learned_sets("all.a1.1", Measurement(400, 72_000, 6_500))])
     found = json.loads(CliRunner().invoke(app, ["inspect", str(store), "--json"]).stdout)
     assert (found["sets"], found["marks"], list(found["authors"])) == (3, 3, ["a1.1", "a2.1"])
     assert found["authors_that_learned"] == ["all.a1.1"]
@@ -168,8 +168,8 @@ def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:
 
 def test_what_is_learned_is_imported_as_it_was_exported(tmp_path: Path) -> None:
     words = [
-        *learned_sets("all.a1.1", Said(400, 72_000, 6_500)),
-        *learned_sets("all.a2.1", Said(9, 70_000, 0), Said(1, 0, 7)),
+        *learned_sets("all.a1.1", Measurement(400, 72_000, 6_500)),
+        *learned_sets("all.a2.1", Measurement(9, 70_000, 0), Measurement(1, 0, 7)),
     ]
     file, again = tmp_path / "marks.json", tmp_path / "again.sqlite"
     file.write_text(to_json("t", GRID, [*SETS, *words]), encoding="utf-8")
@@ -197,7 +197,7 @@ def test_what_is_learned_is_imported_as_it_was_exported(tmp_path: Path) -> None:
     ],
 )
 def test_a_file_that_says_what_no_author_could_have_learned_is_refused(change: dict[str, object]) -> None:
-    exported = json.loads(to_json("t", GRID, learned_sets("all.a1.1", Said(400, 72_000, 6_500))))
+    exported = json.loads(to_json("t", GRID, learned_sets("all.a1.1", Measurement(400, 72_000, 6_500))))
     exported["sets"][0] |= change
     with pytest.raises(StoreError, match=r"sets\[0\]"):
         from_json(json.dumps(exported))

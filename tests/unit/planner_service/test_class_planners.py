@@ -21,7 +21,7 @@ from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps, read_by
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import rows_of
-from shared_map.learning.words import ONE, Said
+from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event
@@ -318,7 +318,7 @@ def test_what_is_learned_of_a_kind_of_ground_holds_for_every_class() -> None:
     maps = ClassMaps(CostMap(terrain, learning=True), classes, _NUMBERS)
     writer = MapReplica(terrain.grid, CostMap(terrain, learning=True), author="all.a0.1")
     kinds = np.unique(maps.common.keys[np.isfinite(terrain.pace_s_per_m)])  # type: ignore[index]
-    learned = {int(kind): Said(500, round(np.log(3) * ONE), ONE // 10) for kind in kinds}
+    learned = {int(kind): Measurement(500, round(np.log(3) * ONE), ONE // 10) for kind in kinds}
     maps.learn([each.mark_set for each in writer.write_learned(learned, 10**9)])
     assert (maps.common.version, {name: each.version for name, each in maps.of.items()}) == (
         1,

@@ -12,8 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.swarm_model import SwarmModel
 
-from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, describe, pack
-from shared_map.keeper.base_map_transfer import BaseMapServer, Fetching, fetch_base_map
+from shared_map.keeper.base_map import (
+    LAYERS,
+    NEEDED,
+    BaseMapCopy,
+    BaseMapServer,
+    Fetching,
+    describe,
+    fetch_base_map,
+    pack,
+)
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Bus, Event, Replied

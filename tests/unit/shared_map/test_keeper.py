@@ -13,7 +13,7 @@ from support.map_strategies import GRID, Acknowledged, set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import Keeper, KeeperStore
-from shared_map.learning.words import ONE, Said, told
+from shared_map.learning.measurements import ONE, Measurement, measurements_in
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.load import parse_scenario
@@ -287,7 +287,7 @@ def test_what_a_dead_author_learned_stays_as_it_was_said_while_its_marks_are_com
     store = KeeperStore(":memory:")
     keeper, other = swarm.keeper("k", store), swarm.writer("a2.1")
     author, dead = swarm.writer("a1.1"), swarm.writer("a3.1")
-    said = {0: Said(400, ONE, ONE // 10)}
+    said = {0: Measurement(400, ONE, ONE // 10)}
     author.sync.publish(author.replica.write_learned(said, swarm.now_ns))
     for each in (author, dead):
         swarm.run(1)
@@ -304,8 +304,8 @@ def test_what_a_dead_author_learned_stays_as_it_was_said_while_its_marks_are_com
     for held in (keeper.replica.held, other.replica.held, late.replica.held):
         word = held.get(beyond, "a1.1")
         assert word is not None
-        assert told(word) == said
-    assert [told(each) for each in store.load() if each.tile == beyond] == [said]
+        assert measurements_in(word) == said
+    assert [measurements_in(each) for each in store.load() if each.tile == beyond] == [said]
 
 
 def test_a_keeper_refuses_the_store_of_another_terrain() -> None:

@@ -9,9 +9,16 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from shared_map.cost_map import CostMap
-from shared_map.learning.factors import FACTORS, MOST_STEPS, Measured, factors_of, log_steps
-from shared_map.learning.middle import Middle
-from shared_map.learning.words import MOST, MOST_CELLS, ONE, Said, told
+from shared_map.learning.factors import FACTORS, MOST_STEPS, factors_of, log_steps
+from shared_map.learning.measurements import (
+    MOST,
+    MOST_CELLS,
+    ONE,
+    Measured,
+    Measurement,
+    TrimmedMean,
+    measurements_in,
+)
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
@@ -19,9 +26,11 @@ from swarm.clock import NS_PER_S
 from swarm.config.classes import MOST_CLASSES
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 
-SAID = st.builds(Said, st.integers(1, MOST_CELLS), st.integers(-MOST, MOST), st.integers(0, MOST * MOST // ONE))
+SAID = st.builds(
+    Measurement, st.integers(1, MOST_CELLS), st.integers(-MOST, MOST), st.integers(0, MOST * MOST // ONE)
+)
 WORDS = st.dictionaries(st.integers(0, 255), SAID, max_size=4)
-THRICE = Said(400, round(np.log(3) * ONE), ONE // 10)
+THRICE = Measurement(400, round(np.log(3) * ONE), ONE // 10)
 
 
 def _terrain() -> Terrain:
@@ -44,7 +53,7 @@ def let_settle(replica: MapReplica) -> None:
     replica.tick(replica.now_ns + 6 * NS_PER_S)
 
 
-def sets_of(author: str, *said: dict[int, Said]) -> list[MarkSet]:
+def sets_of(author: str, *said: dict[int, Measurement]) -> list[MarkSet]:
     """The sets that an author publishes when it learns these, one after the other."""
     replica, _ = replica_of(author, GROUND)
     return [each.mark_set for n, one in enumerate(said) for each in replica.write_learned(one, n * 10**9)]
@@ -52,16 +61,16 @@ def sets_of(author: str, *said: dict[int, Said]) -> list[MarkSet]:
 
 @FEW
 @given(WORDS)
-def test_words_are_read_as_they_were_written(said: dict[int, Said]) -> None:
+def test_words_are_read_as_they_were_written(said: dict[int, Measurement]) -> None:
     (word,) = sets_of("all.a.1", said)
     word.check()
-    assert told(word) == said
+    assert measurements_in(word) == said
 
 
 @FEW
 @given(st.data(), st.lists(st.lists(WORDS, min_size=1, max_size=3), min_size=1, max_size=6))
 def test_replicas_have_equal_maps_in_whatever_order_words_come(
-    data: st.DataObject, by_author: list[list[dict[int, Said]]]
+    data: st.DataObject, by_author: list[list[dict[int, Measurement]]]
 ) -> None:
     sets = [each for n, said in enumerate(by_author) for each in sets_of(f"all.a{n}.1", *said)]
     maps = []
@@ -78,7 +87,7 @@ def test_replicas_have_equal_maps_in_whatever_order_words_come(
 
 @given(st.lists(SAID, min_size=4, max_size=8), SAID)
 def test_one_liar_among_five_moves_a_factor_no_further_than_some_honest_author(
-    honest: list[Said], lie: Said
+    honest: list[Measurement], lie: Measurement
 ) -> None:
     honest = [each._replace(cells=5 + each.cells % 1000) for each in honest]
     steps = log_steps([*honest, lie._replace(cells=max(lie.cells, 5))])
@@ -86,14 +95,16 @@ def test_one_liar_among_five_moves_a_factor_no_further_than_some_honest_author(
     assert min(*alone, 0) - 1 <= steps <= max(*alone, 0) + 1
 
 
-@given(st.lists(st.just(Said(100, 0, ONE // 10)), min_size=2, max_size=3), SAID)
-def test_before_five_a_liar_has_a_bounded_share(honest: list[Said], lie: Said) -> None:
+@given(st.lists(st.just(Measurement(100, 0, ONE // 10)), min_size=2, max_size=3), SAID)
+def test_before_five_a_liar_has_a_bounded_share(honest: list[Measurement], lie: Measurement) -> None:
     share = 2 / (2 + len(honest))
     assert abs(log_steps([*honest, lie])) <= share * MOST_STEPS + 1
 
 
 @given(st.integers(30, 400), SAID)
-def test_an_author_that_has_hardly_begun_takes_nothing_from_what_another_knows(cells: int, said: Said) -> None:
+def test_an_author_that_has_hardly_begun_takes_nothing_from_what_another_knows(
+    cells: int, said: Measurement
+) -> None:
     few = said._replace(cells=1, mean=max(-ONE, min(ONE, said.mean)), variance=0)
     known = THRICE._replace(cells=cells)
     assert log_steps([known, few]) >= log_steps([known]) - 2
@@ -102,7 +113,7 @@ def test_an_author_that_has_hardly_begun_takes_nothing_from_what_another_knows(c
 @FEW
 @given(st.lists(WORDS, min_size=2, max_size=30), st.integers(0, NS_PER_S))
 def test_however_often_an_author_changes_its_mind_the_map_changes_once_in_five_seconds(
-    words: list[dict[int, Said]], every_ns: int
+    words: list[dict[int, Measurement]], every_ns: int
 ) -> None:
     replica, cost_map = replica_of(None, GROUND)
     sets = sets_of("all.a.1", *words)
@@ -118,7 +129,7 @@ def test_however_often_an_author_changes_its_mind_the_map_changes_once_in_five_s
 
 @FEW
 @given(st.dictionaries(st.integers(0, 255), SAID, max_size=30))
-def test_factors_lie_within_a_quarter_and_four(said: dict[int, Said]) -> None:
+def test_factors_lie_within_a_quarter_and_four(said: dict[int, Measurement]) -> None:
     factors = factors_of([said])
     assert (factors >= 0.25).all()
     assert (factors <= 4).all()
@@ -177,14 +188,14 @@ def test_what_is_no_word_changes_nothing() -> None:
         replica, cost_map = replica_of(None, GROUND)
         each.check()
         replica.merge([each])
-        assert told(each) is None
+        assert measurements_in(each) is None
         assert (cost_map.factors == 1).all()
     with pytest.raises(ValueError, match="pace"):
         replace(word, paces=np.full(3, np.nan, "<f4").tobytes()).check()
 
 
 def test_a_process_has_one_voice_however_many_lives_it_writes_under() -> None:
-    right, lie = {0: Said(400, 0, ONE // 10)}, {0: THRICE}
+    right, lie = {0: Measurement(400, 0, ONE // 10)}, {0: THRICE}
     honest = [each for n in range(5) for each in sets_of(f"all.a{n}.1", right)]
     replica, cost_map = replica_of(None, GROUND)
     replica.merge([*honest, *(each for n in range(9) for each in sets_of(f"all.liar.{n}", lie))])
@@ -205,7 +216,7 @@ def test_a_cell_counts_once_and_what_is_no_pace_not_at_all() -> None:
     measured = Measured(np.zeros((4, 4), np.uint8))
     for cell, driven, prior in ((1, 1.5, 0.5), (1, 9.0, 0.5), (2, np.nan, 0.5), (3, 1.0, np.inf), (4, 0.0, 1.0)):
         measured.add(cell, driven, prior)
-    assert measured.said == {0: Said(1, round(np.log(3) * ONE), 0)}
+    assert measured.by_key == {0: Measurement(1, round(np.log(3) * ONE), 0)}
 
 
 def test_a_slope_of_which_too_little_counts_has_the_factor_of_its_class() -> None:
@@ -213,15 +224,15 @@ def test_a_slope_of_which_too_little_counts_has_the_factor_of_its_class() -> Non
     words = [{level: THRICE, steep: THRICE._replace(cells=4)}, {level: THRICE, steep: THRICE._replace(cells=1)}]
     factors = factors_of(words)
     assert factors[steep] == factors[level] > 2.5
-    assert factors_of([words[0], {steep: Said(100, 0, ONE // 10)}])[steep] == 1, (
+    assert factors_of([words[0], {steep: Measurement(100, 0, ONE // 10)}])[steep] == 1, (
         "it is known to be as the prior says"
     )
 
 
 @pytest.mark.parametrize("cells", [4, 5, 20, 400])
 def test_only_what_is_significant_is_learned(cells: int) -> None:
-    assert (log_steps([Said(cells, THRICE.mean, ONE // 10)]) > 8) == (cells >= 5)
-    assert log_steps([Said(cells, ONE // 20, ONE // 10)]) == 0
+    assert (log_steps([Measurement(cells, THRICE.mean, ONE // 10)]) > 8) == (cells >= 5)
+    assert log_steps([Measurement(cells, ONE // 20, ONE // 10)]) == 0
 
 
 @given(st.lists(st.integers(-ONE, ONE), min_size=4, max_size=60), st.data())
@@ -231,10 +242,10 @@ def test_what_lies_on_less_than_a_quarter_of_the_cells_does_not_tell_of_their_ki
     few = data.draw(st.lists(st.integers(-MOST, MOST), max_size=(len(typical) - 1) // 3))
     middles = []
     for order in (typical + few, data.draw(st.permutations(typical + few))):
-        middle = Middle()
+        middle = TrimmedMean()
         for y in order:
             middle.add(y)
-        middles.append(middle.said)
+        middles.append(middle.measurement)
     assert middles[0] == middles[1], "in whatever order they are driven"
     bin_width = ONE // 64
     assert min(typical) - bin_width <= middles[0].mean <= max(typical) + bin_width
@@ -244,12 +255,12 @@ def test_what_lies_on_less_than_a_quarter_of_the_cells_does_not_tell_of_their_ki
 
 @given(st.lists(st.integers(-MOST, MOST), min_size=1, max_size=80))
 def test_the_middle_half_is_that_of_the_sorted_numbers(numbers: list[int]) -> None:
-    middle = Middle()
+    middle = TrimmedMean()
     for y in numbers:
         middle.add(y)
     cut = len(numbers) // 4
     kept = sorted(numbers)[cut : len(numbers) - cut]
-    assert abs(middle.said.mean - sum(kept) / len(kept)) <= ONE // 64 + 1
+    assert abs(middle.measurement.mean - sum(kept) / len(kept)) <= ONE // 64 + 1
     held = np.clip(np.sort(np.array(numbers, np.float64)), kept[0], kept[-1]) / ONE
     variance = min(held.var() * (len(numbers) / len(kept)) ** 2, 25.0)
-    assert middle.said.variance / ONE == pytest.approx(variance, rel=0.02, abs=0.05)
+    assert middle.measurement.variance / ONE == pytest.approx(variance, rel=0.02, abs=0.05)
