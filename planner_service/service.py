@@ -96,7 +96,7 @@ class PlannerService:
         filter = MarkFilter(terrain.grid, self._heard_groups)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
-        self._presence = Presence(terrain.grid, _PRESENCE_NS, scenario.vehicles.sense_range_m, filter)
+        self._presence = Presence(_PRESENCE_NS, filter)
         """Who looks where; nothing is heard of it for a target that has a tracker."""
         self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
         self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
@@ -295,10 +295,9 @@ class PlannerService:
             return
         for heard in self._bus.collected(FLEET):
             assert isinstance(heard.message, Fleet)
-            self._presence.hear(heard.message, now_ns)
+            self._presence.receive(heard.message, now_ns)
         self._presence.expire(now_ns)
-        vehicles = self._presence.vehicles
-        search.hear_vehicles(vehicles.east_m, vehicles.south_m)
+        search.hear_vehicles(*self._presence.columns())
 
     def _listen(self, listens: bool) -> None:
         """Hear from vehicles where they are and what they see, or do not."""

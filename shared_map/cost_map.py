@@ -1,8 +1,8 @@
 """The composite cost map of one process: the prior ground, the marks over it, and inflation.
 
 What is learned of a kind of ground changes the pace of all its cells; a mark replaces the ground of its cell. Then
-a cell is lethal where a vehicle in its middle would touch lethal
-ground. After any sequence of `apply` the composite equals one built from the last statement about each cell.
+a cell is lethal where a vehicle in its middle would touch lethal ground. After any sequence of `apply` the
+composite equals one built from the last statement about each cell.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""
 
 
-_FEW = 16
-"""Up to so many cells are looked at one by one."""
 _MANY_BOXES = 8 * MAX_WINDOWS
 
 
@@ -94,10 +92,9 @@ class CostMap:
         """
         if class_number:
             return
-        if len(cells) <= _FEW:
-            self._apply_few(cells, kinds, paces)
-            return
         where = np.asarray(cells, np.int64)
+        if not len(where):
+            return
         if int(where.min()) < 0 or int(where.max()) >= self.grid.cells:
             raise OutsideGridError(f"a mark is on cell {int(where.max())} of {self.grid.rows} x {self.grid.cols}")
         if self._stated is not None:
@@ -116,37 +113,6 @@ class CostMap:
             self._compose(where, where[np.isinf(was) != np.isinf(values)])
         else:
             self._note_dirty(where)
-
-    def _apply_few(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
-        """`apply` of few cells, as most sets change: an array of one cell costs as much as one of a thousand."""
-        places: list[int] = cells.tolist()
-        if places and not 0 <= min(places) <= max(places) < self.grid.cells:
-            raise OutsideGridError(f"a mark is on cell {max(places)} of {self.grid.rows} x {self.grid.cols}")
-        if self._stated is not None:
-            for cell, kind in zip(places, kinds.tolist(), strict=True):
-                self._stated[cell] = kind != MarkKind.CLEAR
-        ground = self.ground_s_per_m.reshape(-1)
-        before: dict[int, float] = {}
-        for cell, kind, pace in zip(places, kinds.tolist(), paces.tolist(), strict=True):
-            value = pace if kind == MarkKind.PACE else LETHAL if kind == MarkKind.LETHAL else self._prior[cell]
-            was = ground.item(cell)
-            if was != value:
-                before.setdefault(cell, was)
-                ground[cell] = value
-        changed = [cell for cell, was in before.items() if ground.item(cell) != was]
-        if not changed:
-            return
-        self.version += 1
-        if self._halves:
-            flipped = [cell for cell in changed if (before[cell] == LETHAL) != (ground.item(cell) == LETHAL)]
-            self._compose(np.array(changed, np.int64), np.array(flipped, np.int64))
-            return
-        boxes: dict[tuple[int, int], Window] = {}
-        for row, col in (divmod(cell, self.grid.cols) for cell in changed):
-            tile = (row // TILE_CELLS, col // TILE_CELLS)
-            box = Window(row, col, row + 1, col + 1)
-            boxes[tile] = boxes[tile].union(box) if tile in boxes else box
-        self._dirty = merged(boxes.values(), self._dirty)
 
     def learn(self, words: Sequence[MarkSet]) -> bool:
         """Make these the words of all authors about kinds of ground. Those which are none change nothing. A change

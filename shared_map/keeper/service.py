@@ -14,7 +14,7 @@ from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
 from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
 from shared_map.replication.marks import is_zone, standing
-from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.replication.tiles import beyond_tile
 from shared_map.sightings import Sightings
@@ -217,7 +217,7 @@ class KeeperService:
             self._keeper.saved(sets)
             for each in sets:
                 self._plan.accepted(each)
-            self._sync.publish(PublishSet(each) for each in sets)
+            self._sync.publish(sets)
             self._member.note(now_ns, "order", f"zone {order.action} {order.name}")
         zones = zones_of(self.replica, now_ns, self._numbers)
         changed = order.name if sets else ""
@@ -256,7 +256,7 @@ class KeeperService:
             return
         self.replica.merge(compacted, measured=False)
         self._keeper.saved(compacted)
-        self._sync.publish(PublishSet(each) for each in compacted)
+        self._sync.publish(compacted)
         self.counters.count("sets_folded", len(compacted))
 
     def _save(self, now_ns: int) -> None:

@@ -75,13 +75,13 @@ def log_steps(stated: Sequence[Measurement]) -> int:
 
 
 def estimate(stated: Sequence[Measurement]) -> Measurement:
-    """What all authors together state of one kind of ground: the cells that count, the mean, and the variance of one
-    cell. No cells if nobody states anything.
+    """What all authors together state of one kind of ground: the cells that count, the mean, and the variance of
+    one cell. No cells if nobody states anything.
 
     No author's mean counts for more than the largest factor there is. Five authors or more that know five cells
-    each count by their median: less than half of them cannot move it beyond what an honest one states. Of fewer none
-    has a weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1) of
-    the largest factor at most where all know as many cells.
+    each count by their median: less than half of them cannot move it beyond what an honest one states. Of fewer
+    none has a weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1)
+    of the largest factor at most where all know as many cells.
     """
     known = sorted(each for each in stated if each.cells > 0)
     knowing = [each for each in known if each.cells >= _FEWEST_CELLS]

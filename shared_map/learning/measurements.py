@@ -1,10 +1,10 @@
 """What an author measures of kinds of ground, and how that travels: as one more set of marks, about a tile beyond
 the map.
 
-So measurements have all that sets of marks have: numbers of which the newest wins, groups, quotas, authority by key,
-digests, late joins, the keeper's store. The cells of such a set are no places: cell 3 * key is the number of cells
-driven on that kind of ground, the next two are the mean and the variance of y = ln(driven pace / prior pace). Each
-number is written as a pace of 1 + n / 65536, which float32 holds exactly, and which is within the bounds of marks.
+So measurements have all that sets of marks have: numbers of which the newest wins, groups, quotas, authority by
+key, digests, late joins, the keeper's store. The cells of such a set are no places: cell 3 * key is the number of
+cells driven on that kind of ground, the next two are the mean and the variance of y = ln(driven pace / prior pace).
+Each number is written as a pace of 1 + n / 65536, which float32 holds exactly, within the bounds of marks.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def columns_of(measured: Mapping[int, Measurement], stamp_ns: int) -> Columns:
 
 
 def measurements_in(mark_set: MarkSet) -> dict[int, Measurement] | None:
-    """Key -> measurement, of a set about the tile beyond the map; None if it carries none: then nobody takes it in."""
+    """Key -> measurement, of a set about the tile beyond the map; None if it carries none: nobody takes it in."""
     if not mark_set.kinds:
         return {}
     cells = column(mark_set.cells, "<u2").astype(np.int64)
@@ -98,8 +98,8 @@ class TrimmedMean:
     A road with rubble on every tenth cell is not a slower road: the rubble is marked, cell by cell. The mean of all
     cells would say that each of the others is slower, and every vehicle that sees one would mark that it is not.
 
-    A quarter is left out at each end. The variance is that of the Winsorized numbers, so that variance / cells is the
-    square of the mean's standard error (Tukey and McLaughlin 1963).
+    A quarter is left out at each end. The variance is that of the Winsorized numbers, so that variance / cells is
+    the square of the mean's standard error (Tukey and McLaughlin 1963).
 
     cells  how many there are
     """

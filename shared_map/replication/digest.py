@@ -1,4 +1,5 @@
-"""Digests: which (epoch, seq) of which author's sets a replica holds, and how two such tables differ."""
+"""Digests: which (epoch, seq) of which author's sets a replica holds, how two such tables differ (`Ledger`), and
+those of others that still have to be compared with what is held (`PendingDigests`). Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -20,55 +21,60 @@ Held = Mapping[str, bytes]
 """Author -> rows of DIGEST_ROW, as in the message `Digest`."""
 
 
+_NONE = (-1, -1)
+"""Below the number of any set."""
+
+
 class Ledger:
     """The number of each set held, by author and tile, as the rows that digests are made of."""
 
     def __init__(self) -> None:
-        self._authors: dict[str, _Rows] = {}
+        self._numbers: dict[str, dict[int, tuple[int, int]]] = {}  # author -> tile -> (epoch, seq)
+        self._rows: dict[str, NDArray[np.void]] = {}  # author -> the same in order of tile, until one changes
 
     def record(self, author: str, tile: int, epoch: int, seq: int) -> None:
-        rows = self._authors.get(author)
-        if rows is None:
-            rows = self._authors[author] = _Rows()
-        rows.recorded[tile] = (epoch, seq)
+        """An author's set of this tile is held under this number."""
+        self._numbers.setdefault(author, {})[tile] = (epoch, seq)
+        self._rows.pop(author, None)
 
     def record_all(self, author: str, sets: Iterable[MarkSet]) -> None:
         """As `record` of each of an author's sets."""
-        numbers = {each.tile: (each.epoch, each.seq) for each in sets}
-        self._authors.setdefault(author, _Rows()).recorded.update(numbers)
+        self._numbers.setdefault(author, {}).update({each.tile: (each.epoch, each.seq) for each in sets})
+        self._rows.pop(author, None)
 
     def drop(self, author: str, tile: int) -> None:
         """An author's set of this tile is held no more."""
-        rows = self._authors.get(author)
-        if rows is not None and rows.drop(tile) == 0:
-            del self._authors[author]
+        numbers = self._numbers.get(author, {})
+        if numbers.pop(tile, None) is not None:
+            self._rows.pop(author, None)
+            if not numbers:
+                del self._numbers[author]
 
     @property
     def authors(self) -> list[str]:
-        return sorted(self._authors)
+        """Authors of whom a set is held, in order."""
+        return sorted(self._numbers)
 
     def held(self, authors: list[str] | None = None) -> dict[str, bytes]:
         """Rows in order of author and tile: equal holdings give equal bytes."""
-        names = self.authors if authors is None else [name for name in authors if name in self._authors]
-        return {name: self._authors[name].sorted().tobytes() for name in names}
+        names = self.authors if authors is None else [name for name in authors if name in self._numbers]
+        return {name: self._sorted(name).tobytes() for name in names}
 
     def rows_of(self, author: str, tiles: Iterable[int]) -> bytes:
         """Rows of an author's sets of these tiles, in order of tile; of tiles without a set none."""
-        rows = self._authors.get(author)
-        return b"" if rows is None else rows.of(tiles).tobytes()
+        numbers = self._numbers.get(author, {})
+        return digest_rows((tile, *numbers[tile]) for tile in sorted(tiles) if tile in numbers).tobytes()
 
     def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
         """(author, tiles) of which they hold a newer set than we."""
         found = []
         for author in sorted(theirs):
             rows = np.frombuffer(theirs[author], DIGEST_ROW)
-            ours = self._authors.get(author)
-            if ours is None:
-                tiles = rows["tile"].tolist()
-            elif len(rows) <= _FEW:
-                tiles = [tile for tile, *number in rows.tolist() if tuple(number) > ours.number(tile)]
+            if len(rows) <= _FEW:
+                ours = self._numbers.get(author, {})
+                tiles = [tile for tile, *number in rows.tolist() if tuple(number) > ours.get(tile, _NONE)]
             else:
-                tiles = rows["tile"][_newer(rows, ours.sorted())].tolist()
+                tiles = rows["tile"][_newer(rows, self._sorted(author))].tolist()
             if tiles:
                 found.append((author, sorted(set(tiles))))
         return found
@@ -77,63 +83,22 @@ class Ledger:
         """(author, tiles) of these authors of which we hold a newer set than they."""
         found = []
         for author in authors:
-            if author not in self._authors:
-                continue
-            rows = self._authors[author].sorted()
-            if author in theirs:
-                rows = rows[_newer(rows, np.sort(np.frombuffer(theirs[author], DIGEST_ROW)))]
+            rows = self._sorted(author)
+            rows = rows[_newer(rows, np.sort(np.frombuffer(theirs.get(author, b""), DIGEST_ROW)))]
             if len(rows):
                 found.append((author, rows["tile"].tolist()))
         return found
 
+    def _sorted(self, author: str) -> NDArray[np.void]:
+        numbers = self._numbers.get(author, {})
+        if author not in self._rows and numbers:
+            self._rows[author] = digest_rows((tile, *numbers[tile]) for tile in sorted(numbers))
+        return self._rows.get(author, _NO_ROWS)
 
-class _Rows:
-    """One author's rows. What is recorded becomes rows, many at a time, when they are read.
 
-    recorded  tile -> (epoch, seq) that is newer than its row
-    """
-
-    def __init__(self) -> None:
-        self._rows: NDArray[np.void] = np.zeros(0, DIGEST_ROW)  # in order of tile
-        self._places: dict[int, int] = {}  # tile -> its place in `_rows`
-        self.recorded: dict[int, tuple[int, int]] = {}
-
-    def number(self, tile: int) -> tuple[int, int]:
-        """(epoch, seq) of a tile's set; (-1, -1) without one."""
-        number = self.recorded.get(tile)
-        if number is None:
-            place = self._places.get(tile)
-            number = (-1, -1) if place is None else self._rows[place].item()[1:]
-        return number
-
-    def drop(self, tile: int) -> int:
-        """Returns how many are left."""
-        rows = self.sorted()
-        if tile in self._places:
-            self._set(np.delete(rows, self._places[tile]))
-        return len(self._rows)
-
-    def of(self, tiles: Iterable[int]) -> NDArray[np.void]:
-        rows = self.sorted()
-        return rows[[place for tile in sorted(tiles) if (place := self._places.get(tile)) is not None]]
-
-    def sorted(self) -> NDArray[np.void]:
-        if self.recorded:
-            tiles = list(self.recorded)
-            new = np.zeros(len(tiles), DIGEST_ROW)
-            new["tile"] = tiles
-            new["epoch"], new["seq"] = zip(*self.recorded.values(), strict=True)
-            self.recorded = {}
-            known = np.array([tile in self._places for tile in tiles])
-            self._rows[[self._places[tile] for tile in new["tile"][known].tolist()]] = new[known]
-            if not known.all():
-                rows = np.concatenate([self._rows, new[~known]])
-                self._set(rows[np.argsort(rows["tile"])])
-        return self._rows
-
-    def _set(self, rows: NDArray[np.void]) -> None:
-        self._rows = rows
-        self._places = {tile: place for place, tile in enumerate(rows["tile"].tolist())}
+def digest_rows(numbers: Iterable[tuple[int, int, int]]) -> NDArray[np.void]:
+    """Rows of a digest from (tile, epoch, seq)."""
+    return np.array(list(numbers), DIGEST_ROW)
 
 
 def _newer(rows: NDArray[np.void], base: NDArray[np.void]) -> NDArray[np.bool_]:
@@ -151,6 +116,9 @@ def _newer(rows: NDArray[np.void], base: NDArray[np.void]) -> NDArray[np.bool_]:
     return np.asarray(~known | later, bool)
 
 
+_NO_ROWS = digest_rows(())
+
+
 def fingerprint(held: Held) -> str:
     """16 hex digits that are equal where holdings are."""
     hashed = hashlib.blake2b(digest_size=8)
@@ -160,12 +128,12 @@ def fingerprint(held: Held) -> str:
     return hashed.hexdigest()
 
 
-# Digests of others that still have to be compared with what is held. Pure: time is an argument.
-
 _GRACE_NS = NS_PER_S // 10
 """A digest may overtake the sets that it names: what is missing is asked for only this long after it came."""
 _RETRY_NS = NS_PER_S * 15 // 100
+"""What is missing is asked for so often; with 30 % of all messages lost replicas agree within two seconds so."""
 _MAX_TRIES = 10
+"""After these the sender has sent its next whole digest, with which it begins anew."""
 _MAX_SENDERS = 4096
 _MAX_BYTES = 64 << 20
 """A digest that would exceed this is dropped: its sender repeats it within seconds."""

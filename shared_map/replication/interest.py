@@ -1,7 +1,5 @@
-"""Interest: which squares of the grid are near some cells. Pure.
-
-The squares are regions, the unit of subscription, or others of one size.
-"""
+"""Interest: which squares of the grid are near some cells (`Interest`), and whose digests concern a replica which
+holds only those (`DigestInterest`). Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -66,18 +64,6 @@ class Interest:
         }
 
 
-# Whose digests a replica that holds a part of the map listens to. Pure: time is an argument.
-#
-# A digest concerns replicas that hold tiles of which its author has put sets lately. Which those are is not known
-# beforehand. A replica listens to
-#
-# - keepers, whose digests name all sets;
-# - authors of which sets about its own regions came in the last `_NAMED_FOR` periods;
-# - everybody, while no keeper is heard, after a link came back, and now and then.
-#
-# A set that was lost is found by the next digest of its author if the author is known, else by that of the keeper. If
-# the keeper is gone, full or cut off from the author, it is found when the replica next listens to everybody.
-
 _KEEPER_FOR = 3
 _NAMED_FOR = 30
 _ALL_EVERY = 90
@@ -88,7 +74,18 @@ _MOST_NAMES = 1024
 
 
 class DigestInterest:
-    """Decides whose digests are listened to.
+    """Decides whose digests a replica that holds a part of the map listens to.
+
+    A digest concerns replicas that hold tiles of which its author has put sets lately. Which those are is not known
+    beforehand. A replica listens to
+
+    - keepers, whose digests name all sets;
+    - authors of which sets about its own regions came in the last `_NAMED_FOR` periods;
+    - everybody, while no keeper is heard, after a link came back, and now and then.
+
+    A set that was lost is found by the next digest of its author if the author is known, else by that of the
+    keeper. If the keeper is gone, full or cut off from the author, it is found when the replica next listens to
+    everybody.
 
     name       of the listener: those with different names do not all listen to everybody at the same time
     period_ns  of whole digests

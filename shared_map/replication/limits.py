@@ -19,8 +19,10 @@ _MAX_WAITING = 1 << 14
 """Sets of throttled processes that wait, in all. What finds no place is asked for again once a digest names it."""
 
 _BURST_S = 10
+"""A full bucket lasts so long at its rate: a vehicle that finds a burnt forest may tell of it at once."""
 _FORGET_NS = 60 * NS_PER_S
 _SPEAKS_NS = _BURST_S * NS_PER_S
+"""Who was silent for longer has a full bucket, and needs no share."""
 
 
 class Capacity:
@@ -36,7 +38,7 @@ class Capacity:
         self.sets = 0
         self.marks = 0
         self._max_sets, self._max_marks = max_sets, max_marks
-        self._owners: dict[str, list[int]] = {}  # process -> [sets, marks], of those that hold any
+        self._owners: dict[str, tuple[int, int]] = {}  # process -> (sets, marks), of those that hold any
 
     def take(self, new: MarkSet, old: MarkSet | None, *, own: bool = False) -> bool:
         """Count `new` instead of `old`; False, and nothing changes, if that exceeds a bound. A set which takes no
@@ -44,61 +46,44 @@ class Capacity:
 
         own  no bound applies
         """
-        owner = owner_of(new.author)
-        held = self._owners.get(owner) or [0, 0]
         sets, marks = 1, len(new.kinds)
         if old is not None:
             sets, marks = 0, marks - len(old.kinds)
-        if not own:
-            if sets and (self.sets >= self._max_sets or held[0] >= self._max_sets // _PART):
-                return False
-            if (sets or marks > 0) and (
-                self.marks + marks > self._max_marks or held[1] + marks > self._max_marks // _PART
-            ):
-                return False
-        held[0] += sets
-        held[1] += marks
-        self._owners[owner] = held
-        self.sets += sets
-        self.marks += marks
+        if not own and not self._fits(new.author, sets, marks):
+            return False
+        self._count(new.author, sets, marks)
         return True
 
     def take_all(self, author: str, sets: int, marks: int) -> bool:
         """As `take` of so many sets which replace none; False, and nothing changes, if all exceed a bound."""
-        owner = owner_of(author)
-        held = self._owners.get(owner) or [0, 0]
-        if (
-            self.sets + sets > self._max_sets
-            or held[0] + sets > self._max_sets // _PART
-            or self.marks + marks > self._max_marks
-            or held[1] + marks > self._max_marks // _PART
-        ):
+        if not self._fits(author, sets, marks):
             return False
-        self._owners[owner] = [held[0] + sets, held[1] + marks]
-        self.sets += sets
-        self.marks += marks
+        self._count(author, sets, marks)
         return True
 
     def free(self, old: MarkSet) -> None:
         """`old` is held no more."""
-        owner = owner_of(old.author)
-        held = self._owners[owner]
-        held[0] -= 1
-        held[1] -= len(old.kinds)
-        self.sets -= 1
-        self.marks -= len(old.kinds)
-        if held == [0, 0]:
-            del self._owners[owner]
+        self._count(old.author, -1, -len(old.kinds))
 
     def full_for(self, author: str) -> bool:
-        """Whether an author's set of one more tile could exceed a bound, were it to cover every cell."""
-        sets, marks = self._owners.get(owner_of(author), (0, 0))
-        return (
-            self.sets >= self._max_sets
-            or self.marks + TILE_AREA > self._max_marks
-            or sets >= self._max_sets // _PART
-            or marks + TILE_AREA > self._max_marks // _PART
-        )
+        """True if an author's set of one more tile could exceed a bound, were it to cover every cell."""
+        return not self._fits(author, 1, TILE_AREA)
+
+    def _fits(self, author: str, sets: int, marks: int) -> bool:
+        """True if so many more stay within the bounds. What takes no more than before always does."""
+        own_sets, own_marks = self._owners.get(owner_of(author), (0, 0))
+        room_for_sets = self.sets + sets <= self._max_sets and own_sets + sets <= self._max_sets // _PART
+        room_for_marks = self.marks + marks <= self._max_marks and own_marks + marks <= self._max_marks // _PART
+        return (room_for_sets or not sets) and (room_for_marks or not (sets or marks > 0))
+
+    def _count(self, author: str, sets: int, marks: int) -> None:
+        owner = owner_of(author)
+        own_sets, own_marks = self._owners.get(owner, (0, 0))
+        self._owners[owner] = (own_sets + sets, own_marks + marks)
+        if self._owners[owner] == (0, 0):
+            del self._owners[owner]
+        self.sets += sets
+        self.marks += marks
 
 
 class Quota:

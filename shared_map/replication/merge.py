@@ -113,8 +113,6 @@ def _new_winners_of_few(grid: GridSpec, changes: Sequence[TileChange], before_ns
 def _winners_of_few(sets: Sequence[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
     """Cell in the tile -> (kind, pace, stamp) of its winner."""
     zones = [each for each in sets if is_zone(each.author)]
-    if not zones:
-        return _newest_of_few(sets, now_ns)
     others = [each for each in sets if not is_zone(each.author)]
     return _newest_of_few(others, now_ns) | _newest_of_few(zones, now_ns)
 
@@ -150,40 +148,27 @@ class _Placed(NamedTuple):
     """Columns of statements about cells of several tiles.
 
     places  int32  number of the tile's change * TILE_AREA + cell in the tile; increasing, once resolved
+    zones   bool   the statement is an operator's
     """
 
     places: NDArray[np.int32]
     kinds: NDArray[np.uint8]
     paces: NDArray[np.float32]
     stamps_ns: NDArray[np.int64]
+    zones: NDArray[np.bool_]
 
     def taken(self, where: NDArray[np.intp] | NDArray[np.bool_]) -> _Placed:
-        return _Placed(self.places[where], self.kinds[where], self.paces[where], self.stamps_ns[where])
+        return _Placed._make(each[where] for each in self)
 
 
 def _winners(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
     """The winners of each (change, cell). `sets` are in increasing order of change, then of author."""
-    zones = [each for each in sets if is_zone(each[1].author)]
-    if not zones:
-        return _newest(sets, now_ns)
-    others = _newest([each for each in sets if not is_zone(each[1].author)], now_ns)
-    firm = _newest(zones, now_ns)
-    both = _Placed(
-        np.concatenate([others.places, firm.places]),
-        np.concatenate([others.kinds, firm.kinds]),
-        np.concatenate([others.paces, firm.paces]),
-        np.concatenate([others.stamps_ns, firm.stamps_ns]),
-    )
-    order = np.argsort(both.places, kind="stable")
-    return both.taken(order[_last_of_each(both.places[order])])
-
-
-def _newest(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
     stated = _placed(sets, now_ns)
     places = stated.places
     if (places[1:] > places[:-1]).all():
         return stated  # no cell is disputed, as in nearly all traffic: nothing to sort
-    order = np.lexsort((stated.stamps_ns, places))  # stable: on a tie the larger author stays behind
+    # Stable: on a tie the larger author stays behind.
+    order = np.lexsort((stated.stamps_ns, stated.zones, places))
     return stated.taken(order[_last_of_each(places[order])])
 
 
@@ -202,11 +187,13 @@ def _placed(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
     stamps_ns = column(b"".join([each.stamps_ns for each in of]), "<i8")
     cells = column(b"".join([each.cells for each in of]), "<u2")
     numbers = np.array([number for number, _ in sets], np.int32)
-    places = np.repeat(numbers << _AREA_BITS, [len(each.kinds) for each in of])
+    counts = [len(each.kinds) for each in of]
+    places = np.repeat(numbers << _AREA_BITS, counts)
     places += cells
+    zones = np.repeat([is_zone(each.author) for each in of], counts) if of else np.zeros(0, bool)
     if kinds.any():
         paces = np.where(kinds == _PACE, paces, np.float32(0))
-    stated = _Placed(places, kinds, paces, stamps_ns)
+    stated = _Placed(places, kinds, paces, stamps_ns, zones)
     if not any([each.untils_ns for each in of]):  # noqa: C419 - twice as fast as a generator
         return stated
     forever = np.int64(FOREVER).tobytes()
@@ -230,13 +217,9 @@ def _changed(before: _Placed, after: _Placed) -> _Placed:
     gone[were] = False
     if not gone.any():
         return changed
-    places = before.places[gone]
-    return _Placed(
-        np.concatenate([changed.places, places]),
-        np.concatenate([changed.kinds, np.full(len(places), _CLEAR, np.uint8)]),
-        np.concatenate([changed.paces, np.zeros(len(places), np.float32)]),
-        np.concatenate([changed.stamps_ns, np.full(len(places), NO_STATEMENT, np.int64)]),
-    )
+    cleared = before.taken(gone)
+    cleared.kinds[:], cleared.paces[:], cleared.stamps_ns[:] = _CLEAR, 0, NO_STATEMENT
+    return _Placed._make(np.concatenate(pair) for pair in zip(changed, cleared, strict=True))
 
 
 _CLEAR = int(MarkKind.CLEAR)

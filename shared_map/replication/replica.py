@@ -57,13 +57,6 @@ class CostSink(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class PublishSet:
-    """Put this set under its author's key."""
-
-    mark_set: MarkSet
-
-
-@dataclass(frozen=True, slots=True)
 class Merged:
     """The sets that a merge took in, in no particular order.
 
@@ -284,7 +277,7 @@ class MapReplica:
 
     # --- time -----------------------------------------------------------------------------------------------
 
-    def tick(self, now_ns: int) -> list[PublishSet]:
+    def tick(self, now_ns: int) -> list[MarkSet]:
         """Let statements expire. Returns the own sets that may be published now."""
         self._expire(now_ns)
         if self._learn_due_ns is not None and self._now_ns >= self._learn_due_ns:
@@ -300,7 +293,7 @@ class MapReplica:
         for tile in due:
             del self._pending[tile]
             self._published_ns[tile] = now_ns
-        return [PublishSet(own) for tile in due if (own := self.held.get(tile, self.author)) is not None]
+        return [own for tile in due if (own := self.held.get(tile, self.author)) is not None]
 
     def _await_expiry(self, tile: int, sets: Iterable[MarkSet]) -> None:
         """Look at a tile again when the next statement of these sets expires."""
@@ -344,7 +337,7 @@ class MapReplica:
         now_ns: int,
         *,
         lifetime_s: float | None = None,
-    ) -> list[PublishSet]:
+    ) -> list[MarkSet]:
         """State something about cells; of a cell named twice the last counts. The own cost map changes at once.
         Returns the sets that may be published now; `tick` returns the others later.
 
@@ -395,23 +388,9 @@ class MapReplica:
         self.counts["marks_written"] += len(cells)
         self._put_own(tile, sparse(own))
 
-    def write_learned(self, said: Mapping[int, Measurement], now_ns: int) -> list[PublishSet]:
+    def write_learned(self, said: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
         """State what we have learned (`shared_map.learning.measurements`), instead of what we said of it before."""
         self._put_own(beyond_tile(self.grid), Statements(*columns_of(said, now_ns)))
-        return self.tick(now_ns)
-
-    def retract(self, cells: ArrayLike, now_ns: int) -> list[PublishSet]:
-        """Take back what we stated about cells, as if we had never stated it; what others state about them stands.
-
-        cells  int (cells,)  flat indices in the grid
-        """
-        tiles, inner = tile_cells(self.grid, np.atleast_1d(np.asarray(cells, np.int64)))
-        for tile in np.unique(tiles).tolist():
-            own = self._own(tile)
-            back = inner[tiles == tile]
-            if (own.stamps_ns[back] != NO_STATEMENT).any():
-                own.stamps_ns[back] = NO_STATEMENT
-                self._put_own(tile, sparse(own))
         return self.tick(now_ns)
 
     def _own(self, tile: int) -> Statements:

@@ -13,7 +13,7 @@ from shared_map.replication.digest import Held, PendingDigest, PendingDigests
 from shared_map.replication.interest import DigestInterest
 from shared_map.replication.limits import Quota
 from shared_map.replication.marks import packed, unpacked
-from shared_map.replication.replica import MapReplica, Merged, PublishSet
+from shared_map.replication.replica import MapReplica, Merged
 from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_classes, region_of, region_tiles
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
@@ -196,10 +196,10 @@ class MapSync:
             self._compare(pending, now_ns)
         self._send_digest(now_ns)
 
-    def publish(self, actions: Iterable[PublishSet]) -> None:
+    def publish(self, actions: Iterable[MarkSet]) -> None:
         """Put the sets that the replica decided to publish."""
         for action in actions:
-            self._put(action.mark_set)
+            self._put(action)
 
     def holds(self, author: str, rows: bytes, now_ns: int) -> bool:
         """Whether the map has what these rows of a digest name of an author, as far as it is of interest here, and

@@ -13,7 +13,7 @@ import numpy as np
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.map_strategies import GRID, held_winners, naive_winners
+from support.map_strategies import GRID, held_winners, naive_winners, retract
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.mark_store import KeeperStore
@@ -82,7 +82,7 @@ class History:
 
     def retract(self, process: str, cells: list[int]) -> None:
         if (author := self.authors.get(process)) is not None:
-            author.sync.publish(author.replica.retract(cells, self.swarm.now_ns))
+            author.sync.publish(retract(author.replica, cells, self.swarm.now_ns))
 
     def kill(self, name: str) -> None:
         running = self.keepers.pop(name, None) or self.authors.pop(name, None)

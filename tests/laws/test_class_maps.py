@@ -75,7 +75,7 @@ class History:
             int(key): Measurement(int(self.rng.integers(50, 500)), int(self.rng.integers(-60_000, 60_000)), 10)
             for key in range(4)
         }
-        self.replica.merge([each.mark_set for each in author.write_learned(said, 10)])
+        self.replica.merge(author.write_learned(said, 10))
 
     def happen(self) -> None:
         what = int(self.rng.integers(10))

@@ -42,10 +42,10 @@ def sets_of(
     sets = []
     for n, said in enumerate(words):
         author = MapReplica(terrain.grid, author=f"all.a{n}.1")
-        sets += [each.mark_set for each in author.write_learned(said, 10 + n)]
+        sets += author.write_learned(said, 10 + n)
     for n, (cells, kinds) in enumerate(marks):
         author = MapReplica(terrain.grid, author=f"all.m{n}.1")
-        sets += [each.mark_set for each in author.write(cells, kinds, 0.7, 10 + n)]
+        sets += author.write(cells, kinds, 0.7, 10 + n)
     return sets
 
 

@@ -56,14 +56,14 @@ def test_a_running_swarm_says_what_was_learned(tmp_path: Path) -> None:
         try:
             tile = beyond_tile(terrain.grid)
 
-            def measurements_in() -> list[dict[str, object]]:
+            def told() -> list[dict[str, object]]:
                 region = beyond_region(terrain.grid)
-                bus.publish(MARKS, word.mark_set, region=region, tile=tile, author="all.a1.1")
+                bus.publish(MARKS, word, region=region, tile=tile, author="all.a1.1")
                 result = CliRunner().invoke(app, ["learned", "--connect", endpoint, "--json"])
                 return json.loads(result.stdout)["kinds"] if result.exit_code == 0 else []
 
             eventually(told, 30, "the keeper")
-            (row,) = measurements_in()
+            (row,) = told()
             assert (row["kind"], row["cells"], row["authors"]) == ("unknown 0-5", 400, 1)
         finally:
             for process in processes:

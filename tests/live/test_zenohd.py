@@ -16,7 +16,7 @@ from support.zenohd import Zenohd, plugins
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.ports import free_ports
 from shared_map.replication.marks import mark_set, statements
-from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
@@ -76,7 +76,7 @@ def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router
             # Zenoh drops puts where a link is congested, and a storage tells nobody what it has: without a keeper,
             # which would ask again, what was dropped is only there if it is said again.
             for tile in author.replica.held.tiles:
-                own = [PublishSet(each) for each in author.replica.held.of_tile(tile) if each.author == name]
+                own = [each for each in author.replica.held.of_tile(tile) if each.author == name]
                 author.sync.publish(own)
                 author.run(0.01)
             authors[name] = author

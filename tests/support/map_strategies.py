@@ -9,8 +9,9 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.marks import NO_STATEMENT, Statements, mark_set, sparse
 from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import tile_cells
 from swarm.bus.bus import Bus, Event, Heard
 from swarm.config.classes import MOST_CLASSES
 from swarm.grid import GridSpec
@@ -110,6 +111,17 @@ def merge_one(replica: MapReplica, each: MarkSet) -> list[int] | None:
     merged = replica.merge([each])
     assert merged.changed in ([], [len(sink.changed)])
     return sink.changed if merged.sets else None
+
+
+def retract(replica: MapReplica, cells: Sequence[int], now_ns: int) -> list[MarkSet]:
+    """Takes back what a replica's author stated about cells, as if it had never stated it."""
+    tiles, inner = tile_cells(replica.grid, np.array(cells, np.int64))
+    for tile in np.unique(tiles).tolist():
+        own, back = replica._own(tile), inner[tiles == tile]
+        if (own.stamps_ns[back] != NO_STATEMENT).any():
+            own.stamps_ns[back] = NO_STATEMENT
+            replica._put_own(tile, sparse(own))
+    return replica.tick(now_ns)
 
 
 def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, float]]:

@@ -44,43 +44,20 @@ def _presence_of(count: int, rounds: int) -> dict[str, float]:
     grid = GridSpec(1024, 1024, 20.0)
     said = fleets(grid, count, seed=1)
     payloads = [encode(fleet) for fleet in said]
-    presence = Presence(grid, _LEASE_NS, 4 * grid.resolution_m)
+    presence = Presence(_LEASE_NS)
     seq = 0
 
-    def hear() -> None:
+    def receive() -> None:
         nonlocal seq
         seq += 1
         for fleet in said:
-            presence.hear(_again(fleet, seq), seq)
+            presence.receive(_again(fleet, seq), seq)
 
-    mine = said[0]
-    east_m, south_m = np.frombuffer(mine.east_m, "<f4"), np.frombuffer(mine.south_m, "<f4")
-
-    def ask() -> None:
-        for east, south in zip(east_m.tolist(), south_m.tolist(), strict=True):
-            presence.near(east, south, 100.0)
-
-    def hear_one() -> None:
-        """Hears one report, after which the next query builds the index anew."""
-        nonlocal seq
-        seq += 1
-        presence.hear(_again(mine, seq), seq)
-
-    def index() -> None:
-        hear_one()
-        presence.near(0.0, 0.0, 100.0)
-
-    def parked() -> None:
-        hear_one()
-        presence.parked_on(5)
-
-    hear()
+    receive()
     parts = {
         "decode_ms": lambda: [decode(payload, Fleet) for payload in payloads],
-        "hear_ms": hear,
-        "index_ms": index,
-        "near_of_25_ms": ask,
-        "parked_ms": parked,
+        "receive_ms": receive,
+        "columns_ms": presence.columns,
     }
     return {name: round(median(cpu_ms(part) for _ in range(rounds)), 3) for name, part in parts.items()}
 
@@ -95,7 +72,7 @@ def presence(
     vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, multiples of 25.")] = "1000,5000",
     rounds: Annotated[int, typer.Option(min=1, help="Ticks; the median counts.")] = 50,
 ) -> dict[str, Any]:
-    """CPU time per tick that an agent spends on the positions of all other vehicles.
+    """CPU time per tick that a searching planner spends on the positions of all other vehicles.
 
     \b
     ./launch_scripts/bench presence --vehicles 10000

@@ -48,7 +48,7 @@ def learned(**keys: float) -> tuple[CostMap, list[MarkSet]]:
     cost_map = CostMap(GROUND, learning=True)
     words = {FLAT: said(keys["flat"]), STEEP: said(keys["steep"])}
     sets = MapReplica(GROUND.grid, cost_map, author="all.a1.1").write_learned(words, 1)
-    return cost_map, [each.mark_set for each in sets]
+    return cost_map, sets
 
 
 def small() -> Scenario:

@@ -154,7 +154,7 @@ def test_a_garbled_export_is_refused_with_the_place(change: dict[str, object], p
 
 def learned_sets(author: str, *said: Measurement) -> list[MarkSet]:
     replica = MapReplica(GRID, author=author)
-    return [each.mark_set for each in replica.write_learned(dict(enumerate(said)), 1)]
+    return replica.write_learned(dict(enumerate(said)), 1)
 
 
 def test_what_is_learned_counts_as_no_mark(tmp_path: Path) -> None:

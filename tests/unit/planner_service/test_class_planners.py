@@ -319,7 +319,7 @@ def test_what_is_learned_of_a_kind_of_ground_holds_for_every_class() -> None:
     writer = MapReplica(terrain.grid, CostMap(terrain, learning=True), author="all.a0.1")
     kinds = np.unique(maps.common.keys[np.isfinite(terrain.pace_s_per_m)])  # type: ignore[index]
     learned = {int(kind): Measurement(500, round(np.log(3) * ONE), ONE // 10) for kind in kinds}
-    maps.learn([each.mark_set for each in writer.write_learned(learned, 10**9)])
+    maps.learn(writer.write_learned(learned, 10**9))
     assert (maps.common.version, {name: each.version for name, each in maps.of.items()}) == (
         1,
         dict.fromkeys(classes, 1),

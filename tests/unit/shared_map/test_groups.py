@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.agent_world import AgentWorld, pace_of
 
 from shared_map.replication.filter import MarkFilter, readable_for_target, readable_groups
-from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.replica import MapReplica
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
@@ -92,10 +92,6 @@ def writer(group: str) -> MapReplica:
     return MapReplica(GRID, author=f"{group}.a0.1", group=group, publish_hz=1000.0)
 
 
-def sets(actions: list[PublishSet]) -> list[MarkSet]:
-    return [action.mark_set for action in actions]
-
-
 @given(
     st.sets(st.sampled_from(NAMES)),
     st.lists(st.tuples(st.sampled_from(NAMES), st.integers(0, GRID.cells - 1)), max_size=25),
@@ -107,7 +103,7 @@ def test_a_replica_that_reads_some_groups_equals_one_to_which_only_they_spoke(
     writers = {name: writer(name) for name in NAMES}
     heard: list[MarkSet] = []
     for now_ns, (name, cell) in enumerate(said):
-        heard += sets(writers[name].write([cell], [MarkKind.LETHAL], [0.0], 10_000_000 * now_ns))
+        heard += writers[name].write([cell], [MarkKind.LETHAL], [0.0], 10_000_000 * now_ns)
     limited = MapReplica(GRID, filter=MarkFilter(GRID, frozenset(read)))
     told = MapReplica(GRID)
     chance.shuffle(heard)  # type: ignore[attr-defined]
@@ -126,7 +122,7 @@ def test_a_replica_that_reads_some_groups_equals_one_to_which_only_they_spoke(
 def test_a_set_that_claims_another_group_than_its_author_has_is_refused() -> None:
     red = MapReplica(GRID, author="red.a0.1", group="blue", publish_hz=1000.0)
     reader = MapReplica(GRID, filter=MarkFilter(GRID, frozenset({"blue"})))
-    for each in sets(red.write([5], [MarkKind.LETHAL], [0.0], 1)):
+    for each in red.write([5], [MarkKind.LETHAL], [0.0], 1):
         assert reader.merge([each]).sets == []
     assert reader.counts["sets_foreign"] == 1
 

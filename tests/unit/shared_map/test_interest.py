@@ -15,7 +15,7 @@ from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import WIDE_TERRAIN, seeded
 from shared_map.cost_map import CostMap
-from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
@@ -24,7 +24,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.map_data import MarkKind, MarkSet, MarksRequest
+from swarm.wire.messages.map_data import MarkKind, MarksRequest
 from vehicle_agent.service import AgentService
 
 TERRAIN = terrain_of_pace(np.full((300, 520), 0.1, np.float32), 10.0)
@@ -35,10 +35,6 @@ assert GRID.regions == 6
 regions = st.frozensets(st.sampled_from(list(REGIONS)))
 marks = st.tuples(st.integers(0, GRID.cells - 1), st.sampled_from([MarkKind.LETHAL, MarkKind.PACE, MarkKind.CLEAR]))
 steps = st.lists(st.one_of(regions, st.tuples(st.sampled_from(["a.0", "b.0", "mine"]), marks)), max_size=25)
-
-
-def sets(actions: list[PublishSet]) -> list[MarkSet]:
-    return [action.mark_set for action in actions]
 
 
 @given(steps)
@@ -60,7 +56,7 @@ def test_within_its_regions_it_equals_one_that_holds_all(
             held = step
             continue
         name, (cell, kind) = step
-        for each in sets(writers[name].write([cell], [kind], [0.5], 10_000_000 * (now_ns + 1))):
+        for each in writers[name].write([cell], [kind], [0.5], 10_000_000 * (now_ns + 1)):
             everything.merge([each])
             if name == "mine":
                 own.merge([each])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from support.map_strategies import retract
 
 from shared_map.cost_map import CostMap
 from shared_map.learning.factors import FACTORS, MOST_STEPS, factors_of, log_steps
@@ -56,7 +57,7 @@ def let_settle(replica: MapReplica) -> None:
 def sets_of(author: str, *said: dict[int, Measurement]) -> list[MarkSet]:
     """The sets that an author publishes when it learns these, one after the other."""
     replica, _ = replica_of(author, GROUND)
-    return [each.mark_set for n, one in enumerate(said) for each in replica.write_learned(one, n * 10**9)]
+    return [each for n, one in enumerate(said) for each in replica.write_learned(one, n * 10**9)]
 
 
 @FEW
@@ -148,7 +149,7 @@ def test_what_is_learned_changes_the_prior_but_neither_marks_nor_lethal_cells() 
     assert 1.4 < learned < 1.6
     assert (np.isinf(flat) == np.isinf(GROUND.pace_s_per_m.reshape(-1)) | (np.arange(flat.size) == 701)).all()
     assert cost_map.take_dirty() == [GROUND.grid.window]
-    replica.retract([700, 701], 3)
+    retract(replica, [700, 701], 3)
     assert flat[700] == flat[701] == learned
     replica.write_learned({}, 4)
     let_settle(replica)
@@ -159,7 +160,7 @@ def test_marks_then_learned_equals_learned_then_marks() -> None:
     rng = np.random.default_rng(3)
     cells, kinds = rng.integers(0, GROUND.grid.cells, 300), rng.integers(0, 3, 300)
     marks_of = MapReplica(GROUND.grid, author="all.b.1")
-    marks = [each.mark_set for each in marks_of.write(cells, kinds, 0.7, 1)]
+    marks = marks_of.write(cells, kinds, 0.7, 1)
     words = sets_of("all.a.1", {0: THRICE})
     one, first = replica_of(None, GROUND)
     one.merge([*marks, *words])

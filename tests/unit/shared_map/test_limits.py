@@ -34,6 +34,28 @@ def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_ot
     assert quota.throttled == []
 
 
+def test_sets_that_change_nothing_use_up_the_budget_as_sets_of_one_mark_do() -> None:
+    quota = Quota(author_marks_per_s=10)
+    for _ in range(99):
+        quota.charge("loud", 0, 0)
+    assert quota.admits(set_of("loud", 0, 1, {}), 0)
+    quota.charge("loud", 0, 0)
+    assert not quota.admits(set_of("loud", 0, 1, {}), 0)
+
+
+def test_a_larger_set_in_place_of_an_old_one_is_refused_beyond_the_bounds_and_a_smaller_one_never() -> None:
+    one, two, more = (set_of("a", 0, 1, dict.fromkeys(range(n), (0, 1.0, 1))) for n in (1, 2, 3))
+    capacity = Capacity(max_marks=8)  # two for one process
+    assert capacity.take(one, None)
+    assert not capacity.take(more, one)
+    assert (capacity.sets, capacity.marks) == (1, 1)
+    assert capacity.take(two, one)
+    assert not capacity.take(more, two)
+    assert capacity.take(more, two, own=True)
+    assert capacity.take(two, more)
+    assert (capacity.sets, capacity.marks) == (1, 2)
+
+
 def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
     quota = Quota(author_marks_per_s=1)
     quota.charge("loud", 100, 0)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, mark_sets, naive_winners, set_of
 
 from shared_map.replication import merge as merge_module
-from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, supersedes
+from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, supersedes, zone_author
 from shared_map.replication.merge import TileChange, new_winners, winners
 from shared_map.replication.tiles import grid_cells, region_tiles, tile_cells, tile_corners
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind, MarkSet
@@ -90,6 +90,18 @@ def test_whoever_knows_a_statement_from_the_future_can_overrule_it_at_once() -> 
 def test_a_stamp_beyond_time_is_no_mark() -> None:
     with pytest.raises(ValueError, match="below 2"):
         set_of("a", 0, 0, {0: (LETHAL, 0, STAMP_LIMIT_NS)})
+
+
+@pytest.mark.parametrize("few", [-1, 10**9])
+def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zone_over_both(
+    few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(merge_module, "_FEW", few)
+    first, second = set_of("a", 0, 0, {5: (PACE, 2.0, 7)}), set_of("b", 0, 0, {5: (PACE, 3.0, 7)})
+    zone = set_of(zone_author("z"), 0, 0, {5: (PACE, 4.0, 1)})
+    for sets, pace in (([first, second], 3.0), ([zone, first, second], 4.0)):
+        won = new_winners(GRID, [TileChange(0, [], sorted(sets, key=_author))], 0, 0)
+        assert (won.cells.tolist(), won.paces.tolist()) == ([5], [pace])
 
 
 @given(mark_sets(), st.none() | mark_sets(), st.lists(mark_sets(), max_size=3))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import GRID, Composite, merge_one, replica_of, set_of
+from support.map_strategies import GRID, Composite, merge_one, replica_of, retract, set_of
 
 from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set, statements
-from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.replica import MapReplica
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
 from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, MarkKind, MarkSet, MarksRequest
@@ -60,7 +60,7 @@ def writer(author: str = "a1.1") -> tuple[MapReplica, Composite]:
 def test_what_is_written_stands_at_once_and_goes_out_whole() -> None:
     replica, composite = writer()
     out = replica.write([5, 2 * 70], [LETHAL, PACE], [0.0, 2.0], NOW)
-    assert out == [PublishSet(set_of("a1.1", 0, 0, {5: (LETHAL, 0, NOW), 64: (PACE, 2.0, NOW)}))]
+    assert out == [set_of("a1.1", 0, 0, {5: (LETHAL, 0, NOW), 64: (PACE, 2.0, NOW)})]
     assert composite.kinds[5] == LETHAL
     assert composite.paces[2 * 70] == 2.0
 
@@ -71,7 +71,7 @@ def test_a_tile_goes_out_at_most_ten_times_a_second() -> None:
     assert replica.write([6], [LETHAL], [0], NOW + 10_000_000) == []
     assert replica.tick(NOW + 99_000_000) == []
     [action] = replica.tick(NOW + 100_000_000)
-    assert np.frombuffer(action.mark_set.cells, "<u2").tolist() == [5, 6]
+    assert np.frombuffer(action.cells, "<u2").tolist() == [5, 6]
     assert replica.tick(NOW + 300_000_000) == []
 
 
@@ -80,7 +80,7 @@ def test_saying_the_same_again_puts_nothing_on_the_wire() -> None:
     replica.write([5], [LETHAL], [0], NOW)
     assert replica.write([5], [LETHAL], [0], NOW + NS_PER_S) == []
     [action] = replica.write([5], [CLEAR], [0], NOW + NS_PER_S)
-    assert action.mark_set.kinds == bytes([CLEAR])
+    assert action.kinds == bytes([CLEAR])
 
 
 def test_of_a_cell_named_twice_the_last_statement_counts() -> None:
@@ -101,12 +101,12 @@ def test_a_mark_taken_back_leaves_what_others_say() -> None:
     replica, composite = writer()
     replica.merge([set_of("other", 0, 0, {5: (PACE, 4.0, 1)})])
     replica.write([5, 6], [LETHAL, LETHAL], [0, 0], NOW)
-    [action] = replica.retract([5], NOW + NS_PER_S)
-    assert np.frombuffer(action.mark_set.cells, "<u2").tolist() == [6]
+    [action] = retract(replica, [5], NOW + NS_PER_S)
+    assert np.frombuffer(action.cells, "<u2").tolist() == [6]
     assert (composite.kinds[5], composite.paces[5]) == (PACE, 4.0)
-    [action] = replica.retract([6], NOW + 2 * NS_PER_S)
-    assert action.mark_set.kinds == b""  # a tombstone
-    assert replica.retract([6], NOW + 3 * NS_PER_S) == []
+    [action] = retract(replica, [6], NOW + 2 * NS_PER_S)
+    assert action.kinds == b""  # a tombstone
+    assert retract(replica, [6], NOW + 3 * NS_PER_S) == []
 
 
 def test_an_author_taken_for_dead_says_what_it_says_again_under_a_higher_epoch() -> None:
@@ -114,7 +114,7 @@ def test_an_author_taken_for_dead_says_what_it_says_again_under_a_higher_epoch()
     replica.write([5], [LETHAL], [0], NOW)
     assert merge_one(replica, set_of("a1.1", 0, 70, {}, epoch=4)) is None
     [action] = replica.tick(NOW + NS_PER_S)
-    assert action.mark_set == set_of("a1.1", 0, 1, {5: (LETHAL, 0, NOW)}, epoch=5)
+    assert action == set_of("a1.1", 0, 1, {5: (LETHAL, 0, NOW)}, epoch=5)
     assert composite.kinds[5] == LETHAL
 
 
@@ -198,9 +198,9 @@ def test_an_author_drops_its_own_ended_statements_from_its_set() -> None:
     replica, composite = writer()
     replica.write([5], [LETHAL], [0], NOW, lifetime_s=2.0)
     [action] = replica.write([6], [LETHAL], [0], NOW + NS_PER_S)
-    assert np.frombuffer(action.mark_set.untils_ns, "<i8").tolist() == [NOW + 2 * NS_PER_S, FOREVER]
+    assert np.frombuffer(action.untils_ns, "<i8").tolist() == [NOW + 2 * NS_PER_S, FOREVER]
     [action] = replica.tick(NOW + 2 * NS_PER_S)
-    assert action.mark_set == set_of("a1.1", 0, 2, {6: (LETHAL, 0, NOW + NS_PER_S)})
+    assert action == set_of("a1.1", 0, 2, {6: (LETHAL, 0, NOW + NS_PER_S)})
     assert composite.kinds[[5, 6]].tolist() == [CLEAR, LETHAL]
 
 
