@@ -7,7 +7,8 @@ import json
 import logging
 import os
 import sqlite3
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO
@@ -27,28 +28,6 @@ from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order
 from swarm.wire.messages.planning import Sighted
 
-# Which class of vehicles each number means, by which the marks in a store name it. Pure.
-
-
-def agreed(stored: Sequence[str], given: Sequence[str], used: Collection[int]) -> list[str] | str:
-    """The classes in the order of their numbers, once a run with these has the store; why it cannot have it, in
-    words, where a mark for one class alone would become one for another, or for nobody though the class is there.
-
-    stored  the classes as the store has them; it may lack some of `used` if it is older than they
-    given   those of the run
-    used    numbers, from 1 on, of the classes for which alone something is marked
-    """
-    for number in sorted(used):
-        if number > len(stored):
-            continue
-        name = stored[number - 1]
-        is_gone = number > len(given) and name not in given
-        if not is_gone and given[number - 1 : number] != [name]:
-            there = ", ".join(given) if given else "none"
-            return f"marks for {name} alone, which is class {number} there, but this run has the classes {there}"
-    return [*given, *stored[len(given) :]]
-
-
 log = logging.getLogger(__name__)
 
 STORE_VERSION = "2"
@@ -59,20 +38,14 @@ BATCH_BYTES = 1 << 19
 """Marks of one commit, about."""
 _LONGEST_VALUE_BYTES = 16 << 20
 """No message is larger, so no column of a row is."""
-_SCHEMA = """
+_SET = """
+    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
+    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL, untils_ns BLOB NOT NULL
+"""
+_SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS sets (
-    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
-    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
-    untils_ns BLOB NOT NULL,
-    PRIMARY KEY (tile, author)
-) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS folded (
-    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
-    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
-    untils_ns BLOB NOT NULL, since_ns INTEGER NOT NULL,
-    PRIMARY KEY (tile, author)
-) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS sets ({_SET}, PRIMARY KEY (tile, author)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS folded ({_SET}, since_ns INTEGER NOT NULL, PRIMARY KEY (tile, author)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS orders (
     subject TEXT NOT NULL, name TEXT NOT NULL, stamp_ns INTEGER NOT NULL, body BLOB NOT NULL,
     PRIMARY KEY (subject, name)
@@ -94,9 +67,8 @@ WHERE excluded.stamp_ns >= orders.stamp_ns
 """
 _FIELDS = ("tile", "author", "group", "epoch", "seq", "cells", "kinds", "paces", "stamps_ns", "untils_ns")
 _COLUMNS = tuple("grp" if field == "group" else field for field in _FIELDS)  # GROUP is a word of SQL
-_UPSERT = """
-INSERT INTO sets (tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns, untils_ns)
-VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+_UPSERT = f"""
+INSERT INTO sets ({", ".join(_COLUMNS)}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
 ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.epoch, seq = excluded.seq,
     cells = excluded.cells, kinds = excluded.kinds, paces = excluded.paces, stamps_ns = excluded.stamps_ns,
     untils_ns = excluded.untils_ns
@@ -153,45 +125,62 @@ class KeeperStore:
         """
         bound = self.terrain
         if bound is None:
-            try:
-                with self._db:
-                    self._db.execute("INSERT INTO meta VALUES ('terrain', ?)", (terrain,))
-                    self._db.execute("INSERT INTO meta VALUES ('grid', ?)", (json.dumps(asdict(grid)),))
-            except sqlite3.Error as error:
-                raise StoreError(f"cannot write the store {self.path}: {error}") from error
+            with self._writing():
+                self._db.execute("INSERT INTO meta VALUES ('terrain', ?)", (terrain,))
+                self._db.execute("INSERT INTO meta VALUES ('grid', ?)", (json.dumps(asdict(grid)),))
         elif bound != terrain:
             raise StoreError(
                 f"the store {self.path} holds marks on terrain {bound}, but this run has terrain {terrain}: "
                 "give another --store, or the terrain and cost rules that it was made with"
             )
-        if classes is not None:
-            self._bind_classes(list(classes), grid)
+        if classes is not None and self.classes != (order := self._class_order(list(classes), grid)):
+            with self._writing():
+                self._db.execute("REPLACE INTO meta VALUES ('classes', ?)", (json.dumps(order),))
 
-    def _bind_classes(self, classes: list[str], grid: GridSpec) -> None:
+    def _class_order(self, given: list[str], grid: GridSpec) -> list[str]:
+        """The classes in the order of their numbers, once a run with these has the store: those of the run, then
+        what only the store knows. Raises StoreError where a mark for one class alone would become one for another,
+        or for nobody though the class is there. A store which is older than its marks may lack some of their
+        classes."""
         stored = self.classes
-        try:
-            used = {row[0] for row in self._db.execute(_CLASSES_USED, {"tiles": grid.tiles})}
-            order = agreed(stored, classes, used)
-            if isinstance(order, str):
+        with self._reading():
+            used = sorted(row[0] for row in self._db.execute(_CLASSES_USED, {"tiles": grid.tiles}))
+        for number in (each for each in used if each <= len(stored)):
+            name = stored[number - 1]
+            is_gone = number > len(given) and name not in given
+            if not is_gone and given[number - 1 : number] != [name]:
                 raise StoreError(
-                    f"the store {self.path} holds {order}: list it in [[classes]] at its old place, or give "
-                    "another --store"
+                    f"the store {self.path} holds marks for {name} alone, which is class {number} there, but this "
+                    f"run has the classes {', '.join(given) or 'none'}: list it in [[classes]] at its old place, "
+                    "or give another --store"
                 )
-            if order != stored:
-                with self._db:
-                    self._db.execute("REPLACE INTO meta VALUES ('classes', ?)", (json.dumps(order),))
+        return [*given, *stored[len(given) :]]
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Commits all or nothing. A StoreError leaves the store usable."""
+        try:
+            with self._db:
+                yield
+        except sqlite3.ProgrammingError:
+            raise  # a bug of ours, and no disk will get better
         except sqlite3.Error as error:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    @contextmanager
+    def _reading(self, what: str = "") -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, ValueError, TypeError, msgspec.MsgspecError, ProtocolError) as error:
+            raise StoreError(_damaged(self.path, f"{what}{error}")) from error
 
     @property
     def classes(self) -> list[str]:
         """The classes of vehicles beside "ground", in the order of the numbers by which marks name them; none in a
         store that was not told them."""
         text = self._meta("classes")
-        try:
+        with self._reading("classes: "):
             return [] if text is None else msgspec.json.decode(text, type=list[str])
-        except (msgspec.MsgspecError, ValueError) as error:
-            raise StoreError(_damaged(self.path, f"classes: {error}")) from error
 
     @property
     def terrain(self) -> str | None:
@@ -202,16 +191,12 @@ class KeeperStore:
     def grid(self) -> GridSpec | None:
         """The grid of that terrain."""
         text = self._meta("grid")
-        try:
+        with self._reading("grid: "):
             return None if text is None else GridSpec(**json.loads(text))
-        except (ValueError, TypeError) as error:
-            raise StoreError(_damaged(self.path, f"grid: {error}")) from error
 
     def _meta(self, key: str) -> str | None:
-        try:
+        with self._reading():
             row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        except sqlite3.Error as error:
-            raise StoreError(_damaged(self.path, str(error))) from error
         return None if row is None else str(row[0])
 
     def load(self) -> Iterator[MarkSet]:
@@ -224,20 +209,15 @@ class KeeperStore:
 
     def tiles_set_aside(self) -> list[int]:
         """Tiles of which compaction dropped something, in order."""
-        try:
+        with self._reading():
             return [row[0] for row in self._db.execute("SELECT DISTINCT tile FROM folded ORDER BY tile")]
-        except sqlite3.Error as error:
-            raise StoreError(_damaged(self.path, str(error))) from error
 
     def _sets(self, where: str, *values: object) -> Iterator[MarkSet]:
-        try:
+        with self._reading():
             for row in self._db.execute(f"SELECT {', '.join(_COLUMNS)} {where}", values):
-                fields = dict(zip(_FIELDS, row, strict=True))
-                mark_set = MarkSet(**fields)
+                mark_set = MarkSet(**dict(zip(_FIELDS, row, strict=True)))
                 mark_set.check()
                 yield mark_set
-        except (sqlite3.Error, ValueError, TypeError) as error:
-            raise StoreError(_damaged(self.path, str(error))) from error
 
     def _set_at(self, table: str, tile: int, author: str) -> MarkSet | None:
         found = list(self._sets(f"FROM {table} WHERE tile = ? AND author = ?", tile, author))
@@ -248,17 +228,12 @@ class KeeperStore:
         leaves the store usable."""
         given = list(sets)
         own = [each for each in given if each.seq % SEQ_STEP == 0]
-        try:
-            with self._db:
-                self._db.executemany(_UPSERT, [_row(each) for each in own])
-                self._db.executemany(_OUTDATE, [(each.tile, each.author, each.epoch, each.seq) for each in own])
-                for each in given:
-                    if each.seq % SEQ_STEP:
-                        self._save_compacted(each, now_ns)
-        except sqlite3.ProgrammingError:
-            raise  # a bug of ours, and no disk will get better
-        except sqlite3.Error as error:
-            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+        with self._writing():
+            self._db.executemany(_UPSERT, [_row(each) for each in own])
+            self._db.executemany(_OUTDATE, [(each.tile, each.author, each.epoch, each.seq) for each in own])
+            for each in given:
+                if each.seq % SEQ_STEP:
+                    self._save_compacted(each, now_ns)
 
     def _save_compacted(self, compacted: MarkSet, now_ns: int) -> None:
         at = (compacted.tile, compacted.author)
@@ -281,41 +256,29 @@ class KeeperStore:
             self._db.execute(_UPSERT, _row(compacted))
 
     def save_sightings(self, seen: Iterable[Sighted]) -> None:
-        """Keep where each target was seen last. A StoreError leaves the store usable."""
-        try:
-            with self._db:
-                self._db.executemany(_SEEN, [(each.target, each.stamp_ns, encode(each)) for each in seen])
-        except sqlite3.Error as error:
-            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+        """Keeps where each target was seen last."""
+        with self._writing():
+            self._db.executemany(_SEEN, [(each.target, each.stamp_ns, encode(each)) for each in seen])
 
     def sightings(self) -> list[Sighted]:
         """The last sighting of each target, in order of target; none in a store without a table of them."""
-        try:
+        with self._reading(), suppress(sqlite3.OperationalError):
             rows = self._db.execute("SELECT sighted FROM sightings ORDER BY target").fetchall()
             return [decode(row[0], Sighted) for row in rows]
-        except sqlite3.OperationalError:
-            return []
-        except (sqlite3.Error, ProtocolError) as error:
-            raise StoreError(_damaged(self.path, str(error))) from error
+        return []
 
     def save_orders(self, orders: Iterable[Order]) -> None:
-        """Commit the newest orders. A StoreError leaves the store usable."""
+        """Commits the newest orders."""
         rows = [(each.subject, each.name, each.stamp_ns, msgspec.json.encode(each)) for each in orders]
-        if not rows:
-            return
-        try:
-            with self._db:
+        if rows:
+            with self._writing():
                 self._db.executemany(_ORDERED, rows)
-        except sqlite3.Error as error:
-            raise StoreError(f"cannot write the store {self.path}: {error}") from error
 
     def orders(self) -> list[Order]:
         """The newest order about each subject."""
-        try:
+        with self._reading("orders: "):
             rows = self._db.execute("SELECT body FROM orders ORDER BY subject, name").fetchall()
             return [msgspec.json.decode(row[0], type=Order) for row in rows]
-        except (sqlite3.Error, msgspec.MsgspecError, ValueError) as error:
-            raise StoreError(_damaged(self.path, f"orders: {error}")) from error
 
     def close(self) -> None:
         """Release the file, and its lock."""
