@@ -219,7 +219,7 @@ def _changed(before: _Placed, after: _Placed) -> _Placed:
         return changed
     cleared = before.taken(gone)
     cleared.kinds[:], cleared.paces[:], cleared.stamps_ns[:] = _CLEAR, 0, NO_STATEMENT
-    return _Placed._make(np.concatenate(pair) for pair in zip(changed, cleared, strict=True))
+    return _Placed._make(np.concatenate([changed[n], cleared[n]]) for n in range(len(changed)))
 
 
 _CLEAR = int(MarkKind.CLEAR)

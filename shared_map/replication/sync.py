@@ -59,7 +59,7 @@ class MapSync:
     on_accepted  called with every set that is merged
     on_digest    called with the author of every digest that is heard, and when
     near         hold only regions that `enter` names, instead of the whole map, and hear only the digests that
-                 can matter there (`digest_interest`)
+                 can matter there (`DigestInterest`)
     at_ticks     merge what others put at the next tick, all at once, and wake nobody for it: for a service that
                  uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
