@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import argparse
 import io
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from docs.generate.printed import lattice_route, printed_costs, printed_range
+from docs.generate.printed import Pace, Place, lattice_route, printed_costs, printed_range
 from launch_scripts.observe.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED, STYLE
 from planner_service.strategy import ROWS, STAGES, Strategy
 from planner_service.target_tree import TargetTree
@@ -34,14 +33,14 @@ from planner_service.tree.strides import one_stride
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
-FOLDER = Path(__file__).parents[2] / "docs" / "images" / "method"
-Pace = NDArray[np.float32]
-Place = tuple[int, int]
+IMAGES = Path(__file__).parents[1] / "images"
 Trail = NDArray[np.int64]
+_MOVES = np.stack((STEP_ROW, STEP_COL), axis=1)
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#f6f3ea", "#d9cfae", "#a68a5b"])
 _WALL = ListedColormap(["#4a4f57"])
-_LABEL: Any = {"fc": "white", "ec": "none", "pad": 1.0, "alpha": 0.8}
 _GAP = LinearSegmentedColormap.from_list("gap", ["#f2f7f4", "#fbd9a0", ORANGE, RED, "#6d1404"])
+LABEL: Any = {"fc": "white", "ec": "none", "pad": 1.0, "alpha": 0.8}
+"""The box behind a text on the map."""
 
 
 class Chase:
@@ -51,18 +50,16 @@ class Chase:
         self.pace = pace
         self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
         self.tree = TargetTree(self.grid, PlannerConfig(**config), chosen_by=row)
-        self.version = 0
         self.widths: list[int] = []
         self.go(target)
 
     def go(self, target: Place) -> Any:
-        """The target is at a place; the tree follows. A full growth that falls due is done at once."""
+        """Moves the target; the tree follows. A full growth which falls due is done at once."""
         self.target = target
         cell = self.grid.cell(*target)
-        done = self.tree.update(self.pace, cell, [], self.version)
+        done = self.tree.update(self.pace, cell, [], 0)
         if done.wants_full:
-            grown = self.tree.full_job(cell)()
-            done = self.tree.adopt(grown, self.pace, cell, [], self.version, [])
+            done = self.tree.adopt(self.tree.full_job(cell)(), self.pace, cell, [], 0, [])
         if self.tree.wants_strides:
             self.tree.take_strides(self.tree.stride_job().run())
         self.widths.append(done.window.row1 - done.window.row0)
@@ -71,8 +68,7 @@ class Chase:
     def trail(self, start: Place) -> Trail:
         """(n, 2) places of the route from a cell to the target."""
         route = self.tree.routes([self.grid.cell(*start)])[0]
-        steps = np.frombuffer(route.directions, np.uint8)
-        moves = np.stack([np.array(STEP_ROW)[steps], np.array(STEP_COL)[steps]], axis=1)
+        moves = _MOVES[np.frombuffer(route.directions, np.uint8)]
         return np.concatenate([[start], np.array(start) + np.cumsum(moves, axis=0)])
 
     def costs(self) -> NDArray[np.float64]:
@@ -84,23 +80,18 @@ def tree() -> Figure:
     """A cost map, the parents of all cells, and the route of a vehicle."""
     pace = _hills(14, 22, seed=5, strength=2.4)
     pace[3:10, 9] = np.inf
-    chase = Chase(pace, (4, 17), strategy="full")
-    figure, (axes,) = _figure(1, (6.6, 4.3))
-    _ground(axes, pace)
-    for row in range(14):
-        for col in range(22):
-            trail = chase.trail((row, col))
-            if len(trail) > 1 and math.isfinite(pace[row, col]):
-                south, east = (trail[1] - trail[0]) * 0.32
-                axes.annotate(
-                    "",
-                    (col + east, row + south),
-                    (col - east, row - south),
-                    arrowprops={"arrowstyle": "-|>,head_width=.14,head_length=.24", "color": "#7d7357", "lw": 0.7},
-                )
-    _route(axes, chase.trail((11, 3)), GREEN)
-    _vehicle(axes, (11, 3))
-    _target(axes, (4, 17))
+    start, target = (11, 3), (4, 17)
+    chase = Chase(pace, target, strategy="full")
+    figure, (axes,) = maps(1, (6.6, 4.3))
+    draw_ground(axes, pace)
+    trails = [chase.trail((int(row), int(col))) for row, col in np.argwhere(np.isfinite(pace))]
+    first = np.array([trail[:2] for trail in trails if len(trail) > 1])
+    (south, east), (row, col) = (first[:, 1] - first[:, 0]).T * 0.64, first[:, 0].T
+    axes.quiver(
+        col, row, east, south, angles="xy", scale_units="xy", scale=1, pivot="mid", color="#7d7357", width=0.0022,
+        headwidth=5, headlength=6,
+    )  # fmt: skip
+    _draw_chase(axes, chase.trail(start), start, target)
     axes.set_title("Each cell's parent; brown cells cost more, the wall is lethal")
     return figure
 
@@ -114,21 +105,21 @@ def reversed_edges() -> Figure:
     chases = [Chase(pace, place, strategy="full") for place in places]
     driven = np.stack([chase.costs() for chase in chases])
     as_printed = np.stack([printed_costs(pace, place) for place in places])
-    figure, panels = _figure(2, (9.2, 3.3))
+    figure, panels = maps(2, (9.2, 3.3))
     sides = ((as_printed, "Along the edges, as printed"), (driven, "Against the edges"))
     for axes, (costs, title) in zip(panels, sides, strict=True):
         choice = costs.argmin(axis=0)
         axes.imshow(choice, cmap=ListedColormap(["#d6e9f5", "#fdebd0"]), vmin=0, vmax=1)
         axes.contourf(pace > 1, levels=[0.5, 2], colors=[INK], alpha=0.18)
-        if (choice != driven.argmin(axis=0)).any():
-            axes.contourf(choice != driven.argmin(axis=0), levels=[0.5, 1.5], colors="none", hatches=["////"])
+        dearer = choice != driven.argmin(axis=0)
+        if dearer.any():
+            axes.contourf(dearer, levels=[0.5, 1.5], colors="none", hatches=["////"])
             axes.text(24, 34, "hatched: sent to the dearer target", fontsize=8.5, color=INK)
         taken = int(choice[vehicle])
-        _route(axes, chases[taken].trail(vehicle), GREEN)
-        _vehicle(axes, vehicle)
+        _draw_chase(axes, chases[taken].trail(vehicle), vehicle, places[taken])
         for place, colour, name in zip(places, (BLUE, ORANGE), ("A, in a swamp", "B"), strict=True):
-            _target(axes, place, colour)
-            axes.text(place[1], place[0] - 2.6, name, ha="center", fontsize=9, color=INK, bbox=_LABEL)
+            draw_target(axes, place, colour)
+            axes.text(place[1], place[0] - 2.6, name, ha="center", fontsize=9, color=INK, bbox=LABEL)
         figures = f"to {'AB'[taken]}: {costs[taken][vehicle]:.0f} s promised, {driven[taken][vehicle]:.0f} s driven"
         axes.set_title(f"{title}\n{figures}")
     return figure
@@ -138,7 +129,7 @@ def range_rule() -> Figure:
     """How wide a window each move of a target gets, by the printed condition and by blocks that are left."""
     figure = Figure(figsize=(9.2, 3.5), layout="constrained")
     left, *right = figure.subplots(1, 3, width_ratios=[1.05, 1.2, 1.2])
-    _blocks(left)
+    _draw_windows(left)
     moves = range(1, 33)
     for axes, step, title in zip(right, ((0, 1), (1, 1)), ("Along a row", "Along a diagonal"), strict=True):
         chase = Chase(np.ones((257, 257), np.float32), (128, 128), strategy="variable_range", k_min=2)
@@ -155,32 +146,22 @@ def range_rule() -> Figure:
     return figure
 
 
-def _blocks(axes: Axes) -> None:
-    axes.set(xlim=(-17.5, 17.5), ylim=(-17.5, 17.5), aspect="equal", xticks=[], yticks=[])
-    axes.grid(False)
+def _draw_windows(axes: Axes) -> None:
+    """Draws the three smallest windows around a target, over the blocks whose borders decide between them."""
+    axes.set(xlim=(-17.5, 17.5), ylim=(-17.5, 17.5), aspect="equal", title="Windows for k_min = 2")
+    _bare(axes)
     for line in range(-16, 17, 4):
-        wide = 1.1 if line % 8 == 0 else 0.5
-        axes.axhline(line - 2.5, color="#c9ced4", lw=wide, zorder=0)
-        axes.axvline(line - 2.5, color="#c9ced4", lw=wide, zorder=0)
-    for width, colour, text in (
-        (9, GREEN, "9: every move"),
-        (17, BLUE, "17: out of a 4 x 4 block"),
-        (33, ORANGE, "33: out of an 8 x 8 block"),
-    ):
-        axes.add_patch(Rectangle((-width / 2, -width / 2), width, width, fill=False, ec=colour, lw=1.8))
+        for draw in (axes.axhline, axes.axvline):
+            draw(line - 2.5, color="#c9ced4", lw=1.1 if line % 8 == 0 else 0.5, zorder=0)
+    sides = ((9, GREEN, "every move"), (17, BLUE, "out of a 4 x 4 block"), (33, ORANGE, "out of an 8 x 8 block"))
+    for width, colour, text in sides:
+        side = Rectangle((-width / 2, -width / 2), width, width, fill=False, ec=colour, lw=1.8)
+        axes.add_patch(side)
         axes.text(
-            0,
-            width / 2 - 0.3,
-            text,
-            color=colour,
-            fontsize=8.5,
-            ha="center",
-            va="top",
-            weight="bold",
-            bbox={"fc": "white", "ec": "none", "pad": 0.8},
-        )
-    axes.plot(0, 0, "*", ms=12, color=RED, mec="white")
-    axes.set_title("Windows for k_min = 2")
+            0, width / 2 - 0.3, f"{width}: {text}", color=colour, fontsize=8.5, ha="center", va="top",
+            weight="bold", bbox=LABEL | {"alpha": 1.0},
+        )  # fmt: skip
+    draw_target(axes, (0, 0))
 
 
 def tracking() -> Figure:
@@ -190,7 +171,7 @@ def tracking() -> Figure:
     for bridge in (62, 98):
         pace[46:49, bridge : bridge + 4] = 1.0
     start, target = (85, 50), (12, 65)
-    figure, panels = _figure(2, (9.2, 3.5))
+    figure, panels = maps(2, (9.2, 3.5))
     sides = (
         ("variable_range", "Windows, and a new route where the old one ends"),
         ("exact", "Exact moves, newer routes pushed"),
@@ -198,44 +179,41 @@ def tracking() -> Figure:
     for axes, (strategy, title) in zip(panels, sides, strict=True):
         chase = Chase(pace, target, strategy=strategy, k_min=2)
         was = chase.trail(start)
-        driven, ends, frames = _drive(chase, start, [(12, 65 + n) for n in range(1, 31)])
-        _ground(axes, pace)
-        _route(axes, driven, GREEN)
-        _route(axes, was, INK, dashed=True)
+        driven, ends = _drive(chase, start, [(12, 65 + n) for n in range(1, 31)])
+        draw_ground(axes, pace)
         axes.plot([target[1], chase.target[1]], [target[0]] * 2, color=RED, lw=1.4, ls=":")
         axes.plot(target[1], target[0], "*", ms=10, mfc="white", mec=RED)
-        for end in ends:
+        _draw_chase(axes, driven, start, chase.target)
+        axes.plot(was[:, 1], was[:, 0], color=INK, lw=1.6, ls="--")
+        for row, col in ends:
             axes.annotate(
-                "the route ends here:\nthe target has gone",
-                (end[1], end[0]),
-                (end[1] - 42, end[0] + 9),
-                fontsize=8.5,
-                color=INK,
-                arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 0.8},
-            )
-        _vehicle(axes, start)
-        _target(axes, chase.target)
-        axes.set_title(f"{title}\ntarget reached after {frames} frames")
+                "the route ends here:\nthe target has gone", (col, row), (col - 42, row + 9), fontsize=8.5,
+                color=INK, arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 0.8},
+            )  # fmt: skip
+        axes.set_title(f"{title}\ntarget reached after {len(driven) - 1} frames")
     return figure
 
 
-def _drive(chase: Chase, start: Place, way: Sequence[Place]) -> tuple[Trail, list[Place], int]:
-    """A vehicle drives a cell a frame, its target one in two frames, until the two meet. It gets a newer route when
-    it stands in the grown window, and asks for one when its own has ended. Returns its way, ends and frames."""
-    path, place, at = chase.trail(start), start, 0
+def _drive(chase: Chase, start: Place, way: Sequence[Place]) -> tuple[Trail, list[Place]]:
+    """Returns the way of a vehicle, and where its routes ended before it met the target.
+
+    It drives a cell a frame, its target one in two. It gets a newer route when it stands in the grown window,
+    and asks for one when its own has ended.
+    """
     driven, ends = [start], []
-    frame = 0
-    while max(abs(place[0] - chase.target[0]), abs(place[1] - chase.target[1])) > 1 and frame < 400:
-        frame += 1
-        if frame % 2 == 0 and frame // 2 <= len(way) and chase.go(way[frame // 2 - 1]).window.contains(*place):
-            path, at = chase.trail(place), 0
-        if at + 1 >= len(path):
-            ends.append(place)
-            path, at = chase.trail(place), 0
-        at += 1
-        place = (int(path[at][0]), int(path[at][1]))
-        driven.append(place)
-    return np.array(driven), ends, frame
+    ahead = iter(chase.trail(start)[1:])
+    while (
+        max(abs(driven[-1][0] - chase.target[0]), abs(driven[-1][1] - chase.target[1])) > 1 and len(driven) <= 400
+    ):
+        moves, odd = divmod(len(driven), 2)
+        if not odd and moves <= len(way) and chase.go(way[moves - 1]).window.contains(*driven[-1]):
+            ahead = iter(chase.trail(driven[-1])[1:])
+        if (place := next(ahead, None)) is None:
+            ends.append(driven[-1])
+            ahead = iter(chase.trail(driven[-1])[1:])
+            place = next(ahead)
+        driven.append((int(place[0]), int(place[1])))
+    return np.array(driven), ends
 
 
 def schedule() -> Figure:
@@ -246,24 +224,22 @@ def schedule() -> Figure:
     begin = (110, 22)
     way = Chase(pace, (38, 140), strategy="full").trail(begin)[1:121]
     exact = Chase(pace, (int(way[-1][0]), int(way[-1][1])), strategy="full").costs()
-    figure, panels = _figure(2, (8.4, 3.9))
-    for axes, row, name in zip(
-        panels,
-        (ROWS["variable_range"], STAGES["rotate"]),
-        ("The paper's windows", "Doubling windows, renewed every 13 moves"),
-        strict=True,
-    ):
+    figure, panels = maps(2, (8.4, 3.9))
+    sides = (
+        (ROWS["variable_range"], "The paper's windows"),
+        (STAGES["rotate"], "Doubling windows, renewed every 13 moves"),
+    )
+    for axes, (row, name) in zip(panels, sides, strict=True):
         chase = Chase(pace, begin, row, k_min=2, cpu_budget=1.2e-4)
         for place in way:
             chase.go((int(place[0]), int(place[1])))
         with np.errstate(invalid="ignore"):
-            gap = (chase.costs() / exact - 1) * 100
-        gap[np.isnan(gap)] = 0
+            gap = np.nan_to_num((chase.costs() / exact - 1) * 100, posinf=np.inf)
         seen = gap[np.isfinite(pace)]
         shown = axes.imshow(gap, cmap=_GAP.resampled(10), vmin=0, vmax=25)
         axes.imshow(np.where(np.isfinite(pace), np.nan, 1.0), cmap=_WALL)
         axes.plot(way[:, 1], way[:, 0], color=INK, lw=1.0, ls=":")
-        _target(axes, chase.target)
+        draw_target(axes, chase.target)
         axes.set_title(f"{name}\nmean {seen.mean():.2f} %, 95th percentile {np.percentile(seen, 95):.1f} %")
     figure.colorbar(shown, ax=panels, shrink=0.85, label="driven above the optimum, %", extend="max")
     return figure
@@ -272,58 +248,43 @@ def schedule() -> Figure:
 def strides() -> Figure:
     """A thin wall, under a lattice of every eighth cell and under blocks of as many."""
     pace = _hills(64, 96, seed=8, strength=0.9)
-    pace[14:64, 30] = np.inf
-    pace[0:46, 62] = np.inf
+    pace[14:64, 30] = pace[0:46, 62] = np.inf
     start, target = (52, 4), (20, 84)
-    figure, (left, right) = _figure(2, (9.2, 3.6))
-    _ground(left, pace)
+    figure, (left, right) = maps(2, (9.2, 3.6))
+    for axes in (left, right):
+        draw_ground(axes, pace)
     jumped = lattice_route(pace, start, target, stride=8)
-    crossed = [
-        (a, b) for a, b in pairwise(jumped) if any(not math.isfinite(pace[row, col]) for row, col in _between(a, b))
-    ]
     rows, cols = np.mgrid[4:64:8, 4:96:8]
     left.plot(cols.ravel(), rows.ravel(), ".", ms=2.4, color="#8b8371")
-    _route(left, jumped, RED)
-    for a, b in crossed:
-        left.plot((a[1] + b[1]) / 2, (a[0] + b[0]) / 2, "x", ms=11, mew=2.6, color=BLACK)
+    _draw_chase(left, jumped, start, target, RED)
+    for a, b in pairwise(jumped):
+        if np.isinf(pace[tuple(np.linspace(a, b, 9).round().astype(int).T)]).any():
+            left.plot((a[1] + b[1]) / 2, (a[0] + b[0]) / 2, "x", ms=11, mew=2.6, color=BLACK)
     left.set_title("Every eighth cell: the route passes through two walls")
-    _ground(right, pace)
     for line in range(0, 97, 8):
-        right.axvline(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
-        right.axhline(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
+        for draw in (right.axhline, right.axvline):
+            draw(line - 0.5, color="#c9ced4", lw=0.5, zorder=1)
     centres, ways = _network(pace, stride=8)
     for way in ways:
         right.plot(way[:, 1], way[:, 0], color=BLUE, lw=0.8, alpha=0.7)
     right.plot(centres[:, 1], centres[:, 0], "o", ms=2.6, color=BLUE)
-    _route(right, Chase(pace, target, strategy="full").trail(start), GREEN)
+    _draw_chase(right, Chase(pace, target, strategy="full").trail(start), start, target)
     right.set(xlim=(-0.5, 95.5), ylim=(63.5, -0.5), title="Nodes and links of a stride of 8, and the route")
-    for axes in (left, right):
-        _vehicle(axes, start)
-        _target(axes, target)
     return figure
 
 
 def _network(pace: Pace, stride: int) -> tuple[Trail, list[Trail]]:
     """(n, 2) places of the centres of a stride's nodes, and those of the way of each link."""
-    grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-    costs = CostGrid(grid, PlannerConfig())
+    costs = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig())
     costs.load(pace)
     centre, links = one_stride(costs, stride)
-    moves = np.stack((STEP_ROW, STEP_COL), axis=1)
-    begins = np.cumsum(links.length) - links.length
-    ways = []
-    for node, begin, length in zip(links.ends[0], begins, links.length, strict=True):
-        steps = moves[links.paths[begin : begin + length]]
-        start = np.array(divmod(int(centre[node]), costs.stride)) - 1
-        ways.append(np.concatenate([[start], start + np.cumsum(steps, axis=0)]))
-    return np.stack(np.divmod(centre.astype(np.int64), costs.stride), axis=1) - 1, ways
-
-
-def _between(a: Any, b: Any) -> list[Place]:
-    many = int(max(abs(b[0] - a[0]), abs(b[1] - a[1])))
-    return [
-        (round(a[0] + (b[0] - a[0]) * n / many), round(a[1] + (b[1] - a[1]) * n / many)) for n in range(many + 1)
+    centres = np.stack(np.divmod(centre.astype(np.int64), costs.stride), axis=1) - 1
+    paths = np.split(links.paths, np.cumsum(links.length)[:-1])
+    ways = [
+        np.concatenate([[start], start + np.cumsum(_MOVES[path], axis=0)])
+        for start, path in zip(centres[links.ends[0]], paths, strict=True)
     ]
+    return centres, ways
 
 
 # --- how it looks -----------------------------------------------------------------------------------------------
@@ -336,67 +297,69 @@ def _hills(rows: int, cols: int, seed: int, strength: float) -> Pace:
     return pace
 
 
-def _figure(panels: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+def maps(panels: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    """A figure of maps side by side."""
     figure = Figure(figsize=size, layout="constrained")
-    return figure, list(np.atleast_1d(figure.subplots(1, panels)))
+    axes = list(np.atleast_1d(figure.subplots(1, panels)))
+    for each in axes:
+        _bare(each)
+    return figure, axes
 
 
-def _ground(axes: Axes, pace: Pace) -> None:
+def _bare(axes: Axes) -> None:
+    axes.grid(False)
+    axes.set(xticks=[], yticks=[])
+
+
+def draw_ground(axes: Axes, pace: Pace) -> None:
+    """Draws paces from white to brown, and lethal cells dark."""
     finite = np.where(np.isfinite(pace), pace, np.nan)
-    axes.imshow(finite, cmap=_GROUND, vmin=1, vmax=float(np.nanpercentile(finite, 99)))
+    low, high = np.nanpercentile(finite, (0, 99))
+    axes.imshow(finite, cmap=_GROUND, vmin=min(1.0, float(low)), vmax=float(high))
     axes.imshow(np.where(np.isfinite(pace), np.nan, 1.0), cmap=_WALL)
-    axes.grid(False)
-    axes.set(xticks=[], yticks=[])
 
 
-def _route(axes: Axes, trail: Trail, colour: str, dashed: bool = False) -> None:
-    if not dashed:
-        axes.plot(trail[:, 1], trail[:, 0], color="white", lw=3.6, solid_capstyle="round")
-    axes.plot(trail[:, 1], trail[:, 0], color=colour, lw=1.6 if dashed else 2.1, ls="--" if dashed else "-")
+def draw_route(axes: Axes, trail: NDArray[Any], colour: str, label: str | None = None) -> None:
+    """Draws a line through (n, 2) places; a label is for the legend."""
+    axes.plot(trail[:, 1], trail[:, 0], color="white", lw=3.6, solid_capstyle="round")
+    axes.plot(trail[:, 1], trail[:, 0], color=colour, lw=2.1, label=label)
 
 
-def _vehicle(axes: Axes, place: Place) -> None:
-    axes.plot(place[1], place[0], "o", ms=8, color=GREEN, mec="white", mew=1.2)
-    axes.grid(False)
-    axes.set(xticks=[], yticks=[])
+def draw_target(axes: Axes, place: Place, colour: str = RED) -> None:
+    """Draws a target as a star."""
+    axes.plot(place[1], place[0], "*", ms=15, color=colour, mec="white", mew=1.0, zorder=5)
 
 
-def _target(axes: Axes, place: Place, colour: str = RED) -> None:
-    axes.plot(place[1], place[0], "*", ms=15, color=colour, mec="white", mew=1.0)
-    axes.grid(False)
-    axes.set(xticks=[], yticks=[])
+def _draw_chase(axes: Axes, trail: Trail, vehicle: Place, target: Place, colour: str = GREEN) -> None:
+    draw_route(axes, trail, colour)
+    axes.plot(vehicle[1], vehicle[0], "o", ms=8, color=GREEN, mec="white", mew=1.2)
+    draw_target(axes, target)
+
+
+def draw_named(pictures: Mapping[str, Callable[[], Figure]]) -> None:
+    """Writes the pictures which the command line names, all if none.
+
+    A file has a palette and neither date nor version: the same picture is the same file.
+    """
+    parser = argparse.ArgumentParser(description="Draw pictures of the documentation.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(pictures)}; all if none")
+    for name in parser.parse_args().names or pictures:
+        raw = io.BytesIO()
+        with mpl.rc_context(STYLE):
+            pictures[name]().savefig(raw, format="png", dpi=100, metadata={"Software": None})
+        image = Image.open(raw).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        image.save(IMAGES / f"{name}.png", optimize=True)
 
 
 PICTURES: dict[str, Callable[[], Figure]] = {
-    "tree": tree,
-    "reversed-edges": reversed_edges,
-    "range-rule": range_rule,
-    "tracking": tracking,
-    "schedule": schedule,
-    "strides": strides,
+    "method/tree": tree,
+    "method/reversed-edges": reversed_edges,
+    "method/range-rule": range_rule,
+    "method/tracking": tracking,
+    "method/schedule": schedule,
+    "method/strides": strides,
 }
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a picture with a palette, without date or version: the same picture is the same file."""
-    raw = io.BytesIO()
-    figure.savefig(raw, format="png", dpi=100, metadata={"Software": None})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.open(raw).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m docs.generate.method_pictures",
-        description="Draw the pictures of docs/method.md.",
-    )
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PICTURES)}; all if none")
-    for name in parser.parse_args().names or PICTURES:
-        with mpl.rc_context(STYLE):
-            save(PICTURES[name](), FOLDER / f"{name}.png")
-
+"""Picture, by its place below docs/images without .png -> what draws it."""
 
 if __name__ == "__main__":
-    main()
+    draw_named(PICTURES)

@@ -72,22 +72,17 @@ def schema(root: Section = Scenario) -> str:
         for key, value in definition["properties"].items():
             value["description"] = said[key]
     found = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "terrain-swarm scenario", **found}
-    return json.dumps(_plain(found), indent=1)
+    # The end of a text is `$` in JSON Schema, which matches before no line end there.
+    return json.dumps(json.loads(json.dumps(found).replace(r'\\Z"', '$"'), parse_float=_number), indent=1)
 
 
-def _plain(value: Any) -> Any:
-    """The value with whole numbers as such, and with patterns as JSON Schema writes them.
+def _number(text: str) -> float:
+    """Returns a whole number as such.
 
-    `typing` keeps one of two bounds that are equal, 10000 and 1e4, by which module is imported first. The end of a
-    text is `$` in JSON Schema, which matches before no line end there.
+    Of two bounds that are equal, 10000 and 1e4, `typing` keeps that of the module which is imported first.
     """
-    if isinstance(value, str):
-        return value[:-2] + "$" if value.endswith(r"\Z") else value
-    if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
-    if isinstance(value, list):
-        return [_plain(each) for each in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value
+    value = float(text)
+    return int(value) if value.is_integer() else value
 
 
 def _sections(root: Section) -> list[tuple[str, Section]]:
@@ -117,17 +112,13 @@ def _rows(path: str, section: Section) -> Iterator[tuple[str, ...]]:
 def _meanings(section: Section) -> dict[str, str]:
     """What each field means. A field of the root that is a section of its own is described by that section."""
     said = meanings(section)
-    missing: list[str] = []
     for name, hint in hints_of(section).items():
-        inner = section_in(hint)
-        if name not in said and inner is not None:
+        if name not in said:
+            if (inner := section_in(hint)) is None:
+                raise UndocumentedKeyError(
+                    f"{section.__module__}.{section.__name__}: no row in the docstring for {name}"
+                )
             said[name] = prose(inner).partition("\n")[0]
-        elif name not in said:
-            missing.append(name)
-    if missing:
-        raise UndocumentedKeyError(
-            f"{section.__module__}.{section.__name__}: no row in the docstring for {', '.join(missing)}"
-        )
     return said
 
 
@@ -159,6 +150,4 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
         return "see below"
     if isinstance(value, tuple) and any(isinstance(item, msgspec.Struct) for item in value):
         return "one, with its defaults"
-    if isinstance(value, dict):
-        return "`{}`"
     return f"`{json.dumps(msgspec.to_builtins(value))}`"

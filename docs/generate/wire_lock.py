@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import enum
 import json
-import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from docs.generate.wire_page import default_text, messages, parts, type_text
+from docs.generate.wire_page import messages, parts, rows
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.topics import ALIVE_KEY, TOPICS
 from swarm.wire.versions import are_neighbours, name_and_version, read_schemas, written_schema
@@ -52,9 +51,13 @@ def _locked(kind: type[Message]) -> dict[str, Any]:
     return {
         "reads": sorted(name_and_version(schema)[1] for schema in read_schemas(kind)),
         "writes": name_and_version(written_schema(kind))[1],
-        "structs": {struct.__name__: _fields(struct) for struct in structs},
+        "structs": {struct.__name__: rows(struct) for struct in structs},
         "layouts": {struct.__name__: _layout(struct) for struct in structs},
-        "values": {each.__name__: [member.value for member in each] for each in _enumerations(structs)},
+        "values": {
+            each.__name__: [member.value for member in each]
+            for struct in structs
+            for each in parts(struct, enum.Enum)
+        },
     }
 
 
@@ -62,25 +65,6 @@ def _layout(struct: type[msgspec.Struct]) -> str:
     """How fields are written, and whether what a later build adds is read past."""
     config = struct.__struct_config__
     return ("list" if config.array_like else "map") + (", no other fields" if config.forbid_unknown_fields else "")
-
-
-def _enumerations(structs: Iterable[type[msgspec.Struct]]) -> list[type[enum.Enum]]:
-    """Those whose members are written, each once, in the order of the fields."""
-    found: dict[type[enum.Enum], None] = {}
-    for struct in structs:
-        hints: list[Any] = list(typing.get_type_hints(struct, include_extras=True).values())
-        for hint in hints:  # grows
-            hints.extend(typing.get_args(hint))
-            if isinstance(hint, type) and issubclass(hint, enum.Enum):
-                found[hint] = None
-    return list(found)
-
-
-def _fields(struct: type[msgspec.Struct]) -> list[list[str]]:
-    hints = typing.get_type_hints(struct, include_extras=True)
-    return [
-        [field.name, type_text(hints[field.name]), default_text(field)] for field in msgspec.structs.fields(struct)
-    ]
 
 
 def document() -> str:

@@ -75,21 +75,24 @@ def _schemas(message: type[Message]) -> str:
 
 def _struct(struct: type[msgspec.Struct]) -> str:
     prose, _, listing = inspect.cleandoc(struct.__doc__ or "").partition("\n\n")
+    return filled("struct", about=prose, listing=textwrap.indent(listing, "    "), rows=rows(struct))
+
+
+def rows(struct: type[msgspec.Struct]) -> list[list[str]]:
+    """Returns name, type and default of each field."""
     hints = typing.get_type_hints(struct, include_extras=True)
-    rows = [
-        (field.name, type_text(hints[field.name]), default_text(field)) for field in msgspec.structs.fields(struct)
+    return [
+        [field.name, type_text(hints[field.name]), default_text(field)] for field in msgspec.structs.fields(struct)
     ]
-    return filled("struct", about=prose, listing=textwrap.indent(listing, "    "), rows=rows)
 
 
-def parts(message: type[Message]) -> list[type[msgspec.Struct]]:
-    """Structs inside the fields of a message."""
-    found: list[type[msgspec.Struct]] = []
-    hints = list(typing.get_type_hints(message).values())
-    while hints:
-        hint = hints.pop(0)
+def parts(struct: type[msgspec.Struct], kind: type[Any] = msgspec.Struct) -> list[Any]:
+    """Returns the structs, or the classes of another kind, inside the fields of a struct; each once."""
+    found: list[Any] = []
+    hints = list(typing.get_type_hints(struct).values())
+    for hint in hints:  # grows
         hints.extend(typing.get_args(hint))
-        if isinstance(hint, type) and issubclass(hint, msgspec.Struct) and hint not in found:
+        if isinstance(hint, type) and issubclass(hint, kind) and hint not in found:
             found.append(hint)
     return found
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from docs.generate.method_pictures import FOLDER, PICTURES
+from docs.generate import method_pictures, route_pictures
 from docs.generate.printed import lattice_route, printed_costs, printed_range
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-
-METHOD = Path(__file__).parents[3] / "docs" / "method.md"
 
 
 def test_the_printed_condition_never_widens_the_window_of_a_target_that_moves_along_an_axis():
@@ -53,8 +49,8 @@ def test_strides_jump_over_a_wall_thinner_than_a_stride():
     assert math.isinf(tree.cost_to_go_at([grid.cell(4, 0)])[0])
 
 
-def test_every_picture_is_there_small_and_shown():
-    shown = set(re.findall(r"images/method/([\w-]+)\.png", METHOD.read_text(encoding="utf-8")))
-    assert shown == set(PICTURES)
-    for name in PICTURES:
-        assert (FOLDER / f"{name}.png").stat().st_size < 60_000
+@pytest.mark.parametrize("name", [*method_pictures.PICTURES, *route_pictures.PICTURES])
+def test_a_picture_is_there_small_and_shown_on_a_page(name):
+    images = method_pictures.IMAGES
+    assert (images / f"{name}.png").stat().st_size < 160_000
+    assert any(f"images/{name}.png" in page.read_text(encoding="utf-8") for page in images.parent.glob("*.md"))
