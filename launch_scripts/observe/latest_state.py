@@ -230,7 +230,7 @@ class LatestState(Counts):
                     self._fleet_told_ns[agent_of(message.ids[0])] = now_ns
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
-                pose = self._trackings.hear(message, now_ns)
+                pose = self._trackings.on_pose(message, now_ns)
                 if pose is not None:
                     self.poses[pose.target] = pose
                 return pose

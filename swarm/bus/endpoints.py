@@ -1,8 +1,14 @@
-"""Endpoints of routers: their parts, and whether anybody listens there."""
+"""Endpoints of routers: their parts, whether anybody listens there, and if nobody does, why.
+
+The reasons are in words of our own: the network library names its own source files instead.
+"""
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import re
 import socket
 import time
 from collections.abc import Sequence
@@ -10,6 +16,15 @@ from collections.abc import Sequence
 log = logging.getLogger(__name__)
 
 _PAUSE_S = 0.25
+"""Between two looks for a router that is not up yet."""
+_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+_KNOCK_S = 1.0
+"""Longest wait for an answer of a port. A router of the same network answers within milliseconds."""
+_HINTS = {
+    errno.EADDRINUSE: "is the port taken?",
+    errno.EADDRNOTAVAIL: "is it an address of this machine?",
+    errno.EACCES: "ports below 1024 are for administrators",
+}
 
 
 def host_port(endpoint: str) -> tuple[str, int]:
@@ -40,3 +55,39 @@ def wait_for_router(endpoints: Sequence[str]) -> None:
         time.sleep(_PAUSE_S)
     if said:
         log.info("a router is there")
+
+
+def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
+    """Why no router is reached at any of these endpoints: what its port does when somebody knocks."""
+    reasons = dict.fromkeys(_why_silent(endpoint, encrypted) for endpoint in endpoints)
+    return "; ".join(reasons)
+
+
+def why_not_listening(error: Exception) -> str:
+    """Why nobody can listen, from what the library says."""
+    found = _OS_ERROR.search(str(error))
+    if found is None:
+        return "the network library refuses; its own words are in the log (is the port taken?)"
+    number = int(found[1])
+    hint = _HINTS.get(number)
+    return os.strerror(number) + (f" ({hint})" if hint else "")
+
+
+def _why_silent(endpoint: str, encrypted: bool) -> str:
+    try:
+        host, port = host_port(endpoint)
+        socket.create_connection((host, port), timeout=_KNOCK_S).close()
+    except socket.gaierror:
+        return f"the name {host} is unknown here"
+    except TimeoutError:
+        return f"no answer within {_KNOCK_S:g} s (is a firewall between?)"
+    except ConnectionRefusedError:
+        return "nobody listens there (is `swarm router` running there?)"
+    except (OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error)
+    if encrypted:
+        return (
+            "somebody listens there, and refuses us or is no router "
+            "(is `swarm router` running there, with certificates of the same authority?)"
+        )
+    return "somebody listens there, and does not answer as a router (is `swarm router` running there?)"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
+from functools import partial
 from typing import Protocol
 
 from swarm.bus.bus import (
@@ -201,35 +201,23 @@ def narrowed(topic: Topic, fields: Mapping[str, str | int]) -> dict[str, str]:
 
 
 class Subscriptions:
-    """The subscriptions of one topic, looked up by the values of the fields that they name.
-
-    A topic has few such sets of fields, and hundreds of subscriptions: a hundred vehicles each listen to a key of
-    their own, agents to each plot near them.
-    """
+    """The subscriptions of one topic. Which of them a key reaches is looked up once, until one comes or goes."""
 
     def __init__(self) -> None:
-        self._count = 0
+        self._all: list[Declaration] = []
         self._found: dict[tuple[str, ...], list[Declaration]] = {}
-        """Values of all fields of a key -> `find` of it, until a subscription comes or goes."""
-        self._by_names: dict[tuple[str, ...], dict[tuple[str, ...], list[tuple[int, Declaration]]]] = {}
-        """Names of the fields that are no wildcard -> their values -> (number of the declaration, subscription)."""
+        """Values of all fields of a key -> `find` of it."""
 
     def add(self, declaration: Declaration) -> None:
         self._found.clear()
-        names, values = tuple(declaration.narrow), tuple(declaration.narrow.values())
-        self._by_names.setdefault(names, {}).setdefault(values, []).append((self._count, declaration))
-        self._count += 1
+        self._all.append(declaration)
 
     def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
         """Forget the subscriptions of a bus: all, or those with exactly these fields."""
         self._found.clear()
-        for names, by_values in self._by_names.items():
-            if narrow is not None and names != tuple(narrow):
-                continue
-            for values in list(by_values) if narrow is None else [tuple(narrow.values())]:
-                kept = [each for each in by_values.pop(values, ()) if each[1].bus is not bus]
-                if kept:
-                    by_values[values] = kept
+        self._all = [
+            each for each in self._all if each.bus is not bus or (narrow is not None and each.narrow != narrow)
+        ]
 
     def find(self, fields: Mapping[str, str]) -> list[Declaration]:
         """Those that a value with these fields reaches: first the ones with wildcards, each kind in the order of
@@ -237,16 +225,9 @@ class Subscriptions:
         key = tuple(fields.values())
         found = self._found.get(key)
         if found is None:
-            found = self._found[key] = self._look_up(fields)
+            reached = [each for each in self._all if each.meets(fields)]
+            found = self._found[key] = sorted(reached, key=lambda each: len(each.narrow) == len(fields))
         return found
-
-    def _look_up(self, fields: Mapping[str, str]) -> list[Declaration]:
-        wide: list[tuple[int, Declaration]] = []
-        exact: list[tuple[int, Declaration]] = []
-        for names, by_values in self._by_names.items():
-            found = by_values.get(tuple([fields[name] for name in names]), ())
-            (exact if len(names) == len(fields) else wide).extend(found)
-        return [declaration for _, declaration in sorted(wide, key=itemgetter(0)) + exact]
 
 
 def sampled(bus: MemoryBus, post: Post, every_ns: int) -> Post:
@@ -417,7 +398,13 @@ class MemoryBus:
             for delay_ns in network.delays_ns(self, subscription.bus, topic.name):
                 arrivals.setdefault(delay_ns, []).append(subscription)
         for delay_ns, reached in arrivals.items():
-            network.scheduler.after(delay_ns, _Arrivals(self, reached, sample))
+            network.scheduler.after(delay_ns, partial(self._arrive, reached, sample))
+
+    def _arrive(self, reached: Sequence[Declaration], sample: _Sample) -> None:
+        """Let a sample arrive at subscriptions which it reaches at one time, in the order of `find`."""
+        for subscription in reached:
+            if subscription.bus.traced(self, sample.topic.name, sample.payload):
+                subscription.bus.arrived(sample, subscription)
 
     def subscribe(
         self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
@@ -510,12 +497,26 @@ class MemoryBus:
         parsed = decode(payload, topic.request)
         code = code_of(self.authenticator, topic, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
-            assert queryable.post is not None
             for delay_ns in self.network.delays_ns(self, queryable.bus, topic.name):
                 answerer = MemoryAnswerer(asking, queryable, index, asking.began_ns + delay_ns)
                 event = Asked(topic, wanted, parsed, answerer)
-                scheduler.after(delay_ns, _Delivery(self, queryable.bus, payload, code, queryable.post, event))
+                scheduler.after(delay_ns, partial(self._arrive_asked, queryable, payload, code, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
+
+    def _arrive_asked(self, queryable: Declaration, payload: bytes, code: bytes | None, event: Asked) -> None:
+        to, topic = queryable.bus, event.topic
+        assert queryable.post is not None
+        if not to.traced(self, topic.name, payload):
+            return
+        to.received(payload)
+        try:
+            check_code(to.authenticator, code, topic, topic.below(event.fields), payload)
+        except ProtocolError as error:
+            to.counts["payloads_dropped"] += 1
+            event.refuse(f"{topic.name}: {error}")
+            event.end()
+        else:
+            queryable.post(event)
 
     def declare_alive(self, peer: Peer) -> None:
         self.tokens.append(peer)
@@ -593,7 +594,7 @@ class _Sample:
     """One put, parsed and checked once: when the first subscription is reached. All share the result.
 
     checked_by  who has found its code right; None before, and for a bus that checks none
-    parsed      whether `parse` was called
+    parsed      whether it was parsed
     parses      its event; None if the payload is no message of the topic
     fits        the same; None if the message says that it is of another sender than the key, too
     """
@@ -635,44 +636,3 @@ class _Sample:
         except ProtocolError:
             return
         self.fits = self.parses
-
-
-@dataclass(eq=False, slots=True)
-class _Arrivals:
-    """The arrival of a sample at subscriptions that it reaches at one time, in the order of `subscribers`."""
-
-    source: MemoryBus
-    subscriptions: list[Declaration]
-    sample: _Sample
-
-    def __call__(self) -> None:
-        sample, what = self.sample, self.sample.topic.name
-        for subscription in self.subscriptions:
-            if subscription.bus.traced(self.source, what, sample.payload):
-                subscription.bus.arrived(sample, subscription)
-
-
-@dataclass(eq=False, slots=True)
-class _Delivery:
-    """The arrival of a query at a queryable."""
-
-    source: MemoryBus
-    to: MemoryBus
-    payload: bytes
-    code: bytes | None
-    post: Post
-    event: Asked
-
-    def __call__(self) -> None:
-        event, topic = self.event, self.event.topic
-        if not self.to.traced(self.source, topic.name, self.payload):
-            return
-        self.to.received(self.payload)
-        try:
-            check_code(self.to.authenticator, self.code, topic, topic.below(event.fields), self.payload)
-        except ProtocolError as error:
-            self.to.counts["payloads_dropped"] += 1
-            event.refuse(f"{topic.name}: {error}")
-            event.end()
-        else:
-            self.post(event)

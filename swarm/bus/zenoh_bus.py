@@ -10,16 +10,12 @@ ten times a second for nothing (`Arrivals`).
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
-import re
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
@@ -38,7 +34,7 @@ from swarm.bus.bus import (
     Undecoded,
     check_subscription,
 )
-from swarm.bus.endpoints import host_port, listening, wait_for_router
+from swarm.bus.endpoints import listening, wait_for_router, why_not_listening, why_unreachable
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_intake import (
     Arrivals,
@@ -58,94 +54,77 @@ from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
-# The answers to one query on Zenoh.
-
-
-class Reply(Protocol):
-    """Sends one answer to a query whose payload was `asked`, or as a text why there is none."""
-
-    def __call__(
-        self, query: zenoh.Query, asked: bytes, message: Message | str, fields: Mapping[str, str | int]
-    ) -> None: ...
-
 
 class ZenohAnswerer:
     """The `Answerer` of one query, which arrives when this is made. `_query` is None after the end.
 
-    asked  its payload
+    concrete  fields of the key that the queryable serves
+    fault     why the query is rejected, if its timeout is none
     """
 
-    def __init__(self, query: zenoh.Query, asked: bytes, reply: Reply) -> None:
+    def __init__(self, bus: ZenohBus, topic: Topic, concrete: Mapping[str, str], query: zenoh.Query) -> None:
+        self._bus, self._topic, self._concrete = bus, topic, concrete
         self._query: zenoh.Query | None = query
-        self._reply = reply
-        self.asked = asked
         self._arrived_s = time.monotonic()
+        self._asked = b"" if query.payload is None else query.payload.to_bytes()
+        self._parameters = dict(list(query.parameters))  # type: ignore[call-overload]
+        self._as_json = says_json(query, self._asked) or self._parameters.get("format") == "json"
+        self._fault: ProtocolError | None = None
         self.timeout_s = USUAL_TIMEOUT_S
+        try:
+            self.timeout_s = timeout_of(self._parameters.pop(TIMEOUT_PARAMETER, ""))
+        except ProtocolError as error:
+            self._fault = error
+
+    def decoded(self) -> Asked | None:
+        """What is asked; None if that is rejected, which ends the query."""
+        intake, topic, query = self._bus.intake, self._topic, self._query
+        assert query is not None
+        assert topic.request is not None
+        key = str(query.key_expr)
+        intake.received(self._asked)
+        try:
+            if self._fault is not None:
+                raise self._fault
+            intake.check(topic, key, query, self._asked)
+            request = intake.request(topic.request, query, self._asked, self._parameters)
+        except ProtocolError as error:
+            intake.drop(key, error)
+            self.refuse(f"{topic.name}: {error}")
+            self.end()
+            return None
+        # A tool may ask with `**`, which no key template parses: all that we serve is meant.
+        asked = topic.parse(self._bus.namespace, key) or {**dict.fromkeys(topic.fields, "*"), **self._concrete}
+        return Asked(topic, asked, request, self)
 
     def waited_s(self) -> float:
         return time.monotonic() - self._arrived_s
 
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
-        if self._query is None:
+        query, topic, bus = self._query, self._topic, self._bus
+        if query is None:
             raise RuntimeError("answered after the end")
-        self._reply(self._query, self.asked, message, fields)
+        if bus.closed:
+            return
+        key = topic.keyed(bus.namespace, **{**self._concrete, **fields})
+        if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
+            return
+        payload = encode_json(message) if self._as_json else encode(message)
+        bus.intake.sent(payload)
+        if self._as_json:
+            query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
+        else:
+            query.reply(key, payload, attachment=code_of(bus.authenticator, topic, key, payload, self._asked))
 
     def refuse(self, reason: str) -> None:
-        if self._query is not None:
-            self._reply(self._query, self.asked, reason, {})
+        if self._query is not None and not self._bus.closed:
+            self._query.reply_err(reason.encode())
 
     def end(self) -> None:
         # Zenoh ends a query when its last handle goes; `drop` does it now, not at the next garbage collection.
         if self._query is not None:
             self._query.drop()  # type: ignore[no-untyped-call]
             self._query = None
-
-
-# Why a session could not be opened, in our words. The library names its own source files instead.
-
-_OS_ERROR = re.compile(r"\(os error (\d+)\)")
-_KNOCK_S = 1.0
-_HINTS = {
-    errno.EADDRINUSE: "is the port taken?",
-    errno.EADDRNOTAVAIL: "is it an address of this machine?",
-    errno.EACCES: "ports below 1024 are for administrators",
-}
-
-
-def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
-    """Why no router is reached at any of these endpoints: what its port does when somebody knocks."""
-    reasons = dict.fromkeys(_why_silent(endpoint, encrypted) for endpoint in endpoints)
-    return "; ".join(reasons)
-
-
-def why_not_listening(error: Exception) -> str:
-    """Why nobody can listen, from what the library says."""
-    found = _OS_ERROR.search(str(error))
-    if found is None:
-        return "the network library refuses; its own words are in the log (is the port taken?)"
-    number = int(found[1])
-    hint = _HINTS.get(number)
-    return os.strerror(number) + (f" ({hint})" if hint else "")
-
-
-def _why_silent(endpoint: str, encrypted: bool) -> str:
-    try:
-        host, port = host_port(endpoint)
-        socket.create_connection((host, port), timeout=_KNOCK_S).close()
-    except socket.gaierror:
-        return f"the name {host} is unknown here"
-    except TimeoutError:
-        return f"no answer within {_KNOCK_S:g} s (is a firewall between?)"
-    except ConnectionRefusedError:
-        return "nobody listens there (is `swarm router` running there?)"
-    except (OSError, ValueError) as error:
-        return getattr(error, "strerror", None) or str(error)
-    if encrypted:
-        return (
-            "somebody listens there, and refuses us or is no router "
-            "(is `swarm router` running there, with certificates of the same authority?)"
-        )
-    return "somebody listens there, and does not answer as a router (is `swarm router` running there?)"
 
 
 log = logging.getLogger(__name__)
@@ -204,8 +183,8 @@ class ZenohBus:
     def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
         self._session = session
         self._namespace = namespace
-        self._authenticator = authenticator
-        self._intake = Intake(namespace, authenticator)
+        self.authenticator = authenticator
+        self.intake = Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
@@ -227,10 +206,10 @@ class ZenohBus:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        return self._intake.counts
+        return self.intake.counts
 
     @property
-    def _closed(self) -> bool:
+    def closed(self) -> bool:
         return self._closing.is_set()
 
     @property
@@ -245,14 +224,14 @@ class ZenohBus:
         self.close()
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        if self._closed:
+        if self.closed:
             return
         key, payload = topic.keyed(self._namespace, **fields), encode(message)
-        self._intake.sent(payload)
+        self.intake.sent(payload)
         self._session.put(
             key,
             payload,
-            attachment=code_of(self._authenticator, topic, key, payload),
+            attachment=code_of(self.authenticator, topic, key, payload),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=_PRIORITIES[topic.priority],
             allowed_destination=zenoh.Locality.ANY if topic.echoed else zenoh.Locality.REMOTE,
@@ -264,17 +243,17 @@ class ZenohBus:
         check_subscription(topic, together, every_s)
 
         def arrive(sample: zenoh.Sample) -> None:
-            heard = self._intake.arrived(topic, sample)
+            heard = self.intake.arrived(topic, sample)
             if heard is not None:
                 post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            heard = self._intake.together(topic, samples)
+            heard = self.intake.together(topic, samples)
             if heard:
                 post(HeardMany(topic, heard))
 
         def arrive_sampled(samples: list[zenoh.Sample]) -> None:
-            for heard in self._intake.newest(topic, samples):
+            for heard in self.intake.newest(topic, samples):
                 post(heard)
 
         subscriber = self._subscriber(topic, fields)
@@ -295,46 +274,20 @@ class ZenohBus:
     def collected(self, topic: Topic) -> list[Heard]:
         heard: list[Heard] = []
         for subscriber in self._collecting.get(topic.name, ()):
-            heard += self._intake.newest(topic, taken_from(subscriber.handler, topic.buffer))
+            heard += self.intake.newest(topic, taken_from(subscriber.handler, topic.buffer))
         return heard
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
         samples: list[zenoh.Sample] = []
         for subscriber in self._collecting.get(topic.name, ()):
             samples += taken_from(subscriber.handler, topic.buffer)
-        return self._intake.together(topic, samples) if samples else []
+        return self.intake.together(topic, samples) if samples else []
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())
         collecting = self._collecting.get(topic.name, ())
         self._collecting[topic.name] = [each for each in collecting if each not in subscribers]
         self._undeclare_all(subscribers)
-
-    def _reply(
-        self,
-        topic: Topic,
-        concrete: Mapping[str, str],
-        as_json: bool,
-        query: zenoh.Query,
-        asked: bytes,
-        message: Message | str,
-        fields: Mapping[str, str | int],
-    ) -> None:
-        """Send one answer to a query, or as a text why there is none."""
-        if self._closed:
-            return
-        if isinstance(message, str):
-            query.reply_err(message.encode())
-            return
-        key = topic.keyed(self._namespace, **{**concrete, **fields})
-        if str(query.key_expr) != key and not query.key_expr.intersects(zenoh.KeyExpr(key)):
-            return
-        payload = encode_json(message) if as_json else encode(message)
-        self._intake.sent(payload)
-        if as_json:
-            query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
-        else:
-            query.reply(key, payload, attachment=code_of(self._authenticator, topic, key, payload, asked))
 
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
         expression = topic.expression(self._namespace, **fields)
@@ -343,49 +296,18 @@ class ZenohBus:
         return subscriber
 
     def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
-        request_type = topic.request
-        if request_type is None:
+        if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
 
-        def decoded(
-            query: zenoh.Query, answerer: ZenohAnswerer, parameters: dict[str, str], fault: ProtocolError | None
-        ) -> Asked | None:
-            key = str(query.key_expr)
-            self._intake.received(answerer.asked)
-            try:
-                if fault is not None:
-                    raise fault
-                self._intake.check(topic, key, query, answerer.asked)
-                request = self._intake.request(request_type, query, answerer.asked, parameters)
-            except ProtocolError as error:
-                self._intake.drop(key, error)
-                answerer.refuse(f"{topic.name}: {error}")
-                answerer.end()
-                return None
-            # A tool may ask with `**`, which no key template parses: all that we serve is meant.
-            asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
-            return Asked(topic, asked, request, answerer)
-
-        def undecoded_of(query: zenoh.Query) -> Undecoded:
-            parameters = dict(list(query.parameters))  # type: ignore[call-overload]
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            as_json = says_json(query, payload) or parameters.get("format") == "json"
-            answerer = ZenohAnswerer(query, payload, partial(self._reply, topic, concrete, as_json))
-            fault = None
-            try:
-                answerer.timeout_s = timeout_of(parameters.pop(TIMEOUT_PARAMETER, ""))
-            except ProtocolError as error:
-                fault = error
-            return Undecoded(topic, answerer, partial(decoded, query, answerer, parameters, fault))
-
         def arrive(query: zenoh.Query) -> None:
-            asked = undecoded_of(query).decoded()
+            asked = ZenohAnswerer(self, topic, concrete, query).decoded()
             if asked is not None:
                 post(asked)
 
         def leave(query: zenoh.Query) -> None:
-            post(undecoded_of(query))
+            answerer = ZenohAnswerer(self, topic, concrete, query)
+            post(Undecoded(topic, answerer, answerer.decoded))
 
         expression = topic.expression(self._namespace, **fields)
         arrivals = Arrivals(_QUERY_BUFFER)
@@ -425,23 +347,23 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
-                self._intake.check(topic, key, reply.ok, payload, asked)
+                self.intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
-                named = self._intake.fields(topic, key)
+                named = self.intake.fields(topic, key)
             except ProtocolError as error:
-                self._intake.drop(key, error)
+                self.intake.drop(key, error)
                 return
             replies += 1
-            self._intake.received(payload)
+            self.intake.received(payload)
             post(Replied(tag, topic, named, message, took_s))
 
         def finish() -> None:
             post(AskEnded(tag, topic, replies, failure))
 
-        if self._closed:
+        if self.closed:
             finish()
             return
-        self._intake.sent(asked)
+        self.intake.sent(asked)
         self._session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
             zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
@@ -449,7 +371,7 @@ class ZenohBus:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
             payload=asked,
-            attachment=code_of(self._authenticator, topic, expression, asked),
+            attachment=code_of(self.authenticator, topic, expression, asked),
             priority=_PRIORITIES[topic.priority],
         )
 
@@ -463,7 +385,7 @@ class ZenohBus:
             try:
                 peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
-                self._intake.drop(str(sample.key_expr), error)
+                self.intake.drop(str(sample.key_expr), error)
                 return
             if peer in self._own_peers:
                 return  # our own token falls with the link, though we live
@@ -486,7 +408,7 @@ class ZenohBus:
 
     def close(self) -> None:
         """Leave the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten seconds."""
-        if self._closed:
+        if self.closed:
             return
         self._closing.set()
         closer = threading.Thread(target=self._undeclare, name="close", daemon=True)
@@ -519,7 +441,7 @@ class ZenohBus:
                     arrive(item)
                 raise BusError(f"{name} hears nothing more")
             except (BusError, zenoh.ZError):
-                if not self._closed and entity in self._entities:
+                if not self.closed and entity in self._entities:
                     raise  # it has ended by itself
 
         thread = threading.Thread(target=run, name=name, daemon=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from swarm.client.frame import Frame
 from swarm.client.observer import EVERY_S, Observer
-from swarm.client.orders import Orders
+from swarm.client.order_calls import Orders
 from swarm.client.route import Route
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target

@@ -20,8 +20,6 @@ CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
 EVERY_S = 0.2
 _HEARD = (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS)
-_SAMPLED = (FLEET,)
-"""Of these only the newest is read, some times a second: they come at every tick, of every vehicle."""
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
 _ZONES = "operator."
@@ -96,11 +94,8 @@ class Observer:
         """What has changed since `take_routes` and `take_mark_sets`."""
         session.add(self)
         bus, post = session.bus, session.post
-        for topic in _HEARD:
-            if topic in _SAMPLED:
-                bus.subscribe(topic, post, every_s=every_s)
-            else:
-                bus.subscribe(topic, post)
+        for topic in _HEARD:  # of fleets only the newest: they come at every tick, of every vehicle
+            bus.subscribe(topic, post, every_s=every_s if topic is FLEET else 0.0)
         self._ask_marks()
 
     def __enter__(self) -> Observer:
@@ -191,7 +186,7 @@ class Observer:
             case Heard(message=Body() as body):
                 self._bodies[body.id] = body, now_ns
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
-                if self._trackings.hear(pose, now_ns) is not None:
+                if self._trackings.on_pose(pose, now_ns) is not None:
                     self._targets[pose.target] = None
             case Heard(message=Followed() as followed):
                 self._on_followed(followed)

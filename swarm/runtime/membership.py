@@ -69,7 +69,7 @@ class Alarms:
             if standing == kind and about not in abouts:
                 self.end(kind, about, now_ns)
 
-    def told(self) -> list[Alarm]:
+    def current(self) -> list[Alarm]:
         """What lasts, then what is over, each in order of time."""
         return [*sorted(self._standing.values(), key=lambda alarm: alarm.since_ns), *self._over]
 
@@ -221,7 +221,7 @@ class Member:
                 name: {id: h.buckets for id, h in each.items()}
                 for name, each in self.counters.histograms_by.items()
             },
-            alarms=self.alarms.told(),
+            alarms=self.alarms.current(),
             web_port=self.web_port,
         )
         if self._before is not None:

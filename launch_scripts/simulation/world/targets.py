@@ -236,7 +236,7 @@ class TargetWorld:
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
-        counts = self._trackings.hear(pose, now_ns)
+        counts = self._trackings.on_pose(pose, now_ns)
         if counts is None:
             return
         pose = counts
