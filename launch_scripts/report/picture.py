@@ -2,92 +2,125 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import matplotlib as mpl
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, duration, fact
-from launch_scripts.report.map_figure import GroundPicture, draw_map
+from launch_scripts.report.map_figure import GroundPicture, draw_border, draw_map
 from launch_scripts.report.run_arrays import RunTracks
-from launch_scripts.report.run_plots import PLOTS, draw_plot
+from launch_scripts.report.run_plots import PLOTS, draw_plot, saved
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 
 _MAP = (0.046, 0.058, 0.552, 0.776)
 """Left, bottom, width and height of the map at most, as shares of the page."""
-_BESIDE = ("states", "totals", "gaps", "waiting", "messages", "timings")
+_BESIDE = ("states", "captures", "gaps", "waiting", "messages", "timings")
 """Plots beside the map; the page of the run has all."""
-_COUNTS = ("captures", "marks", "reroute_requests", "routes_served")
+
+
+class Card(NamedTuple):
+    """One of the main figures of a run: what it is called, in words, what it means.
+
+    tone  good, bad or nothing
+    """
+
+    label: str
+    text: str
+    meaning: str
+    tone: str = ""
+
+
+def cards(report: Mapping[str, Any]) -> list[Card]:
+    """The main figures of a run, for the picture and the page."""
+    gap = report["certified_gap"]
+    unproven = gap.get("unproven") or 0
+    not_counted = f" {count(unproven)} had none and are not counted." if unproven else ""
+    times = {
+        "growth_ms": ("growth of a tree, p50", "All cheapest paths to one target"),
+        "route_query_ms": ("route query, p50", "From a vehicle's question to the answer"),
+        "mark_to_tree_ms": ("mark to tree, p50", "From what a sensor sees to a tree's cost"),
+    }
+    return [
+        *(_of_fact(report, name) for name in ("captures", "marks", "reroute_requests", "routes_served")),
+        Card(
+            "certified gap, mean",
+            percent(gap["mean"]),
+            "Routes that vehicles began cost at most so much more than the cheapest that exist: proven, by a lower "
+            f"bound with each.{not_counted}",
+        ),
+        Card(
+            "certified gap, p95",
+            percent(gap["p95"]),
+            f"Of 100 routes, 95 are proven to be at least as good as this. The worst: {percent(gap['max'])}.",
+        ),
+        *(
+            Card(label, duration(report[name]["p50"]), f"{meaning}; p99 {duration(report[name]['p99'])}.")
+            for name, (label, meaning) in times.items()
+        ),
+        Card("messages/s, mean", count(report["messages_per_s"]), "Of all processes, over the whole run."),
+        *(_of_fact(report, name, must_be_zero=True) for name in ("collisions", "lethal_entries")),
+    ]
+
+
+def _of_fact(report: Mapping[str, Any], name: str, must_be_zero: bool = False) -> Card:
+    value, told = report[name], fact(name)
+    tone = "" if not must_be_zero or value is None else "bad" if value else "good"
+    return Card(told.label, told.text(value), told.meaning, tone)
+
+
+def headline(report: Mapping[str, Any], run: str | None) -> list[str]:
+    """Which run it was and how long, in a few words each."""
+    seconds, scale, startup_s = (report[name] for name in ("seconds", "time_scale", "startup_s"))
+    known = {
+        f"scenario {report['scenario']}": True,
+        f"run {run}": run,
+        f"seed {report['seed']}": True,
+        f"{seconds or 0:.0f} s" + (f" at {scale:g} times real motion" if scale != 1 else ""): seconds is not None,
+        "simulated in one process": "simulated" in report,
+        f"{report['processes']} processes": report["processes"] is not None and "simulated" not in report,
+        f"{report['restarts']} restarts": report["restarts"],
+        f"all running after {startup_s or 0:.1f} s": startup_s is not None,
+    }
+    return [text for text, is_known in known.items() if is_known]
 
 
 def save_picture(path: Path, ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> None:
-    """Draw the run and write it as PNG."""
-    with mpl.rc_context(palette.STYLE):
-        figure = draw(ground, tracks, report)
-        canvas = FigureCanvasAgg(figure)
-        with path.open("wb") as file:
-            canvas.print_png(file, pil_kwargs={"compress_level": 4})  # type: ignore[no-untyped-call]
+    """Draws the run and writes it as PNG."""
+    with saved(path, (WIDTH_IN, HEIGHT_IN), DPI) as figure:
+        draw(figure, ground, tracks, report)
 
 
-def draw(ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> Figure:
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), dpi=DPI, facecolor="white")
+def draw(figure: Figure, ground: GroundPicture, tracks: RunTracks, report: dict[str, Any]) -> None:
+    """Draws the run on a figure of the size of the picture."""
     _draw_head(figure, report)
-    draw_map(figure.add_axes(_MAP), ground, tracks, report)
+    axes = figure.add_axes(_MAP)
+    draw_map(axes, tracks, report)
+    draw_border(axes, ground, tracks)
     left, width, top, bottom, gap = 0.655, 0.297, 0.818, 0.058, 0.052
     height = (top - bottom - gap * (len(_BESIDE) - 1)) / len(_BESIDE)
-    plots = [next(plot for plot in PLOTS if plot.name == name) for name in _BESIDE]
-    last = max(n for n, plot in enumerate(plots) if plot.over_time)
-    for n, plot in enumerate(plots):
-        axes = figure.add_axes((left, top - height - n * (height + gap), width, height))
-        draw_plot(axes, plot, report)
-        if plot.over_time:
-            axes.tick_params(axis="x", labelbottom=n == last)
-    return figure
+    for n, name in enumerate(_BESIDE):
+        beside = figure.add_axes((left, top - height - n * (height + gap), width, height))
+        draw_plot(beside, next(plot for plot in PLOTS if plot.name == name), report)
 
 
 def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
     title = f"{report['vehicles']} vehicles chase {report['targets']} targets"
     figure.text(0.033, 0.966, title, fontsize=21, fontweight="bold", va="center")
-    figure.text(0.033, 0.936, "   ·   ".join(_facts(report)), fontsize=9, color=palette.FAINT, va="center")
-    gap = report["certified_gap"]
-    tiles = [
-        *((fact(name).label, count(report[name]), palette.INK) for name in _COUNTS),
-        ("certified gap, mean", percent(gap["mean"]), palette.INK),
-        ("certified gap, p95", percent(gap["p95"]), palette.INK),
-        ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), palette.INK),
-        ("route query, p99", duration(report["route_query_ms"]["p99"]), palette.INK),
-        *(
-            (name.replace("_", " "), count(report[name]), palette.RED if report[name] else palette.GREEN)
-            for name in ("collisions", "lethal_entries", "lost")
-        ),
-    ]
+    facts = "   ·   ".join(headline(report, report["run_id"]))
+    figure.text(0.033, 0.936, facts, fontsize=9, color=palette.FAINT, va="center")
     for y in (0.918, 0.853):
         figure.add_artist(Line2D([0.033, 0.967], [y, y], color=palette.RULE, linewidth=1))
-    widths = [max(len(label), 1.9 * len(value)) + 3 for label, value, _ in tiles]
+    tiles = cards(report)
+    widths = [max(len(tile.label), 1.9 * len(tile.text)) + 5 for tile in tiles]
     x, unit = 0.033, 0.95 / sum(widths)
-    for (label, value, colour), width in zip(tiles, widths, strict=True):
-        figure.text(x, 0.896, value, fontsize=14, fontweight="bold", color=colour, va="center")
-        figure.text(x, 0.869, label, fontsize=8, color=palette.FAINT, va="center")
+    tones = {"": palette.INK, "good": palette.GREEN, "bad": palette.RED}
+    for tile, width in zip(tiles, widths, strict=True):
+        figure.text(x, 0.896, tile.text, fontsize=14, fontweight="bold", color=tones[tile.tone], va="center")
+        figure.text(x, 0.869, tile.label, fontsize=8, color=palette.FAINT, va="center")
         x += unit * width
-
-
-def _facts(report: dict[str, Any]) -> list[str]:
-    seconds, scale = report["seconds"], report["time_scale"]
-    facts = [f"scenario {report['scenario']}"]
-    if report["run_id"]:
-        facts.append(f"run {report['run_id']}")
-    facts.append(f"seed {report['seed']}")
-    if seconds is not None:
-        facts.append(f"{seconds:.0f} s" + (f" at {scale:g} x real motion" if scale != 1 else ""))
-    for name, one in (("processes", "process"), ("restarts", "restart")):
-        if report[name] is not None:
-            facts.append(f"{report[name]} {one if report[name] == 1 else name}")
-    if report["startup_s"] is not None:
-        facts.append(f"all running after {report['startup_s']:.1f} s")
-    return facts

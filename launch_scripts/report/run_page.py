@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from launch_scripts.observe import palette
 from launch_scripts.observe.counts import percent
-from launch_scripts.observe.facts import count, duration, fact, grouped, together
-from launch_scripts.observe.palette import GROUPS, STYLE, round_length, said_length
+from launch_scripts.observe.facts import count, grouped, together
+from launch_scripts.observe.palette import STYLE
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
 from launch_scripts.report.map_figure import (
@@ -28,13 +26,12 @@ from launch_scripts.report.map_figure import (
     LEARNED_FILE,
     QUICKER,
     SLOWER,
-    Points,
     colours_of_groups,
-    group_of,
-    in_km,
-    mark_overlay,
+    draw_map,
+    size_km,
 )
-from launch_scripts.report.run_arrays import TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.picture import cards, headline
+from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
 from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.config.input_files import FileKind, read_bytes, read_text
@@ -44,6 +41,10 @@ from swarm.grid import GridSpec
 PAGE_FILE = "report.html"
 _NOTES_SHOWN = 400
 _ROWS_SHOWN = 2000
+_MAP_IN = 10.0
+"""The longer side of the map."""
+_PLOT_IN, _PLOT = (4.1, 1.8), (0.125, 0.135, 0.775, 0.7)
+"""Size of a plot, and where its axes are in it."""
 
 
 def write_page(folder: Path) -> Path:
@@ -64,7 +65,6 @@ def write_page(folder: Path) -> Path:
 def page_of(folder: Path, report: Mapping[str, Any]) -> str:
     """The page's text. What comes from files is escaped by the template."""
     environment = environment_of_pages()
-    tracks = folder / TRACKS_FILE
     scenario = folder / SCENARIO_FILE
     recording = folder / "run.rrd"  # without a byte where the monitor ended before it drew anything
     notes = list(report.get("notes") or [])
@@ -74,14 +74,15 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         report=report,
         name=folder.resolve().name,
         where=f"{folder.resolve().parent.name}/{folder.resolve().name}",
-        cards=_cards(report),
+        facts=headline(report, folder.resolve().name),
+        cards=cards(report),
         alarms=_alarms(report),
         left_behind=_left_behind(report),
-        map=map_parts(folder, read_tracks(tracks), report) if tracks.exists() else None,
+        map=_map(folder, report),
         slower=SLOWER,
         quicker=QUICKER,
         plots=[
-            (plot, themed_svg(lambda axes, plot=plot: draw_plot(axes, plot, report, titled=False)))  # type: ignore[misc]
+            (plot, _svg(_PLOT_IN, _PLOT, lambda axes, plot=plot: draw_plot(axes, plot, report, titled=False)))  # type: ignore[misc]
             for plot in PLOTS
         ],
         tables=[_table(section, heading, report) for section, (_, heading) in TABLES.items()],
@@ -110,51 +111,6 @@ def _when(text: str) -> str:
         return f"{datetime.datetime.fromisoformat(text):%Y-%m-%d %H:%M} UTC"
     except ValueError:
         return text
-
-
-Card = tuple[str, str, str, str]
-"""What a figure is called, the figure, what it means; good, bad or nothing."""
-
-
-def _cards(report: Mapping[str, Any]) -> list[Card]:
-    gap = report["certified_gap"]
-    unproven = gap.get("unproven") or 0
-    return [
-        _of_fact(report, "captures"),
-        (
-            "certified gap, mean",
-            percent(gap["mean"]),
-            "Routes that vehicles began cost at most so much more than the cheapest that exist: proven, by a lower "
-            "bound with each." + (f" {count(unproven)} had none and are not counted." if unproven else ""),
-            "",
-        ),
-        (
-            "certified gap, p95",
-            percent(gap["p95"]),
-            f"Of 100 routes, 95 are proven to be at least as good as this. The worst: {percent(gap['max'])}.",
-            "",
-        ),
-        _of_fact(report, "collisions", must_be_zero=True),
-        _of_fact(report, "lethal_entries", must_be_zero=True),
-        _of_fact(report, "marks"),
-        _of_fact(report, "reroute_requests"),
-        _of_fact(report, "routes_served"),
-        _timing(report, "growth_ms", "growing a tree, p50", "All cheapest paths to one target"),
-        _timing(report, "route_query_ms", "asking for a route, p50", "From a vehicle's question to the answer"),
-        _timing(report, "mark_to_tree_ms", "from mark to tree, p50", "From what a sensor sees to a tree's cost"),
-        ("messages/s, mean", count(report["messages_per_s"]), "Of all processes, over the whole run.", ""),
-    ]
-
-
-def _of_fact(report: Mapping[str, Any], name: str, must_be_zero: bool = False) -> Card:
-    value, told = report[name], fact(name)
-    tone = "" if not must_be_zero or value is None else "bad" if value else "good"
-    return told.label, told.text(value), told.meaning, tone
-
-
-def _timing(report: Mapping[str, Any], name: str, label: str, meaning: str) -> Card:
-    quantiles = report[name]
-    return label, duration(quantiles["p50"]), f"{meaning}; p99 {duration(quantiles['p99'])}.", ""
 
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
@@ -239,111 +195,47 @@ def _cell(name: str, value: Any) -> tuple[str, Any]:
     return (count(value) if isinstance(value, int | float) else str(value)), value
 
 
-# --- the map, as SVG over the picture of its ground: tracks can be pointed at and switched ------------------------
-
-WIDTH = 1000
-"""Units of the drawing across the longer side of the map."""
-_MOST_POINTS = 60_000
-"""Points of all tracks: more would be slow to look at."""
+# --- drawings, as SVG ---------------------------------------------------------------------------------------------
 
 
-def map_parts(folder: Path, tracks: RunTracks, report: Mapping[str, Any]) -> dict[str, Any]:
-    """What the page's template makes a map of: places in units of the drawing, pictures as data."""
-    grid = tracks.grid
-    long_km = max(grid.rows, grid.cols) * grid.resolution_m / 1000
-    scale = WIDTH / long_km
-    samples = sum(len(track.time_ns) for track in (*tracks.vehicles, *tracks.targets))
-    step = max(1, -(-samples // _MOST_POINTS))
-    groups = colours_of_groups(report)
-    vehicles = [
-        {
-            "id": track.id,
-            "group": (group := group_of(track.id, report)),
-            "colour": groups.get(group, GROUPS[0]),
-            **_drawn(in_km(track, grid) * scale, step),
-        }
-        for track in tracks.vehicles
-        if len(track.time_ns)
-    ]
-    pieces = [(track.id, in_km(track, grid) * scale) for track in tracks.targets if len(track.time_ns)]
-    bar_km = round_length(grid.cols * grid.resolution_m / 5000)
-    ground, learned = folder / GROUND_FILE, folder / LEARNED_FILE
+def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What the page's template makes a map of: a drawing to be laid over pictures; None without tracks."""
+    if not (folder / TRACKS_FILE).exists():
+        return None
+    tracks = read_tracks(folder / TRACKS_FILE)
+    width_km, height_km = size_km(tracks.grid)
+    scale = _MAP_IN / max(width_km, height_km)
+    files = {"ground": (GROUND_FILE, "image/webp"), "learned": (LEARNED_FILE, "image/png")}
     return {
-        "width": round(grid.cols * grid.resolution_m / 1000 * scale, 1),
-        "height": round(grid.rows * grid.resolution_m / 1000 * scale, 1),
-        "ground": data_uri("image/webp", read_bytes(ground, FileKind.RUN)) if ground.exists() else None,
-        "learned": data_uri("image/png", read_bytes(learned, FileKind.RUN)) if learned.exists() else None,
-        "marks": _png(tracks) if len(tracks.marks.cells) else None,
-        "groups": groups,
-        "vehicles": vehicles,
-        "thin": 1 / max(1.0, len(vehicles) / 60) ** 0.5,
-        "targets": [{"id": id, **_drawn(line, step)} for id, line in pieces],
-        "last": {id: [round(float(v), 1) for v in line[-1]] for id, line in pieces},
-        "captures": [
-            {"target": track.id, "place": [round(float(v), 1) for v in in_km(track, grid)[0] * scale]}
-            for track in tracks.captures
-        ],
-        "bar": {"units": round(bar_km * scale, 1), "text": said_length(bar_km * 1000)},
+        "svg": _svg(
+            (width_km * scale, height_km * scale), (0, 0, 1, 1), lambda axes: draw_map(axes, tracks, report)
+        ),
+        "groups": colours_of_groups(report),
+        "marks": len(tracks.marks.cells),
+        **{
+            name: _data_uri(kind, read_bytes(folder / file, FileKind.RUN)) if (folder / file).exists() else None
+            for name, (file, kind) in files.items()
+        },
     }
 
 
-def data_uri(kind: str, content: bytes) -> str:
+def _data_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def _drawn(line: Points, step: int) -> dict[str, Any]:
-    """A path of every step-th point, and those that go straight on left out; where it begins and ends."""
-    some = np.concatenate([line[:-1:step], line[-1:]])
-    before, after = np.diff(some[:-1], axis=0), np.diff(some[1:], axis=0)
-    straight = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) < 0.05 * np.hypot(*before.T)
-    kept = np.ones(len(some), np.bool_)
-    kept[1:-1] = ~straight
-    points = [f"{x:.1f} {y:.1f}" for x, y in some[kept]]
-    return {"path": "M" + "L".join(points), "begin": points[0].split(), "end": points[-1].split()}
-
-
-def _png(tracks: RunTracks) -> str:
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.fromarray(mark_overlay(tracks)).save(file, "PNG", optimize=True)
-    return data_uri("image/png", file.getvalue())
-
-
-# --- plots, as SVG whose colours follow the page: one drawing, light and dark -------------------------------------
-
-WIDTH_IN, HEIGHT_IN = 4.1, 1.8
-_THEMED = {
-    palette.INK: "--ink",
-    palette.FAINT: "--faint",
-    STYLE["axes.edgecolor"]: "--rule",
-    STYLE["grid.color"]: "--grid",
-    palette.VIOLET: "--violet",
-    palette.BLUE: "--blue",
-    palette.BLACK: "--black",
-    "#ffffff": "--card",
-    "#000000": "--ink",
-}
-"""Colour of a drawing -> the page's variable that takes its place."""
-_VARIABLES = {colour.lower(): variable for colour, variable in _THEMED.items()}
-_COLOUR = re.compile("|".join(_THEMED), re.IGNORECASE)
-
-
-def themed_svg(draw: Callable[[Axes], None]) -> Markup:
-    """What `draw` draws, as an SVG element. Its text is text; the page says in which font."""
-    with mpl.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": "run"}):
-        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN))
-        axes = figure.add_axes((0.125, 0.135, 0.775, 0.7))
-        axes.set_facecolor("none")
+def _svg(
+    size_in: tuple[float, float], place: tuple[float, float, float, float], draw: Callable[[Axes], None]
+) -> Markup:
+    """What `draw` draws on axes at a place of a figure, as an SVG element as wide as its place. Its text is text,
+    and the page says in which font."""
+    with mpl.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": "run", "text.parse_math": False}):
+        figure = Figure(figsize=size_in)
+        axes = figure.add_axes(place)
         draw(axes)
+        if place == (0, 0, 1, 1):
+            axes.set_axis_off()
         file = io.StringIO()
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    return Markup(themed(file.getvalue()))
-
-
-def themed(svg: str) -> str:
-    """The SVG element of a file, as wide as its place, in the page's colours."""
-    element = svg[svg.index("<svg") :]
-    head, _, rest = element.partition(">")
-    head = re.sub(r' (width|height)="[^"]*"', "", head)
-    return _COLOUR.sub(lambda found: f"var({_VARIABLES[found.group().lower()]})", f"{head}>{rest}")
+    head, _, rest = file.getvalue().partition("<svg ")[2].partition(">")
+    sized = re.sub(r' (width|height)="[^"]*"', "", f" {head}")
+    return Markup(f"<svg{sized}>{rest}")  # matplotlib has escaped what it was given

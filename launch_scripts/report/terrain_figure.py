@@ -5,35 +5,30 @@ All figures of terrains are drawn on `MapAxes`, in the terrain's own unit of len
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from launch_scripts.observe.palette import BLUE, RED, STYLE, hillshade
+from launch_scripts.observe.palette import BLUE, RED, hillshade
 from launch_scripts.report.map_figure import draw_north, draw_scale_bar
+from launch_scripts.report.run_plots import saved
 from shared_map.arrays import Floats
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.pyramid import Level, level_of
 from shared_map.terrain.synthetic.landscape import TINT
 from shared_map.terrain.terrain import Terrain
-from swarm.errors import StoreError
 
 MOST_CELLS = 1 << 21
 """Most cells of a panel; larger terrains are shown by a coarser level of their pyramid."""
 _PANEL_IN = 6.6
 """Longer side of a panel, in inches."""
-_DPI = 120
 _LETHAL, _VOID = "#3b1a5a", "#9a9a9a"
 # Muted greens to rock to snow. No blue: valleys must not look like lakes.
 _HEIGHTS = LinearSegmentedColormap.from_list(
@@ -97,19 +92,6 @@ class MapAxes(NamedTuple):
             self.key(patches)
 
 
-@contextlib.contextmanager
-def saved(path: Path, size_in: tuple[float, float]) -> Iterator[Figure]:
-    """A figure in the style of all pictures, which is written at the end. Raises StoreError if it cannot be."""
-    with mpl.rc_context({**STYLE, "text.parse_math": False}):  # names may hold a $
-        figure = Figure(figsize=size_in, layout="constrained", dpi=_DPI)
-        FigureCanvasAgg(figure)
-        yield figure
-        try:
-            figure.savefig(path)
-        except (OSError, ValueError) as error:
-            raise StoreError(f"cannot write the picture {path}: {error}") from error
-
-
 # --- a terrain ----------------------------------------------------------------------------------------------------
 
 
@@ -119,7 +101,7 @@ def draw_terrain(terrain: Terrain, path: Path, title: str) -> None:
     grid = level.grid
     ratio = min(max(grid.rows / grid.cols, 0.3), 3.0)
     wide_in, high_in = (_PANEL_IN, _PANEL_IN * ratio) if ratio <= 1 else (_PANEL_IN / ratio, _PANEL_IN)
-    with saved(path, (2 * wide_in + 4.2, 2 * high_in + 1.9)) as figure:
+    with saved(path, (2 * wide_in + 4.2, 2 * high_in + 1.9), layout="constrained") as figure:
         panels = figure.subplots(2, 2).reshape(-1)
         names = ("elevation", "photo", "classes", _name_of_cost(terrain))
         elevation, photo, classes, cost = (
@@ -213,7 +195,7 @@ def draw_route(
     """
     level = level_of(terrain, MOST_CELLS)
     high_in = 8.0 * min(max(level.grid.rows / level.grid.cols, 0.3), 1.4)
-    with saved(path, (8.6, high_in + 3.0)) as figure:
+    with saved(path, (8.6, high_in + 3.0), layout="constrained") as figure:
         above, below = figure.subplots(2, 1, height_ratios=[high_in, 2.2])
         panel = MapAxes.of(above, level, title)
         share = level.lethal_share[..., None]
@@ -250,7 +232,7 @@ _COLOURS = ("#1b6ca8", "#c8553d", "#4f9d69", "#8e6bb0", "#b8860b", "#3a3a3a", "#
 def draw_rules(groups: Mapping[str, Sequence[Any]], path: Path) -> None:
     """Pace or speed over slope, a panel for each group: its title and its `slope_rules.Curve`s."""
     slopes = np.linspace(-_STEEPEST_PERCENT, _STEEPEST_PERCENT, 1201)
-    with saved(path, (7.5 * len(groups), 5.6)) as figure:
+    with saved(path, (7.5 * len(groups), 5.6), layout="constrained") as figure:
         panels = figure.subplots(1, len(groups), squeeze=False)[0]
         for panel, (title, curves) in zip(panels, groups.items(), strict=True):
             for n, curve in enumerate(curves):

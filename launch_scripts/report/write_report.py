@@ -74,7 +74,13 @@ def write_report(
     """
     report = {**report, **({"made": made} if (made := ended(folder)) else {})}
     # matplotlib takes a moment
-    from launch_scripts.report.map_figure import GROUND_FILE, LEARNED_FILE, ground_picture, learned_overlay
+    from launch_scripts.report.map_figure import (
+        GROUND_FILE,
+        LEARNED_FILE,
+        ground_picture,
+        image_bytes,
+        learned_pixels,
+    )
 
     tracks = packed_tracks(recorder)
     ground = ground_picture(terrain, recorder.scenario, truth)
@@ -83,12 +89,12 @@ def write_report(
         REPORT_FILE: lambda: json.dumps(report, indent=1, allow_nan=False).encode() + b"\n",
         **{file: partial(csv_of, section, report) for section, (file, _) in TABLES.items()},
         TRACKS_FILE: lambda: tracks,
-        GROUND_FILE: ground.webp,
+        GROUND_FILE: lambda: image_bytes(ground.pixels, "WEBP"),
         GROUND_PACE_FILE: lambda: packed_ground(terrain, ground.level),
     }
     factors = factors_in(recorder.observed.learned_words())
     if (factors != 1).any():
-        contents[LEARNED_FILE] = lambda: learned_overlay(terrain, factors)
+        contents[LEARNED_FILE] = lambda: image_bytes(learned_pixels(terrain, factors), "PNG")
     for name, content in contents.items():
         _write(folder / name, content())
     from launch_scripts.report.picture import save_picture

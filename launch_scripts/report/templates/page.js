@@ -19,6 +19,20 @@ for (const button of document.querySelectorAll("thead button")) {
 }
 // A vehicle that is pressed, on the map or in the table, stands out in both.
 const map = document.querySelector(".map");
+const prefix = "vehicle:";
+for (const group of document.querySelectorAll(`.layers [id^="${prefix}"]`)) {
+  group.dataset.vehicle = group.id.slice(prefix.length);
+  group.classList.add("vehicle");
+  const hit = group.querySelector("path").cloneNode();  // wider than what is seen, to be pressed
+  hit.setAttribute("style", "");
+  hit.classList.add("hit");
+  group.append(hit);
+}
+for (const group of document.querySelectorAll('.layers [id^="vehicle:"], .layers [id^="target:"]')) {
+  const title = document.createElementNS("http://www.w3.org/2000/svg", "title");
+  title.textContent = group.id.split(":")[1];
+  group.prepend(title);
+}
 const vehicles = [...document.querySelectorAll("[data-vehicle]")];
 let picked = null;
 function pick(id) {
@@ -29,6 +43,6 @@ function pick(id) {
 for (const each of vehicles) each.addEventListener("click", () => pick(each.dataset.vehicle));
 for (const box of document.querySelectorAll("[data-layer]")) {
   box.addEventListener("change", () => {
-    for (const layer of document.querySelectorAll(`[data-of="${box.dataset.layer}"]`)) layer.style.display = box.checked ? "" : "none";
+    for (const layer of document.querySelectorAll(box.dataset.layer)) layer.style.display = box.checked ? "" : "none";
   });
 }

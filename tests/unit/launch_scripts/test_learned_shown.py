@@ -115,5 +115,5 @@ def test_a_report_tells_each_kind_of_ground_and_has_a_picture(tmp_path: Path) ->
     assert (steep["kind"], steep["factor"]) == ("unknown 25+", 1.0)
     assert (tmp_path / "learned.png").read_bytes().startswith(b"\x89PNG")
     page = (tmp_path / "report.html").read_text()
-    assert 'data-layer="learned"' in page
+    assert 'data-layer=".learned"' in page
     assert "unknown 25+" in page

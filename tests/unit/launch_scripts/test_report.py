@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from launch_scripts.observe.palette import STATE_COLOURS, STYLE, hillshade
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report import picture
 from launch_scripts.report import run_plots as plots
+from launch_scripts.report.run_plots import saved
 from launch_scripts.report.map_figure import ground_picture
 from launch_scripts.report.run_arrays import packed_tracks, tracks_in
 from launch_scripts.report.write_report import make_report, write_report
@@ -125,9 +127,9 @@ def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
     report = make_report(recorder, terrain, run_id="20261121-120000-abcd", startup_s=7.7)
     tracks = tracks_in(packed_tracks(recorder), Path("tracks.npz"))
     still = ground_picture(terrain, scenario, None)
-    with mpl.rc_context(STYLE):
-        figure = picture.draw(still, tracks, report)
-        canvas: Any = FigureCanvasAgg(figure)
+    with saved(io.BytesIO(), (picture.WIDTH_IN, picture.HEIGHT_IN), picture.DPI) as figure:
+        picture.draw(figure, still, tracks, report)
+        canvas: Any = figure.canvas
         canvas.draw()
         renderer = canvas.get_renderer()
         bounds = figure.bbox
@@ -148,7 +150,7 @@ def test_the_legend_of_states_leaves_the_title_its_room(states: int) -> None:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(picture.WIDTH_IN, picture.HEIGHT_IN), dpi=picture.DPI)
         axes = figure.add_axes((0.655, 0.6, 0.297, 0.1))
-        plots.draw_plot(axes, next(plot for plot in plots.PLOTS if plot.name == "states"), {"series": series})
+        plots.draw_plot(axes, plots.PLOTS[0], {"series": series})
         FigureCanvasAgg(figure).draw()
         legend = axes.get_legend()
         assert legend is not None
@@ -168,7 +170,7 @@ def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenar
     assert (tmp_path / "report.png").stat().st_size > 10_000
     # It may be stopped before a vehicle has told where it is.
     series = {"t_s": [0.5], **{state.name.lower(): [0] for state in VehicleState}}
-    assert not plots._states(Figure().add_subplot(), {"series": series})
+    assert not plots.PLOTS[0].draw(Figure().add_subplot(), plots.PLOTS[0], {"series": series})
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenario, tmp_path: Path) -> None:

@@ -91,20 +91,23 @@ def test_the_page_needs_no_network_and_runs_nothing_that_a_file_or_a_message_sai
 
 def test_figures_on_the_page_are_those_of_the_report(run: Path) -> None:
     report = json.loads((run / "report.json").read_text())
-    words = " ".join(Reader((run / "report.html").read_text()).words)
+    text = (run / "report.html").read_text()
+    words = " ".join(Reader(text).words)
     shown = re.sub(r"\s+", " ", words)
     gap = report["certified_gap"]
     assert report["captures"] > 0
-    for text in (
+    for figure in (
         f"{report['captures']} captures",
         f"{percent(gap['mean'])} certified gap, mean",
         f"{percent(gap['p95'])} certified gap, p95",
         f"{report['marks']} marks",
     ):
-        assert text in shown, text
+        assert figure in shown, figure
     for section in ("by_target", "by_vehicle"):
         for id, row in report[section].items():
             assert re.search(rf"{id} {row['captures']} ", shown), id
+        if section == "by_vehicle":
+            assert text.count(f'id="vehicle:{id}"') == 1, "the map can be pressed there"
     assert report["ground_shows"] == ["forbidden", "hidden"]
     assert "forbidden zone" in shown
 
