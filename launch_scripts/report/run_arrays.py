@@ -21,15 +21,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.history import Tracks
 from launch_scripts.observe.latest_state import MarkedCells
 from launch_scripts.observe.recorder import Recorder
 from shared_map.terrain.pyramid import Level
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import StoreError
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.errors import OutsideGridError, StoreError
+from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
 
 TRACKS_FILE, GROUND_PACE_FILE = "tracks.npz", "ground.npz"
@@ -43,10 +42,37 @@ _DAMAGES = (
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
 """What NumPy and zipfile raise on bytes that are no archive of arrays."""
-_MARKS: Mapping[str, type[np.generic]] = {
-    "cells": np.int64, "kinds": np.uint8, "paces": np.float32, "stamps_ns": np.int64,
+_KINDS: Mapping[str, Any] = {
+    "text": np.str_, "whole": np.int64, "count": np.int64, "time": np.int64, "byte": np.uint8,
+    "real": np.float64, "pace": np.float32, "place": np.float32,
+}
+"""Kind of a column -> its type. A count is not below 0, a time one that a message may have, a place two lengths."""
+_COLUMNS: Mapping[str, tuple[str, str]] = {
+    **{
+        f"{of}_{name}": (f"{of}{table}", kind)
+        for of in ("vehicles", "targets")
+        for name, table, kind in (
+            ("id", "", "text"), ("piece", "", "whole"), ("samples", "", "count"),
+            ("time_ns", " sampled", "time"), ("place_m", " sampled", "place"),
+        )
+    },
+    **{f"captures_{name}": ("captures", kind) for name, kind in (
+        ("id", "text"), ("time_ns", "time"), ("place_m", "place"))},
+    **{f"marks_{name}": ("marks", kind) for name, kind in (
+        ("cells", "count"), ("kinds", "byte"), ("paces", "pace"), ("stamps_ns", "time"))},
+    **{f"routes_{name}": ("routes", kind) for name, kind in (
+        ("vehicle", "text"), ("target", "text"), ("time_ns", "time"), ("start", "whole"), ("cost_s", "real"),
+        ("bound_s", "real"), ("steps", "count"), ("many_legs", "count"))},
+    "routes_directions": ("steps of routes", "byte"),
+    "routes_legs": ("legs of routes", "count"),
 }  # fmt: skip
-"""Columns of marks."""
+"""Column of `tracks.npz` -> the table that it belongs to, and its kind. All columns of a table are as long.
+
+A row of vehicles or targets is a piece of a track, and says how many samples it has: all stand track by track.
+A row of routes says how many steps, and legs if it is pulled: these stand route by route.
+"""
+_ADDED = ("marks_", "routes_")
+"""Columns that a file of an older build lacks: they are as if nothing was marked, and no route begun or pulled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,54 +153,41 @@ def packed_ground(terrain: Terrain, seen: Level) -> bytes:
 
 
 def packed_tracks(recorder: Recorder) -> bytes:
-    """The content of `tracks.npz`: columns of tracks, captures, marks and routes."""
-    observed, captures, begun = recorder.observed, list(recorder.captures), recorder.routes.kept
+    """The content of `tracks.npz`."""
+    observed, captures, begun = recorder.observed, recorder.captures, recorder.routes.kept
     began_ns, marked, routes = observed.began_ns or 0, observed.marked(), [each.route for each in begun]
-    return _packed(
-        {
-            "grid": np.array(json.dumps(asdict(recorder.grid))),
-            "began_ns": np.int64(began_ns),
-            **_columns("vehicles", recorder.vehicle_tracks),
-            **_columns("targets", recorder.target_tracks),
-            "captures_id": _texts(each.target for each in captures),
-            "captures_time_ns": _whole_numbers(began_ns + int(each.time_s * NS_PER_S) for each in captures),
-            "captures_place_m": np.array([(each.east_m, each.south_m) for each in captures], np.float32).reshape(
-                -1, 2
-            ),
-            **{f"marks_{name}": getattr(marked, name) for name in _MARKS},
-            # A row per route; and the directions of all, and the legs of those that are pulled, route by route.
-            "routes_vehicle": _texts(route.vehicle for route in routes),
-            "routes_target": _texts(route.target for route in routes),
-            "routes_time_ns": _whole_numbers(each.time_ns for each in begun),
-            "routes_start": _whole_numbers(route.start for route in routes),
-            "routes_cost_s": np.array([route.cost_s for route in routes], np.float64),
-            "routes_bound_s": np.array([route.lower_bound_s for route in routes], np.float64),
-            "routes_steps": _whole_numbers(len(route.directions) for route in routes),
-            "routes_directions": np.frombuffer(b"".join(route.directions for route in routes), np.uint8),
-            "routes_legs": np.frombuffer(b"".join(route.legs for route in routes), "<u4"),
-            "routes_many_legs": _whole_numbers(len(route.legs) // 4 for route in routes),
+    columns: dict[str, Any] = {}
+    for of, tracks in (("vehicles", recorder.vehicle_tracks), ("targets", recorder.target_tracks)):
+        lines = dict(sorted(tracks.lines().items()))
+        columns |= {
+            f"{of}_id": [id for id, _ in lines],
+            f"{of}_piece": [piece for _, piece in lines],
+            f"{of}_samples": [len(times) for times, _ in lines.values()],
+            f"{of}_time_ns": [time for times, _ in lines.values() for time in times.tolist()],
+            f"{of}_place_m": np.concatenate([np.zeros((0, 2)), *(places for _, places in lines.values())]),
         }
-    )
-
-
-def _texts(values: Iterator[str]) -> NDArray[np.str_]:
-    return np.array(list(values), np.str_)
-
-
-def _whole_numbers(values: Iterator[int]) -> NDArray[np.int64]:
-    return np.array(list(values), np.int64)
-
-
-def _columns(name: str, tracks: Tracks) -> dict[str, NDArray[Any]]:
-    """A row per track: its id, its piece, how many samples; and all samples, track by track."""
-    lines = dict(sorted(tracks.lines().items()))
-    return {
-        f"{name}_id": _texts(id for id, _ in lines),
-        f"{name}_piece": _whole_numbers(piece for _, piece in lines),
-        f"{name}_samples": _whole_numbers(len(times) for times, _ in lines.values()),
-        f"{name}_time_ns": np.concatenate([np.zeros(0, np.int64), *(times for times, _ in lines.values())]),
-        f"{name}_place_m": np.concatenate([np.zeros((0, 2), np.float32), *(line for _, line in lines.values())]),
+    columns |= {
+        "captures_id": [each.target for each in captures],
+        "captures_time_ns": [began_ns + int(each.time_s * NS_PER_S) for each in captures],
+        "captures_place_m": [(each.east_m, each.south_m) for each in captures],
+        **{f"marks_{name}": getattr(marked, name) for name in ("cells", "kinds", "paces", "stamps_ns")},
+        "routes_vehicle": [route.vehicle for route in routes],
+        "routes_target": [route.target for route in routes],
+        "routes_time_ns": [each.time_ns for each in begun],
+        "routes_start": [route.start for route in routes],
+        "routes_cost_s": [route.cost_s for route in routes],
+        "routes_bound_s": [route.lower_bound_s for route in routes],
+        "routes_steps": [len(route.directions) for route in routes],
+        "routes_directions": np.frombuffer(b"".join(route.directions for route in routes), np.uint8),
+        "routes_legs": np.frombuffer(b"".join(route.legs for route in routes), "<u4"),
+        "routes_many_legs": [len(route.legs) // 4 for route in routes],
     }
+    typed = {name: _shaped(columns[name], kind) for name, (_, kind) in _COLUMNS.items()}
+    return _packed({"grid": np.array(json.dumps(asdict(recorder.grid))), "began_ns": np.int64(began_ns), **typed})
+
+
+def _shaped(values: Any, kind: str) -> NDArray[Any]:
+    return np.asarray(values, _KINDS[kind]).reshape((-1, 2) if kind == "place" else -1)
 
 
 # --- in -----------------------------------------------------------------------------------------------------------
@@ -221,40 +234,47 @@ def tracks_in(content: bytes, path: Path) -> RunTracks:
     """What `packed_tracks` packed. Raises StoreError if it is damaged; `path` is how the sentence calls it."""
     with _arrays_in(content, path) as arrays:
         grid = _grid(json.loads(str(arrays["grid"])))
-        ids, times_ns, places = _rows(arrays, "captures", {"id": "text", "time_ns": "time", "place_m": "place"})
-        places = _on_map(places, grid)
-        captures = [Track(str(id), 0, times_ns[n : n + 1], places[n : n + 1]) for n, id in enumerate(ids)]
+        columns: dict[str, NDArray[Any]] = {}
+        rows: dict[str, int] = {}
+        for name, (table, kind) in _COLUMNS.items():
+            if name in arrays or not name.startswith(_ADDED):
+                columns[name] = _checked(name, arrays[name], kind)
+            else:
+                columns[name] = _shaped(np.zeros(rows.get(table, 0)), kind)
+            if rows.setdefault(table, len(columns[name])) != len(columns[name]):
+                raise ValueError(f"the columns of {table} differ in length")
+        places = _on_map(columns["captures_place_m"], grid)
+        ids, times_ns = columns["captures_id"].tolist(), columns["captures_time_ns"]
         return RunTracks(
             grid,
-            _tracks(arrays, "vehicles", grid),
-            _tracks(arrays, "targets", grid),
-            captures,
-            _marks(arrays, grid),
-            _routes(arrays, grid),
+            _tracks(columns, "vehicles", grid),
+            _tracks(columns, "targets", grid),
+            [Track(id, 0, times_ns[n : n + 1], places[n : n + 1]) for n, id in enumerate(ids)],
+            _marks(columns, grid),
+            _routes(columns, grid),
             int(arrays["began_ns"]) if "began_ns" in arrays else None,
         )
 
 
-def _rows(arrays: Any, name: str, kinds: Mapping[str, str]) -> list[NDArray[Any]]:
-    """Columns of a table, each of its kind (text, real, place, whole, count, time) and all as long. A time is one
-    that a message may have, and a count is not below 0."""
-    columns = []
-    for column, kind in kinds.items():
-        array = arrays[f"{name}_{column}"]
-        if kind in ("whole", "count", "time"):
-            if array.ndim != 1 or array.dtype.kind not in "iu":
-                raise ValueError(f"{name}_{column} is no column of whole numbers")
-            array = np.asarray(array, np.int64)
-            if kind != "whole" and array.min(initial=0) < 0:
-                raise ValueError(f"{name}_{column} has a number below 0")
-            if kind == "time" and array.max(initial=0) >= STAMP_LIMIT_NS:
-                raise ValueError(f"{name}_{column} has a time after 2116")
-        elif kind == "place" and not (np.abs(array) <= _FARTHEST_M).all():  # nor is any of them NaN
-            raise ValueError(f"{name}_{column} has a place farther than {_FARTHEST_M:g} m away, or nowhere")
-        columns.append(array)
-    if len({len(array) for array in columns}) > 1:
-        raise ValueError(f"the columns of {name} differ in length")
-    return columns
+def _checked(name: str, array: NDArray[Any], kind: str) -> NDArray[Any]:
+    if np.issubdtype(_KINDS[kind], np.integer):
+        if array.ndim != 1 or array.dtype.kind not in "iu":
+            raise ValueError(f"{name} is no column of whole numbers")
+        if kind != "whole" and array.min(initial=0) < 0:
+            raise ValueError(f"{name} has a number below 0")
+        if kind == "time" and array.max(initial=0) >= STAMP_LIMIT_NS:
+            raise ValueError(f"{name} has a time after 2116")
+    elif kind == "place" and not (np.abs(array) <= _FARTHEST_M).all():  # nor is any of them NaN
+        raise ValueError(f"{name} has a place farther than {_FARTHEST_M:g} m away, or nowhere")
+    return _shaped(array, kind)
+
+
+def _split(name: str, columns: Mapping[str, NDArray[Any]], counts: str) -> list[NDArray[Any]]:
+    """A column cut into parts that are as long as another one says."""
+    lengths, column = columns[counts], columns[name]
+    if lengths.sum() != len(column):
+        raise ValueError(f"{name} has {len(column)} rows, not the {lengths.sum()} of {counts}")
+    return np.split(column, np.cumsum(lengths)[:-1])
 
 
 def _grid(fields: dict[str, Any]) -> GridSpec:
@@ -275,22 +295,15 @@ def _on_map(place_m: NDArray[Any], grid: GridSpec) -> NDArray[np.float64]:
     return np.stack([grid.west_m + east_m, grid.north_m - south_m], axis=1)
 
 
-def _tracks(arrays: Any, name: str, grid: GridSpec) -> list[Track]:
-    ids, pieces, samples = _rows(arrays, name, {"id": "text", "piece": "whole", "samples": "count"})
-    times_ns, places = _rows(arrays, name, {"time_ns": "time", "place_m": "place"})
-    if samples.sum() != len(times_ns):
-        raise ValueError(f"{name} are not as many as their samples say")
-    ends = np.cumsum(samples)[:-1]
-    each = zip(ids, pieces, np.split(times_ns, ends), np.split(_on_map(places, grid), ends), strict=False)
-    return [Track(str(id), int(piece), at_ns, xy_m) for id, piece, at_ns, xy_m in each]
+def _tracks(columns: Mapping[str, NDArray[Any]], name: str, grid: GridSpec) -> list[Track]:
+    ids, pieces = columns[f"{name}_id"].tolist(), columns[f"{name}_piece"].tolist()
+    times, places = (_split(f"{name}_{each}", columns, f"{name}_samples") for each in ("time_ns", "place_m"))
+    rows = zip(ids, pieces, times, places, strict=False)  # without a row there is one empty part
+    return [Track(id, piece, time_ns, _on_map(place_m, grid)) for id, piece, time_ns, place_m in rows]
 
 
-def _marks(arrays: Any, grid: GridSpec) -> MarkedCells:
-    if "marks_cells" not in arrays:
-        return MarkedCells(*(np.zeros(0, kind) for kind in _MARKS.values()))
-    kinds = {"cells": "count", "kinds": "whole", "paces": "real", "stamps_ns": "time"}
-    columns = _rows(arrays, "marks", kinds)
-    marks = MarkedCells(*(array.astype(kind) for array, kind in zip(columns, _MARKS.values(), strict=True)))
+def _marks(columns: Mapping[str, NDArray[Any]], grid: GridSpec) -> MarkedCells:
+    marks = MarkedCells(*(columns[f"marks_{name}"] for name in ("cells", "kinds", "paces", "stamps_ns")))
     if marks.cells.max(initial=0) >= grid.cells:
         raise ValueError("marks lie outside of the grid")
     if not np.isfinite(marks.paces[marks.kinds == MarkKind.PACE]).all():
@@ -298,42 +311,23 @@ def _marks(arrays: Any, grid: GridSpec) -> MarkedCells:
     return marks
 
 
-def _routes(arrays: Any, grid: GridSpec) -> list[GivenRoute]:
-    if "routes_vehicle" not in arrays:
-        return []
-    kinds = {
-        "vehicle": "text", "target": "text", "time_ns": "time", "start": "whole", "cost_s": "real",
-        "bound_s": "real", "steps": "count",
-    }  # fmt: skip
-    columns = _rows(arrays, "routes", kinds)
-    steps, directions = columns[-1], arrays["routes_directions"].astype(np.uint8)
-    if len(directions) != steps.sum():
-        raise ValueError("the directions of routes are not theirs")
-    many, legs = np.zeros(len(steps), np.int64), np.zeros(0, np.int64)
-    if "routes_legs" in arrays:  # else of an older build
-        (many,), (legs,) = (_rows(arrays, "routes", {name: "count"}) for name in ("many_legs", "legs"))
-        if len(many) != len(steps) or many.sum() != len(legs) or legs.min(initial=1) < 1:
-            raise ValueError("the legs of routes are not theirs")
-    rows = zip(*(column.tolist() for column in columns[:-1]), strict=True)
-    ways, of_legs = np.split(directions, np.cumsum(steps)[:-1]), np.split(legs, np.cumsum(many)[:-1])
+def _routes(columns: Mapping[str, NDArray[Any]], grid: GridSpec) -> list[GivenRoute]:
+    """The routes of the file, but for those that no agent of ours tells: they leave the grid."""
+    names = ("vehicle", "target", "time_ns", "start", "cost_s", "bound_s")
+    rows = zip(*(columns[f"routes_{name}"].tolist() for name in names), strict=True)
+    ways, legs = (
+        _split("routes_directions", columns, "routes_steps"), _split("routes_legs", columns, "routes_many_legs")
+    )  # fmt: skip
     routes = []
-    for (vehicle, target, time_ns, start, cost_s, bound_s), way, own in zip(rows, ways, of_legs, strict=False):
-        cells = _walked(grid, start, way)
-        turns = np.concatenate(([0], np.cumsum(own, dtype=np.int64)))
-        if cells is not None and turns[-1] == len(way):  # a pulled route: straight from turn to turn
+    for (vehicle, target, time_ns, start, cost_s, bound_s), way, own in zip(rows, ways, legs, strict=False):
+        try:
+            cells = np.array(walk(grid, start, way.tobytes()), np.int64)
+        except (ValueError, OutsideGridError):
+            continue
+        turns = np.cumsum([0, *own.tolist()])
+        if turns[-1] == len(way):  # a pulled route: straight from turn to turn
             cells = cells[turns]
-        if cells is not None and math.isfinite(cost_s):
-            gap = cost_s / bound_s if bound_s > 0 else float("inf")
+        if math.isfinite(cost_s):
+            gap = cost_s / bound_s if bound_s > 0 else math.inf
             routes.append(GivenRoute(vehicle, target, time_ns, cost_s, gap, cells))
     return routes
-
-
-def _walked(grid: GridSpec, start: int, directions: NDArray[np.uint8]) -> NDArray[np.int64] | None:
-    """The cells of a route; None of one that no agent of ours tells: it leaves the grid, or has no such step."""
-    if not 0 <= start < grid.cells or max(directions, default=0) > 7:
-        return None
-    row, col = grid.row_col(start)
-    rows = np.cumsum(np.concatenate([[row], np.array(STEP_ROW, np.int64)[directions]]))
-    cols = np.cumsum(np.concatenate([[col], np.array(STEP_COL, np.int64)[directions]]))
-    inside = rows.min() >= 0 and rows.max() < grid.rows and cols.min() >= 0 and cols.max() < grid.cols
-    return np.asarray(rows * grid.cols + cols, np.int64) if inside else None

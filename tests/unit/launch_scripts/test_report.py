@@ -21,9 +21,9 @@ from launch_scripts.observe.palette import STATE_COLOURS, STYLE, hillshade
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report import picture
 from launch_scripts.report import run_plots as plots
-from launch_scripts.report.run_plots import saved
 from launch_scripts.report.map_figure import ground_picture
 from launch_scripts.report.run_arrays import packed_tracks, tracks_in
+from launch_scripts.report.run_plots import saved
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.load import parse_scenario
