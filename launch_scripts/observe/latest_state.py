@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe.counts import Counts, sum_of
 from launch_scripts.observe.process_load import ProcessLoads
+from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, crew_of
 from swarm.config.scenario import Scenario
@@ -24,7 +25,6 @@ from swarm.liveness import HIGHEST_RANK, Peer, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracking import Trackings
-from swarm.wire.fields import column
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.orders import Orders
@@ -407,25 +407,20 @@ class LatestState(Counts):
         return [marks for (_, tile), marks in sorted(self._marks.items()) if tile == self.grid.tiles]
 
     def marked(self) -> MarkedCells:
-        """The newest statement per cell, ties by the larger author; cells cleared again are left out."""
-        newest: dict[int, tuple[int, str, int, float]] = {}
-        for (author, tile), marks in sorted(self._marks.items()):
-            if tile >= self.grid.tiles:
-                continue
-            window = self.grid.tile_window(tile)
-            columns = (column(marks.cells, "<u2"), column(marks.stamps_ns, "<i8"), column(marks.paces, "<f4"))
-            rows = zip(*(values.tolist() for values in columns), marks.kinds, strict=True)
-            for inside, stamp_ns, pace, kind in rows:
-                row, col = window.row0 + inside // TILE_CELLS, window.col0 + inside % TILE_CELLS
-                if row >= window.row1 or col >= window.col1:
-                    continue
-                cell = row * self.grid.cols + col
-                if cell not in newest or (stamp_ns, author) > newest[cell][:2]:
-                    newest[cell] = (stamp_ns, author, kind, pace)
-        kept = [(cell, *told) for cell, told in sorted(newest.items()) if told[2] != MarkKind.CLEAR]
-        return MarkedCells(
-            np.array([cell for cell, _, _, _, _ in kept], np.int64),
-            np.array([kind for _, _, _, kind, _ in kept], np.uint8),
-            np.array([pace for _, _, _, _, pace in kept], np.float32),
-            np.array([stamp_ns for _, stamp_ns, _, _, _ in kept], np.int64),
-        )
+        """What stands about each cell, as the shared map merges it; cells cleared again are left out."""
+        of_tile: dict[int, list[MarkSet]] = {}
+        for (_, tile), marks in sorted(self._marks.items()):
+            if tile < self.grid.tiles:
+                of_tile.setdefault(tile, []).append(marks)
+        found = []
+        for tile, sets in of_tile.items():
+            window, stated = self.grid.tile_window(tile), winners(sets, self.moved_ns)
+            rows, cols = np.divmod(stated.cells.astype(np.int64), TILE_CELLS)
+            rows, cols = rows + window.row0, cols + window.col0
+            kept = (stated.kinds != MarkKind.CLEAR) & (rows < window.row1) & (cols < window.col1)
+            columns = (rows * self.grid.cols + cols, stated.kinds, stated.paces, stated.stamps_ns)
+            found.append([each[kept] for each in columns])
+        types = (np.int64, np.uint8, np.float32, np.int64)
+        joined = [np.concatenate([np.zeros(0, type), *(each[n] for each in found)]) for n, type in enumerate(types)]
+        order = np.argsort(joined[0])
+        return MarkedCells(*(each[order] for each in joined))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,13 @@ STATE_COLOURS = {
     VehicleState.OUTDATED: YELLOW,
     VehicleState.SEARCHING: SKY,
 }
+
+
+def colours_of_groups(report: Mapping[str, Any]) -> dict[str, str]:
+    """Group -> its colour, in the order of a run's report."""
+    groups = report.get("by_group")
+    names = list(groups) if isinstance(groups, dict) and groups else [""]
+    return {group: GROUPS[n % len(GROUPS)] for n, group in enumerate(names)}
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

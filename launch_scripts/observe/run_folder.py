@@ -139,28 +139,19 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not path.exists():
         raise lacks(folder, REPORT_FILE)
     try:
-        report = json.loads(
-            read_text(path, FileKind.RUN), parse_int=_whole, parse_float=_finite, parse_constant=_finite
-        )
+        text, number = read_text(path, FileKind.RUN), _number
+        report = json.loads(text, parse_int=number, parse_float=number, parse_constant=number)
+        if not isinstance(report, dict):
+            raise ValueError("found no object, expected the figures of a run")
+        return report
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
-    if not isinstance(report, dict):
-        raise StoreError(f"{path} is damaged: found no object, expected the figures of a run")
-    return report
 
 
-def _whole(text: str) -> int:
-    """A number of a report: sums of counts, of which each fits into 64 bits."""
-    if len(text) > 40:
-        raise ValueError(f"found a whole number of {len(text)} digits")
-    return int(text)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
+def _number(text: str) -> float:
+    if not math.isfinite(value := float(text)):
         raise ValueError(f"found {text[:30]}, expected a number")
-    return value
+    return int(text) if text.lstrip("-").isdecimal() else value
 
 
 def _version(package: str) -> str | None:

@@ -22,8 +22,9 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
-from launch_scripts.observe.palette import hillshade, rgb, round_length, said_length
+from launch_scripts.observe.palette import colours_of_groups, hillshade, rgb, round_length, said_length
 from launch_scripts.report.run_arrays import RunTracks, Track
+from launch_scripts.report.run_layers import groups_of
 from launch_scripts.report.run_plots import halo
 from shared_map.arrays import Floats
 from shared_map.learning.factors import keys_of
@@ -59,10 +60,10 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
         axes.imshow(mark_overlay(tracks), extent=(0, width_km, height_km, 0), interpolation="none", zorder=2)
     samples = sum(len(track.time_ns) for track in (*tracks.vehicles, *tracks.targets))
     step = max(1, -(-samples // _MOST_POINTS))
-    groups, labelled = colours_of_groups(report), set[str]()
+    groups, of_vehicle, labelled = colours_of_groups(report), groups_of(report), set[str]()
     thin = 1 / max(1.0, len(tracks.vehicles) / 100) ** 0.5
     for track in tracks.vehicles:
-        group = group_of(track.id, report)
+        group = of_vehicle.get(track.id, next(iter(groups)))
         label = "vehicle" if len(groups) == 1 else f"vehicle of {group}"
         shape = "^" if group in report.get("aloft", ()) else "o"
         colour = groups.get(group, palette.GROUPS[0])
@@ -117,20 +118,6 @@ def draw_border(axes: Axes, ground: GroundPicture, tracks: RunTracks) -> None:
         handles=handles, loc="upper left", bbox_to_anchor=(0, -0.022), ncol=-(-len(handles) // 2), handlelength=1.5,
         columnspacing=1.4, borderaxespad=0.3, handletextpad=0.5, borderpad=0, labelspacing=0.35,
     )  # fmt: skip
-
-
-def colours_of_groups(report: Mapping[str, Any]) -> dict[str, str]:
-    """Group -> its colour, in the order of the report."""
-    return {
-        group: palette.GROUPS[n % len(palette.GROUPS)]
-        for n, group in enumerate(report.get("by_group") or {"": None})
-    }
-
-
-def group_of(vehicle: str, report: Mapping[str, Any]) -> str:
-    """The group of a vehicle; the first where nobody knows it."""
-    row = (report.get("by_vehicle") or {}).get(vehicle) or {}
-    return str(row.get("group", next(iter(report.get("by_group") or {"": None}), "")))
 
 
 def in_km(track: Track, grid: GridSpec, step: int = 1) -> Points:

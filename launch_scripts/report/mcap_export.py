@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from launch_scripts.observe.palette import GROUPS, rgb
+from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
 from launch_scripts.observe.run_folder import REPORT_FILE, read_report, replacing
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, read_ground
 from launch_scripts.report.run_layers import free_places, groups_of, tracks_of_run
@@ -35,8 +35,7 @@ def export_mcap(folder: Path, out: Path | None, force: bool) -> str:
     tracks = tracks_of_run(folder)
     report = read_report(folder) if (folder / REPORT_FILE).exists() else {}
     ground = read_ground(folder, tracks.grid)
-    began_ns = _began_ns(tracks.began_ns, [int(each.time_ns[0]) for each in tracks.vehicles if len(each.time_ns)])
-    lines = lines_of(report, folder / REPORT_FILE, began_ns, tracks.captures)
+    lines = lines_of(report, folder / REPORT_FILE, tracks.began_ns, tracks.captures)
     messages = RosMessages(types_of(Distribution.JAZZY), RosMap(tracks.grid))
     run = folder.resolve().name
     if not any(len(each.time_ns) for each in (*tracks.vehicles, *tracks.targets)):
@@ -94,22 +93,13 @@ def _check_packages() -> None:
         )
 
 
-def _began_ns(told_ns: int | None, first_ns: Iterable[int]) -> int:
-    """From when the time of the run counts; an older build did not say it, but its first samples are from then."""
-    return told_ns if told_ns is not None else min(first_ns, default=0)
-
-
 def _colours(report: Mapping[str, Any]) -> dict[str, Colour]:
     """Vehicle -> colour of its group, as in all pictures of a run."""
-    groups = groups_of(report)
-    order = {group: n for n, group in enumerate(dict.fromkeys([*(report.get("by_group") or {}), *groups.values()]))}
-    of_group = {group: _opaque(GROUPS[n % len(GROUPS)]) for group, n in order.items()}
-    return {vehicle: of_group[group] for vehicle, group in groups.items()}
-
-
-def _opaque(colour: str) -> Colour:
-    red, green, blue = (part / 255 for part in rgb(colour))
-    return red, green, blue, 1.0
+    groups = colours_of_groups(report)
+    of_vehicle = {vehicle: rgb(groups.get(group, GROUPS[0])) for vehicle, group in groups_of(report).items()}
+    return {
+        vehicle: (red / 255, green / 255, blue / 255, 1.0) for vehicle, (red, green, blue) in of_vehicle.items()
+    }
 
 
 def _facts(run: str, report: Mapping[str, Any], grid: GridSpec) -> dict[str, str]:

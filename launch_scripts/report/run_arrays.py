@@ -43,8 +43,14 @@ _DAMAGES = (
 )
 """What NumPy and zipfile raise on bytes that are no archive of arrays."""
 _KINDS: Mapping[str, Any] = {
-    "text": np.str_, "whole": np.int64, "count": np.int64, "time": np.int64, "byte": np.uint8,
-    "real": np.float64, "pace": np.float32, "place": np.float32,
+    "text": np.str_,
+    "whole": np.int64,
+    "count": np.int64,
+    "time": np.int64,
+    "byte": np.uint8,
+    "real": np.float64,
+    "pace": np.float32,
+    "place": np.float32,
 }
 """Kind of a column -> its type. A count is not below 0, a time one that a message may have, a place two lengths."""
 _COLUMNS: Mapping[str, tuple[str, str]] = {
@@ -112,7 +118,7 @@ class RunTracks:
 
     captures  tracks of one point each
     marks     at the end; none in a file of an older build, as `routes`, which are in order of time
-    began_ns  from when the time of the run counts; None in a file of an older build
+    began_ns  from when the time of the run counts; an older build did not say it, but began to sample then
     """
 
     grid: GridSpec
@@ -121,7 +127,7 @@ class RunTracks:
     captures: list[Track]
     marks: MarkedCells
     routes: list[GivenRoute]
-    began_ns: int | None = None
+    began_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +258,9 @@ def tracks_in(content: bytes, path: Path) -> RunTracks:
             [Track(id, 0, times_ns[n : n + 1], places[n : n + 1]) for n, id in enumerate(ids)],
             _marks(columns, grid),
             _routes(columns, grid),
-            int(arrays["began_ns"]) if "began_ns" in arrays else None,
+            int(arrays["began_ns"])
+            if "began_ns" in arrays
+            else int(columns["vehicles_time_ns"].min(initial=STAMP_LIMIT_NS)),
         )
 
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.facts import count, grouped, together
-from launch_scripts.observe.palette import STYLE
+from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
 from launch_scripts.report.map_figure import (
@@ -26,7 +26,6 @@ from launch_scripts.report.map_figure import (
     LEARNED_FILE,
     QUICKER,
     SLOWER,
-    colours_of_groups,
     draw_map,
     size_km,
 )
@@ -146,37 +145,14 @@ def _left_behind(report: Mapping[str, Any]) -> list[str]:
     return said
 
 
-_COLUMNS = {
-    "captures": "captures",
-    "vehicles": "vehicles",
-    "group": "group",
-    "class": "class",
-    "routes": "routes",
-    "distance_m": "driven, km",
-    "waiting_s": "waited, s",
-    "standing_s": "stood, s",
-    "certified_gap_mean": "gap, mean",
-    "certified_gap_p95": "gap, p95",
-    "certified_gap_max": "gap, max",
-    "certified_gap_unproven": "unproven",
-    "growths": "growths",
-    "window_growths": "windows",
-    "chased_by_at_end": "chased by, at the end",
-    "state_at_end": "at the end",
-    "target_at_end": "going for",
-}
-"""Column -> its heading, in order."""
-_TEXTS = ("group", "class", "state_at_end", "target_at_end")
-
-
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:
     rows = {id: flat(id, row) for id, row in (report.get(section) or {}).items()}
-    columns = [name for name in _COLUMNS if any(name in row for row in rows.values())]
+    columns = list(dict.fromkeys(name for row in rows.values() for name in row))[1:]
     shown = list(rows.items())[:_ROWS_SHOWN]
     return {
         "section": section,
         "heading": heading,
-        "columns": [(_COLUMNS[name], name in _TEXTS) for name in columns],
+        "columns": [name.replace("_", " ") for name in columns],
         "rows": [(id, [_cell(name, row.get(name)) for name in columns]) for id, row in shown],
         "left": len(rows) - len(shown),
     }
@@ -188,10 +164,6 @@ def _cell(name: str, value: Any) -> tuple[str, Any]:
         return "–", ""
     if name in ("certified_gap_mean", "certified_gap_p95", "certified_gap_max"):
         return percent(value), value
-    if name == "distance_m":
-        return f"{value / 1000:,.2f}", value
-    if name.endswith("_s"):
-        return f"{value:,.0f}", value
     return (count(value) if isinstance(value, int | float) else str(value)), value
 
 

@@ -10,11 +10,10 @@ import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2 import map_messages
 from launch_scripts.gateways.ros2.map_messages import (
@@ -36,7 +35,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
 )
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.report.exporter import turns_of
-from launch_scripts.report.run_arrays import GivenRoute, GroundPace, RunTracks, Track
+from launch_scripts.report.run_arrays import GroundPace, RunTracks, Track
 from shared_map.terrain.map_frame import middles_of
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
@@ -49,11 +48,9 @@ _MOST_POINTS, _MOST_CELLS = 2_000_000, 64_000_000
 """Of all routes drawn, and of all grids of marks, in a recording: 48 MB and 64 MB before compression."""
 _LEAST, _MOST = 8, 600
 """Messages that drawings and grids of marks get, as far as there is news for them."""
-Times = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class Told:
+class Told(NamedTuple):
     """One message of a recording."""
 
     time_ns: int
@@ -78,10 +75,11 @@ def told(
     if not ends:
         return
     first_ns, last_ns = min(ends), max(ends)
+    frames = frame_names(each.id for each in tracks.vehicles)
     yield from heapq.merge(
-        _still(messages, tracks, ground, first_ns),
-        _vehicles(messages, tracks.vehicles),
-        _targets(messages, tracks.targets),
+        _still(messages, ground, frames, first_ns),
+        _moving(messages, tracks.vehicles, "/swarm/poses", frames),
+        _moving(messages, tracks.targets, "/targets"),
         _marks(messages, tracks, ground, first_ns, last_ns),
         _drawn(messages, tracks, colours, first_ns, last_ns),
         (
@@ -92,12 +90,13 @@ def told(
     )
 
 
-def _still(messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, first_ns: int) -> Iterator[Told]:
+def _still(
+    messages: RosMessages, ground: GroundPace | None, frames: Mapping[str, str], first_ns: int
+) -> Iterator[Told]:
     map = messages.map
-    frames = [messages.transform(first_ns, (TERRAIN_FRAME, map.frame), map.origin_m)]
-    names = frame_names(each.id for each in tracks.vehicles)
-    frames += [messages.transform(first_ns, (map.frame, frames_of(name)[0])) for name in names.values()]
-    yield Told(first_ns, "/tf_static", messages.transforms(frames))
+    still = [messages.transform(first_ns, (TERRAIN_FRAME, map.frame), map.origin_m)]
+    still += [messages.transform(first_ns, (map.frame, frames_of(name)[0])) for name in frames.values()]
+    yield Told(first_ns, "/tf_static", messages.transforms(still))
     if ground is not None:
         occupancy = occupancy_of(ground.pace_s_per_m, ground.best_s_per_m)
         yield Told(first_ns, "/map", occupancy_grid(messages, first_ns, occupancy, ground.side))
@@ -106,30 +105,31 @@ def _still(messages: RosMessages, tracks: RunTracks, ground: GroundPace | None, 
 # --- what moves ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Instant:
-    """Everything that was seen at one time, in order of id. xy_m float64 (n, 2)."""
+def _moving(
+    messages: RosMessages, tracks: Sequence[Track], topic: str, frames: Mapping[str, str] | None = None
+) -> Iterator[Told]:
+    """The samples of all tracks, time by time. Headings lead from each sample to the next of its track.
 
-    time_ns: int
-    ids: list[str]
-    xy_m: NDArray[np.float64]
-    headings_rad: list[float]
-
-
-def _instants(tracks: Sequence[Track]) -> Iterator[_Instant]:
-    """The samples of all tracks, time by time. Headings lead from each sample to the next of its track."""
+    frames  vehicle -> its name in frames, of which transforms are told; None: none are
+    """
     tracks = sorted((each for each in tracks if len(each.time_ns)), key=lambda each: (each.id, each.piece))
     if not tracks:
         return
     times = np.concatenate([each.time_ns for each in tracks])
     xy_m = np.concatenate([each.xy_m for each in tracks])
     headings = np.concatenate([headings_along(each.xy_m) for each in tracks])
-    of = np.repeat(np.arange(len(tracks)), [len(each.time_ns) for each in tracks])
-    order = np.lexsort((of, times))
-    begins = np.flatnonzero(np.diff(times[order], prepend=times[order[0]] - 1))
-    for some in np.split(order, begins[1:]):
-        ids = [tracks[n].id for n in of[some].tolist()]
-        yield _Instant(int(times[some[0]]), ids, xy_m[some], headings[some].tolist())
+    ids = [each.id for each in tracks for _ in each.time_ns]
+    order = np.argsort(times, kind="stable")
+    begins = np.flatnonzero(np.diff(times[order]))
+    for some in np.split(order, begins + 1):
+        now_ns = int(times[some[0]])
+        if frames is not None:
+            bases = [
+                messages.transform(now_ns, frames_of(frames[ids[n]]), messages.map.to_ros(*xy_m[n]), headings[n])
+                for n in some.tolist()
+            ]
+            yield Told(now_ns, "/tf", messages.transforms(bases))
+        yield Told(now_ns, topic, messages.pose_array(now_ns, xy_m[some], headings[some].tolist()))
 
 
 def frame_names(ids: Iterable[str]) -> dict[str, str]:
@@ -142,25 +142,6 @@ def frame_names(ids: Iterable[str]) -> dict[str, str]:
             names[id] = id if ros_name(id) in taken else ros_name(id)
             taken.add(names[id])
     return names
-
-
-def _vehicles(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
-    names = frame_names(each.id for each in tracks)
-    for now in _instants(tracks):
-        places = zip(now.ids, now.xy_m.tolist(), now.headings_rad, strict=True)
-        bases = [
-            messages.transform(now.time_ns, frames_of(names[id]), messages.map.to_ros(*xy_m), heading_rad)
-            for id, xy_m, heading_rad in places
-        ]
-        yield Told(now.time_ns, "/tf", messages.transforms(bases))
-        poses = messages.pose_array(now.time_ns, now.xy_m, now.headings_rad)
-        yield Told(now.time_ns, "/swarm/poses", poses)
-
-
-def _targets(messages: RosMessages, tracks: Sequence[Track]) -> Iterator[Told]:
-    for now in _instants(tracks):
-        poses = messages.pose_array(now.time_ns, now.xy_m, now.headings_rad)
-        yield Told(now.time_ns, "/targets", poses)
 
 
 # --- what changes now and then ------------------------------------------------------------------------------------
@@ -217,28 +198,20 @@ def _drawn(
     at_once = len({route.vehicle for route in routes}) * points // max(len(routes), 1)
     most = min(max(_MOST_POINTS // max(at_once, 1), _LEAST), _MOST)
     current: dict[str, Drawing] = {}
-    done = 0
+    done, side_m = 0, 3 * tracks.grid.resolution_m
     for now_ns in instants_of(changes, first_ns, last_ns, most):
         while done < len(routes) and routes[done].time_ns <= now_ns:
-            route = routes[done]
-            current[route.vehicle] = _route(tracks, route, colours.get(route.vehicle, map_messages.ROUTE))
+            vehicle, cells = routes[done].vehicle, turns_of(routes[done].cells, tracks.grid)
+            middles_m, colour = middles_of(tracks.grid, cells).T, colours.get(vehicle, map_messages.ROUTE)
+            current[vehicle] = map_messages.route(tracks.grid, middles_m, colour)
             done += 1
-        seen = {
-            each.id: each
+        captured = {
+            each.id: Drawing("captures", Form.CUBES, each.xy_m[:1], CAPTURE, side_m)
             for each, at_ns in zip(tracks.captures, captures_ns, strict=True)
             if at_ns <= now_ns < at_ns + _SHOWN_NS
         }
-        drawings = [*current.values(), *(_capture(tracks, each) for each in seen.values())]
+        drawings = [*current.values(), *captured.values()]
         yield Told(now_ns, "/swarm/markers", marker_array(messages, now_ns, drawings))
-
-
-def _route(tracks: RunTracks, route: GivenRoute, colour: Colour) -> Drawing:
-    cells = turns_of(route.cells, tracks.grid)
-    return map_messages.route(tracks.grid, middles_of(tracks.grid, cells).T, colour)
-
-
-def _capture(tracks: RunTracks, capture: Track) -> Drawing:
-    return Drawing("captures", Form.CUBES, capture.xy_m[:1], CAPTURE, 3 * tracks.grid.resolution_m)
 
 
 # --- what a run said in words, as lines of a log ------------------------------------------------------------------
