@@ -72,16 +72,17 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
         labelled.add(label)
     last = {track.id: track for track in tracks.targets if len(track.time_ns)}
     for track in tracks.targets:
-        shape, label = ("D", "target") if track is last.get(track.id) else ("", None)
-        label = label if track.id == next(reversed(last), None) else None
-        line = in_km(track, grid, step)
-        _draw_track(axes, f"target:{track.id}", line, palette.RED, 1.8, shape, label=label, zorder=6)
-        if shape and len(last) <= _SHOWN_LABELS:
-            _label(axes, track.id, *line[-1], width_km)
+        line, is_last = in_km(track, grid, step), track is last.get(track.id)
+        named = "target" if track is next(reversed(last.values()), None) else None
+        _draw_track(
+            axes, f"target:{track.id}", line, palette.RED, 1.8, "D" if is_last else "", label=named, zorder=6
+        )
+        if is_last and len(last) <= _SHOWN_LABELS:
+            _label(axes, track.id, float(line[-1, 0]), float(line[-1, 1]), width_km)
     places = np.concatenate([np.empty((0, 2)), *(in_km(track, grid) for track in tracks.captures)])
     axes.scatter(
-        *places.T, marker="*", s=115, c=palette.YELLOW, edgecolors=palette.BLACK, linewidths=0.7, label="capture",
-        zorder=8, gid="captures",
+        places[:, 0], places[:, 1], marker="*", s=115, c=palette.YELLOW, edgecolors=palette.BLACK, linewidths=0.7,
+        label="capture", zorder=8, gid="captures",
     )  # fmt: skip
     axes.set(xlim=(0, width_km), ylim=(height_km, 0), aspect="equal")
     axes.grid(False)
@@ -282,7 +283,8 @@ def _photo(seen: Level) -> Pixels:
     photo = seen.photo.astype(np.float32) / 255
     grey = photo.mean(axis=2, keepdims=True)
     paled = 0.55 * (0.65 * photo + 0.35 * grey) + 0.45
-    return (255 * np.clip(paled * (0.62 + 0.55 * shade[..., None]), 0, 1)).astype(np.uint8)
+    lit: Pixels = (255 * np.clip(paled * (0.62 + 0.55 * shade[..., None]), 0, 1)).astype(np.uint8)
+    return lit
 
 
 # --- what was learned of it ---------------------------------------------------------------------------------------

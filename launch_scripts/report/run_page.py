@@ -177,6 +177,11 @@ def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
     tracks = read_tracks(folder / TRACKS_FILE)
     width_km, height_km = size_km(tracks.grid)
     scale = _MAP_IN / max(width_km, height_km)
+
+    def draw(axes: Axes) -> None:
+        draw_map(axes, tracks, report)
+        axes.set_axis_off()
+
     files = {"ground": (GROUND_FILE, "image/webp"), "learned": (LEARNED_FILE, "image/png")}
     return {
         "svg": _svg(
@@ -204,8 +209,6 @@ def _svg(
         figure = Figure(figsize=size_in)
         axes = figure.add_axes(place)
         draw(axes)
-        if place == (0, 0, 1, 1):
-            axes.set_axis_off()
         file = io.StringIO()
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     head, _, rest = file.getvalue().partition("<svg ")[2].partition(">")

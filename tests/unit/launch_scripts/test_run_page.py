@@ -105,7 +105,7 @@ def test_figures_on_the_page_are_those_of_the_report(run: Path) -> None:
         assert figure in shown, figure
     for section in ("by_target", "by_vehicle"):
         for id, row in report[section].items():
-            assert re.search(rf"{id} {row['captures']} ", shown), id
+            assert re.search(rf"{id} (?:\S+ ground )?{row['captures']} ", shown), id
         if section == "by_vehicle":
             assert text.count(f'id="vehicle:{id}"') == 1, "the map can be pressed there"
     assert report["ground_shows"] == ["forbidden", "hidden"]
