@@ -64,7 +64,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
     """
     terrain, grid, held = _read(store)
     sets, words = _parted(grid, held)
-    _, kind = stored_marks.to_bands(grid, sets, time.time_ns())
+    _, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
     with KeeperStore(store, read_only=True) as kept:
         seen = kept.sightings()
     frame = MapFrame(grid)
@@ -238,7 +238,7 @@ def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
 
 
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
-    pace, kind = stored_marks.to_bands(grid, sets, time.time_ns())
+    pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
     said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
     bands = [
         "pace of marks, s/m; inf lethal; nan as the prior map says",

@@ -1,7 +1,8 @@
 """The base map on the wire: a terrain in packed pieces, and a terrain again, for machines that lack its files.
 
 What a piece must hash to is told beforehand, so that a false one is refused when it comes; that the whole is the
-terrain of the run is seen from the run's digest. Core: no bus, no clock.
+terrain of the run is seen from the run's digest. A keeper answers for it (`BaseMapServer`), and a process without
+the files asks for it (`fetch_base_map`).
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ import hashlib
 import logging
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from queue import Empty, SimpleQueue
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,16 @@ from numpy.typing import NDArray
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import Terrain, finished
-from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
+from swarm.bus.bus import Asked, Bus, Event
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
+from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import BASE_DIGEST_BYTES, BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.topics import BASE_MAP, BASE_TILES
+
+log = logging.getLogger(__name__)
 
 _LEVEL = 1  # a third smaller than the raw bytes as with level 6, in half the time
 
@@ -46,6 +50,15 @@ LAYERS = {
 }
 NEEDED = ("ground", "elevation", "classes")
 """What all need. The prior pace follows from the ground and the vehicle's radius; the photo is to look at."""
+_PIECES_KEPT = 1024
+"""Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
+_REGIONS_AT_ONCE = 8
+_PIECES_PER_REQUEST = 64
+"""Of at most 64 KiB each: what one answer may cost a keeper."""
+_ASK_TIMEOUT_S = 3.0
+_PAUSE_S = 0.25
+_MOST_KEEPERS = 16
+"""Whoever answers for a base map beyond these is not asked."""
 
 
 def layers_of(terrain: Terrain) -> dict[str, NDArray[Any]]:
@@ -239,70 +252,51 @@ def _inflated(data: bytes, size: int, what: str) -> bytes:
     return unpacked
 
 
-# The base map over the bus: a keeper that answers for it, and how a process without the files gets it.
-
-log = logging.getLogger(__name__)
-
-_CACHE_BYTES = 64 << 20
-_REGIONS_AT_ONCE = 8
-_PIECES_PER_REQUEST = 64
-_ASK_TIMEOUT_S = 3.0
-_PAUSE_S = 0.25
-_MOST_KEEPERS = 16
-
-
 class BaseMapServer:
     """Answers for a terrain, which never changes: so on the bus's own thread, beside the keeper's loop, which a
-    large map must not hold up. Pieces are packed once and kept up to 64 MiB, as machines often start together."""
+    large map must not hold up. Pieces are packed once and kept."""
 
     def __init__(self, terrain: Terrain, keeper: str) -> None:
         self._terrain = terrain
         self._keeper = keeper
-        self._described: BaseMap | None = None
-        self._packed: dict[tuple[str, int], BaseMapTile] = {}
-        self._packed_bytes = 0
+        self._piece = lru_cache(_PIECES_KEPT)(self._pack)
 
     def start(self, bus: Bus) -> None:
+        """Serves the description, and pieces."""
         bus.serve(BASE_MAP, self.answer_map, keeper=self._keeper)
         bus.serve(BASE_TILES, self.answer_tiles, keeper=self._keeper)
 
     def answer_map(self, event: Event) -> None:
+        """Answers what the terrain is."""
         assert isinstance(event, Asked)
-        if self._described is None:
-            self._described = describe(self._terrain, self._keeper)
         event.answer(self._described)
         event.end()
 
     def answer_tiles(self, event: Event) -> None:
+        """Answers with the pieces that are asked for, or says why there are none."""
         assert isinstance(event, Asked)
         request = event.request
         assert isinstance(request, BaseMapRequest)
         regions = self._terrain.grid.regions
-        for layer in request.layers:
-            if layer not in LAYERS:
-                event.refuse(f"there is no layer {layer[:40]!r}; there are {', '.join(LAYERS)}")
-                break
+        unknown = [layer for layer in request.layers if layer not in LAYERS]
+        if unknown:
+            event.refuse(f"there is no layer {unknown[0][:40]!r}; there are {', '.join(LAYERS)}")
+        elif len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
+            event.refuse(f"at most {_PIECES_PER_REQUEST} pieces in one request")
+        elif any(region >= regions for region in request.regions):
+            event.refuse(f"a region of {max(request.regions)} is not in 0..{regions - 1}")
         else:
-            if len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
-                event.refuse(f"at most {_PIECES_PER_REQUEST} pieces in one request")
-            elif any(region >= regions for region in request.regions):
-                event.refuse(f"a region of {max(request.regions)} is not in 0..{regions - 1}")
-            else:
-                for layer in request.layers:
-                    for region in request.regions:
-                        event.answer(self._piece(layer, region))
+            for layer in request.layers:
+                for region in request.regions:
+                    event.answer(self._piece(layer, region))
         event.end()
 
-    def _piece(self, layer: str, region: int) -> BaseMapTile:
-        tile = self._packed.get((layer, region))
-        if tile is None:
-            tile = pack(self._terrain, layer, region)
-            self._packed[layer, region] = tile
-            self._packed_bytes += len(tile.data)
-            while self._packed_bytes > _CACHE_BYTES:
-                oldest = next(iter(self._packed))
-                self._packed_bytes -= len(self._packed.pop(oldest).data)
-        return tile
+    @cached_property
+    def _described(self) -> BaseMap:
+        return describe(self._terrain, self._keeper)
+
+    def _pack(self, layer: str, region: int) -> BaseMapTile:
+        return pack(self._terrain, layer, region)
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,30 +319,27 @@ def fetch_base_map(bus: Bus, wanted: Fetching, why: str, progress: Progress = no
     why  what is missing here, to begin the sentence with when it fails: "there is no file ..."
     Raises TerrainError when no keeper gives it, or what comes is another terrain.
     """
-    asking = _Asking(bus)
     patience_s = time.monotonic() + wanted.within_s
     refusals: dict[str, str] = {}
     while True:
-        for described in _of_others(asking.described(), refusals):
+        replies = replies_to(bus, BASE_MAP, Nothing(), _ASK_TIMEOUT_S, _MOST_KEEPERS)[0]
+        others = [each for each in replies if isinstance(each, BaseMap) and each.keeper not in refusals]
+        for described in sorted(others, key=lambda each: each.keeper):
             try:
-                return _fetch(asking, BaseMapCopy(described, wanted.terrain, wanted.layers), wanted, progress)
+                return _fetch(bus, BaseMapCopy(described, wanted.terrain, wanted.layers), wanted, progress)
             except TerrainError as error:
                 log.warning("%s", error)
                 refusals[described.keeper] = str(error)
         if time.monotonic() > patience_s:
             break
         time.sleep(_PAUSE_S)
-    told = "; ".join(refusals.values()) or (
+    why_not = "; ".join(refusals.values()) or (
         f"no keeper in namespace {bus.namespace} answered within {wanted.within_s:g} s; start one where the file is"
     )
-    raise TerrainError(f"{why}, and the base map cannot be fetched: {told}")
+    raise TerrainError(f"{why}, and the base map cannot be fetched: {why_not}")
 
 
-def _of_others(found: Sequence[BaseMap], refusals: dict[str, str]) -> list[BaseMap]:
-    return [each for each in found if each.keeper not in refusals]
-
-
-def _fetch(asking: _Asking, copy: BaseMapCopy, wanted: Fetching, progress: Progress) -> Terrain:
+def _fetch(bus: Bus, copy: BaseMapCopy, wanted: Fetching, progress: Progress) -> Terrain:
     what = f"base map from keeper {copy.keeper}"
     due_s = time.monotonic() + wanted.within_s
     false: str | None = None
@@ -356,7 +347,10 @@ def _fetch(asking: _Asking, copy: BaseMapCopy, wanted: Fetching, progress: Progr
         before = copy.share
         for layer, regions in copy.missing(_REGIONS_AT_ONCE):
             request = BaseMapRequest(layers=[layer], regions=regions)
-            for tile in asking.tiles(request, copy.keeper):
+            # Twice as many, so that one false answer beside each true one does not crowd it out.
+            at_most = 2 * len(regions)
+            replies = replies_to(bus, BASE_TILES, request, _ASK_TIMEOUT_S, at_most, keeper=copy.keeper)[0]
+            for tile in (each for each in replies if isinstance(each, BaseMapTile)):
                 try:
                     if copy.take(tile):
                         due_s = time.monotonic() + wanted.within_s
@@ -371,43 +365,3 @@ def _fetch(asking: _Asking, copy: BaseMapCopy, wanted: Fetching, progress: Progr
             late = f"{what}: {copy.share:.0%} came, then nothing for {wanted.within_s:g} s"
             raise TerrainError(late if false is None else f"{late}; refused: {false}")
     return copy.terrain(wanted.cost)
-
-
-class _Asking:
-    """Questions one after the other, each with an end."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self._events: SimpleQueue[Event] = SimpleQueue()
-        self._asked = 0
-
-    def described(self) -> list[BaseMap]:
-        self._asked += 1
-        tag = f"base-map-{self._asked}"
-        self._bus.ask(BASE_MAP, Nothing(), self._events.put, tag=tag, timeout_s=_ASK_TIMEOUT_S)
-        found = [message for message in self._replies(tag, _MOST_KEEPERS) if isinstance(message, BaseMap)]
-        return sorted(found, key=lambda each: each.keeper)
-
-    def tiles(self, request: BaseMapRequest, keeper: str) -> list[BaseMapTile]:
-        self._asked += 1
-        tag = f"base-tiles-{self._asked}"
-        post = self._events.put
-        self._bus.ask(BASE_TILES, request, post, tag=tag, timeout_s=_ASK_TIMEOUT_S, keeper=keeper)
-        # Twice as many, so that one false answer beside each true one does not crowd it out.
-        replies = self._replies(tag, 2 * len(request.regions))
-        return [message for message in replies if isinstance(message, BaseMapTile)]
-
-    def _replies(self, tag: str, at_most: int) -> list[object]:
-        replies: list[object] = []
-        until_s = time.monotonic() + _ASK_TIMEOUT_S + 1.0
-        while (left_s := until_s - time.monotonic()) > 0:
-            try:
-                event = self._events.get(timeout=left_s)
-            except Empty:
-                break
-            match event:
-                case Replied(tag=answered, message=message) if answered == tag and len(replies) < at_most:
-                    replies.append(message)
-                case AskEnded(tag=ended) if ended == tag:
-                    break
-        return replies

@@ -175,19 +175,12 @@ def _word(each: _Set) -> MarkSet:
     return made
 
 
-def to_bands(
-    grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """(pace, kind) of the winning marks for all vehicles. The pace is in s/m: inf is lethal, nan is as the prior
-    has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything."""
-    pace, kind, _ = to_cells(grid, sets, now_ns)
-    return pace, kind
-
-
 def to_cells(
     grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
-    """As `to_bands`, and when each winning mark was made: UNIX time in ns, 0 where nobody says anything."""
+    """(pace, kind, stamp) of the winning marks for all vehicles, (rows, cols) each. The pace is in s/m: inf is
+    lethal, nan is as the prior has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything. The
+    stamp is when the mark was made: UNIX time in ns, 0 where nobody says anything."""
     replica = MapReplica(grid)
     replica.merge(list(sets))
     replica.tick(now_ns)

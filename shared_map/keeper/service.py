@@ -9,7 +9,6 @@ import msgspec
 
 from shared_map.keeper.base_map import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
-from shared_map.keeper.last_words import LastWords
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
 from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
@@ -23,6 +22,7 @@ from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.config.classes import class_numbers
 from swarm.errors import StoreError
+from swarm.liveness import Roster
 from swarm.runtime.membership import Member
 from swarm.runtime.order_book import described
 from swarm.runtime.role import RoleSetup
@@ -42,6 +42,9 @@ _NOTE_AGAIN_NS = 60 * NS_PER_S
 _NAME_AT_MOST = 16
 _COMPACT_EVERY_NS = NS_PER_S
 _COMPACT_TILES = 16
+"""Compacted at once: what sets that arrive wait for is bounded."""
+_MOST_PROCESSES = 4096
+"""So many `Stats` are remembered: whoever holds a certificate may write under any number of ids."""
 
 
 class KeeperService:
@@ -63,7 +66,9 @@ class KeeperService:
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
-        self._last_words = LastWords()
+        self._stats: dict[tuple[str, str], Stats] = {}
+        """(role, id) -> the newest `Stats` of every process: those of the gone are for whoever comes later."""
+        self._roster = Roster()
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
         self._sync = MapSync(
@@ -109,7 +114,7 @@ class KeeperService:
         self._orders.start(now_ns)
         self._bus.subscribe(STATS, self._post)
         self._bus.serve(STATS, self._post)
-        self._last_words.alive(self._member.peer, True)
+        self._roster.appeared(self._member.peer)
         for role in ("planner", "targets", "keeper", "monitor"):  # agents are watched for orders
             self._bus.watch_alive(self._post, role=role)
         log.info("keeper started: %d tiles in store %s", len(self.replica.held.tiles), self._store.path)
@@ -120,15 +125,18 @@ class KeeperService:
                 self._sightings.hear(sighted, now_ns)
                 return
             case Heard(message=Stats() as stats):
-                self._last_words.hear(stats)
+                self._receive_stats(stats)
                 return
             case Asked(topic=topic) if topic is STATS:
-                for stats in self._last_words.of_the_gone():
-                    event.answer(stats, role=stats.role, id=stats.id)
+                for _, stats in sorted(self._stats.items()):
+                    if not self._roster.is_alive(stats.role, stats.id):
+                        event.answer(stats, role=stats.role, id=stats.id)
                 event.end()
                 return
-            case Appeared(peer) | Disappeared(peer):  # others want to know it, too
-                self._last_words.alive(peer, isinstance(event, Appeared))
+            case Appeared(peer):  # others want to know it, too
+                self._roster.appeared(peer)
+            case Disappeared(peer):
+                self._roster.gone(peer)
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
             return
@@ -163,6 +171,14 @@ class KeeperService:
     def stop(self, now_ns: int) -> None:
         self._save(now_ns)
         self._member.publish_stats(now_ns)
+
+    def _receive_stats(self, stats: Stats) -> None:
+        key = (stats.role, stats.id)
+        known = self._stats.get(key)
+        if known is None and len(self._stats) >= _MOST_PROCESSES:
+            return
+        if known is None or (stats.incarnation, stats.stamp_ns) >= (known.incarnation, known.stamp_ns):
+            self._stats[key] = stats
 
     def _save_sightings(self, now_ns: int) -> None:
         """Save the newest sightings. They are for people to look at, so a full disk is no reason to try again."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools
+from shared_map.replication.digest import digest_rows
 from shared_map.replication.limits import MAX_MARKS
 from shared_map.replication.marks import (
     NO_STATEMENTS,
@@ -34,15 +35,14 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.places import corners_of
 from swarm.wire.fields import column
-from swarm.wire.messages.map_data import DIGEST_ROW, FOREVER, SEQ_STEP, STAMP_LIMIT_NS, MarkKind, MarkSet
-from swarm.wire.messages.orders import MOST_ZONES, Corners, Zone, ZoneOrder
+from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, STAMP_LIMIT_NS, MarkKind, MarkSet
+from swarm.wire.messages.orders import MOST_ZONES, Zone, ZoneOrder
 
 MOST_CELLS = 1 << 17
 """Of one zone: what every replica takes in at once, within the quota of one author."""
 MOST_IN_ALL = MAX_MARKS // 8
 """Cells of all zones: half of what a replica holds of one author."""
 
-_Points = NDArray[np.float64]
 _LIMIT = 1 << 62
 """Numbers of sets are below this."""
 
@@ -157,10 +157,7 @@ def zones_of(replica: MapReplica, now_ns: int, numbers: Mapping[str, int]) -> li
 
 def rows_of(sets: Sequence[MarkSet]) -> bytes:
     """The numbers of sets, as rows of a digest."""
-    rows = np.zeros(len(sets), DIGEST_ROW)
-    rows["tile"] = [each.tile for each in sets]
-    rows["epoch"], rows["seq"] = [each.epoch for each in sets], [each.seq for each in sets]
-    return rows.tobytes()
+    return digest_rows((each.tile, each.epoch, each.seq) for each in sets).tobytes()
 
 
 def _zone_sets(replica: MapReplica) -> Iterator[MarkSet]:
@@ -175,6 +172,8 @@ def _names(replica: MapReplica, now_ns: int) -> str:
 
 def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
     """Cells whose middle lies in the zone; why there is no such zone."""
+    import shapely  # a keeper that is given no zone needs none of it
+
     grid = terrain.grid
     corners = order.polygon
     if order.corners:
@@ -184,14 +183,14 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
             return str(error)
     if order.polygon_m:
         corners = [_row_col(x_m, y_m, grid) for x_m, y_m in order.polygon_m]
-    if (crossing := _crossing(corners)) is not None:
-        one, other = crossing
-        return f"polygon: the edges from corner {one + 1} and from corner {other + 1} cross or touch each other"
     side_m = grid.resolution_m
     inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
     covered = int(inside.sum())
     if not covered:
         return f"polygon: it covers no cell of the terrain of {grid.rows} x {grid.cols} cells"
+    fault = shapely.is_valid_reason(shapely.Polygon(corners))
+    if fault != "Valid Geometry":
+        return f"polygon: its edges cross or touch each other at row and column [{fault.partition('[')[2]}"
     if order.kind == "pace":
         # An operator's word wins over what vehicles find: it must not send them into what the terrain closes.
         inside &= np.isfinite(terrain.ground_s_per_m)
@@ -207,33 +206,6 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
 
 def _row_col(x_m: float, y_m: float, grid: GridSpec) -> tuple[float, float]:
     return (grid.north_m - y_m) / grid.resolution_m, (x_m - grid.west_m) / grid.resolution_m
-
-
-def _crossing(corners: Corners) -> tuple[int, int] | None:
-    """Two edges of a polygon which have a point in common and are not neighbours; None if there are none."""
-    start = np.array(corners, np.float64)
-    end = np.roll(start, -1, axis=0)
-    number = len(start)
-
-    def side(a: _Points, b: _Points, c: _Points) -> _Points:
-        """On which side of the line from a to b each point c lies: -1, 0 or 1."""
-        along, to = b - a, c - a
-        return np.asarray(np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]))
-
-    def on(a: _Points, b: _Points, c: _Points) -> Bools:
-        """Whether c, which is in line with a and b, lies between them."""
-        return np.asarray(((np.minimum(a, b) <= c) & (c <= np.maximum(a, b))).all(axis=-1))
-
-    a, b = start[:, None], end[:, None]
-    c, d = start[None], end[None]
-    ends = (side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b))
-    meet = (ends[0] != ends[1]) & (ends[2] != ends[3])
-    for turn, (p, q, r) in zip(ends, ((a, b, c), (a, b, d), (c, d, a), (c, d, b)), strict=True):
-        meet |= (turn == 0) & on(p, q, r)
-    apart = (np.arange(number)[:, None] - np.arange(number)[None]) % number
-    meet &= (apart != 0) & (apart != 1) & (apart != number - 1)
-    first = np.argwhere(meet)
-    return None if not len(first) else (int(first[0, 0]), int(first[0, 1]))
 
 
 def _by_tile(

@@ -25,6 +25,8 @@ _FIND_S = 3.0
 _ORDER_S = 5.0
 _OBEY_S = 3.0
 _LEAVE_S = 0.3
+_MOST_REPLIES = 1 << 16
+"""More than any swarm has processes, tiles with marks or orders: who floods a question fills no memory."""
 _MOST_SEEN = 1 << 12
 """Whoever holds a certificate may raise tokens of any number of lives, one after the other."""
 
@@ -166,11 +168,12 @@ class Operator:
 
 
 def replies_to(
-    bus: Bus, topic: Topic, request: Message, timeout_s: float, **fields: str | int
+    bus: Bus, topic: Topic, request: Message, timeout_s: float, at_most: int = _MOST_REPLIES, **fields: str | int
 ) -> tuple[list[Message], str | None]:
     """Asks, waits for all answers, and returns (replies, why there are no more).
 
-    fields  of the topic's key
+    at_most  replies are kept; what comes beyond them is dropped
+    fields   of the topic's key
     """
     inbox = Inbox()
     found: list[Message] = []
@@ -178,7 +181,7 @@ def replies_to(
     deadline_s = time.monotonic() + timeout_s + 1.0
     while time.monotonic() < deadline_s:
         match inbox.take(0.1):
-            case Replied(message=message):
+            case Replied(message=message) if len(found) < at_most:
                 found.append(message)
             case AskEnded(failure=failure):
                 return found, failure

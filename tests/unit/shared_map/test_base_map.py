@@ -202,8 +202,8 @@ class Liar(BaseMapServer):
         super().__init__(TERRAIN, "0")
         self.also = also
 
-    def _piece(self, layer: str, region: int) -> BaseMapTile:
-        true = super()._piece(layer, region)
+    def _pack(self, layer: str, region: int) -> BaseMapTile:
+        true = super()._pack(layer, region)
         return true if self.also and region % 2 else BaseMapTile(layer=layer, region=region, data=b"lies")
 
 

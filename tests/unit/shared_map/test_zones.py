@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from fractions import Fraction
 from typing import Any
 
 import msgspec
@@ -11,13 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.effort import few
 from support.map_strategies import held_winners, set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.cost_map import CostMap
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.keeper.zone_orders import _crossing, rows_of, zone_sets
+from shared_map.keeper.zone_orders import rows_of, zone_sets
 from shared_map.replication.filter import readable_for_target
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
@@ -199,7 +196,10 @@ def test_metres_are_those_of_poses() -> None:
     ("fields", "says"),
     [
         ({"action": "remove", "name": "nowhere"}, "there is no zone 'nowhere'; there are none"),
-        ({"polygon": [(0, 0), (5, 5), (0, 5), (5, 0)]}, "the edges from corner 1 and from corner 3 cross"),
+        (
+            {"polygon": [(0, 0), (5, 5), (0, 5), (5, 0)]},
+            "edges cross or touch each other at row and column [2.5 2.5]",
+        ),
         ({"polygon": [(0, 0), (0, 9), (5, 9), (0, 4), (5, 0)]}, "cross or touch"),
         ({"polygon": [(-20, -20), (-20, -5), (-5, -5)]}, "covers no cell of the terrain of 40 x 70 cells"),
         ({"polygon": [(0, 0), (1, 1), (0, 0)]}, "covers no cell"),
@@ -245,41 +245,6 @@ def test_no_group_is_called_as_zones_are() -> None:
 
 
 # --- laws ---------------------------------------------------------------------------------------------------------
-
-corners = st.lists(st.tuples(st.integers(-3, 12), st.integers(-3, 12)), min_size=3, max_size=7)
-
-
-def _on(p: Any, q: Any, r: Any) -> bool:
-    """Whether r lies on the segment from p to q."""
-    if (q[0] - p[0]) * (r[1] - p[1]) != (q[1] - p[1]) * (r[0] - p[0]):
-        return False
-    return all(min(a, b) <= c <= max(a, b) for a, b, c in zip(p, q, r, strict=True))
-
-
-def _meet(p: Any, q: Any, r: Any, s: Any) -> bool:
-    """Whether two segments have a point in common, by solving for it in fractions."""
-    if any((_on(p, q, r), _on(p, q, s), _on(r, s, p), _on(r, s, q))):
-        return True
-    det = (q[0] - p[0]) * (s[1] - r[1]) - (q[1] - p[1]) * (s[0] - r[0])
-    if det == 0:
-        return False
-    t = Fraction((r[0] - p[0]) * (s[1] - r[1]) - (r[1] - p[1]) * (s[0] - r[0]), det)
-    u = Fraction((r[0] - p[0]) * (q[1] - p[1]) - (r[1] - p[1]) * (q[0] - p[0]), det)
-    return 0 <= t <= 1 and 0 <= u <= 1
-
-
-@settings(max_examples=few(200))
-@given(corners)
-def test_edges_that_meet_are_found_as_fractions_find_them(polygon: list[tuple[int, int]]) -> None:
-    number = len(polygon)
-    edges = [(polygon[n], polygon[(n + 1) % number]) for n in range(number)]
-    expected = any(
-        _meet(*edges[one], *edges[other])
-        for one, other in itertools.combinations(range(number), 2)
-        if (other - one) % number not in (1, number - 1)
-    )
-    assert (_crossing([(float(a), float(b)) for a, b in polygon]) is not None) == expected
-
 
 actions = st.lists(
     st.one_of(
