@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
 from swarm.liveness import Newest
-from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkSet
+from swarm.wire.messages.map_data import DIGEST_ROW, Digest
 
 _FEW = 64
 """Rows up to which tuples are compared faster than arrays: digests of late changes come several times a second."""
@@ -35,11 +35,6 @@ class Ledger:
     def record(self, author: str, tile: int, epoch: int, seq: int) -> None:
         """An author's set of this tile is held under this number."""
         self._numbers.setdefault(author, {})[tile] = (epoch, seq)
-        self._rows.pop(author, None)
-
-    def record_all(self, author: str, sets: Iterable[MarkSet]) -> None:
-        """As `record` of each of an author's sets."""
-        self._numbers.setdefault(author, {}).update({each.tile: (each.epoch, each.seq) for each in sets})
         self._rows.pop(author, None)
 
     def drop(self, author: str, tile: int) -> None:

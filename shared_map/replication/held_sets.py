@@ -127,19 +127,6 @@ class HeldSets:
         self.ledger.record(author, tile, new.epoch, new.seq)
         return True
 
-    def put_all(self, author: str, first: Sequence[MarkSet]) -> bool:
-        """Hold sets of an author, each the first about its tile; False, and nothing changes, if that exceeds the
-        capacity."""
-        if not self.capacity.take_all(author, len(first), sum([len(each.kinds) for each in first])):
-            return False
-        self._tiles.update([(each.tile, {author: each}) for each in first])
-        self.ledger.record_all(author, first)
-        return True
-
-    def __contains__(self, tile: int) -> bool:
-        """Whether a set of this tile is held, of any author."""
-        return tile in self._tiles
-
     def delete(self, tombstone: MarkSet, now_ns: int) -> None:
         """Delete what its author stated about a tile, and remember under which number."""
         assert is_tombstone(tombstone)

@@ -25,6 +25,9 @@ _SPEAKS_NS = _BURST_S * NS_PER_S
 """Who was silent for longer has a full bucket, and needs no share."""
 
 
+_NOTHING = (0, 0)
+
+
 class Capacity:
     """Counts the sets and statements held, in all and by process; refuses a set which would exceed a bound.
 
@@ -46,41 +49,34 @@ class Capacity:
 
         own  no bound applies
         """
-        sets, marks = 1, len(new.kinds)
-        if old is not None:
-            sets, marks = 0, marks - len(old.kinds)
-        if not own and not self._fits(new.author, sets, marks):
+        owner, marks = owner_of(new.author), len(new.kinds)
+        sets, more = (1, marks) if old is None else (0, marks - len(old.kinds))
+        if not own and (sets or more > 0) and not self._fits(owner, sets, more):
             return False
-        self._count(new.author, sets, marks)
-        return True
-
-    def take_all(self, author: str, sets: int, marks: int) -> bool:
-        """As `take` of so many sets which replace none; False, and nothing changes, if all exceed a bound."""
-        if not self._fits(author, sets, marks):
-            return False
-        self._count(author, sets, marks)
+        self._count(owner, sets, more)
         return True
 
     def free(self, old: MarkSet) -> None:
         """`old` is held no more."""
-        self._count(old.author, -1, -len(old.kinds))
+        self._count(owner_of(old.author), -1, -len(old.kinds))
 
     def full_for(self, author: str) -> bool:
         """True if an author's set of one more tile could exceed a bound, were it to cover every cell."""
-        return not self._fits(author, 1, TILE_AREA)
+        return not self._fits(owner_of(author), 1, TILE_AREA)
 
-    def _fits(self, author: str, sets: int, marks: int) -> bool:
-        """True if so many more stay within the bounds. What takes no more than before always does."""
-        own_sets, own_marks = self._owners.get(owner_of(author), (0, 0))
-        room_for_sets = self.sets + sets <= self._max_sets and own_sets + sets <= self._max_sets // _PART
-        room_for_marks = self.marks + marks <= self._max_marks and own_marks + marks <= self._max_marks // _PART
-        return (room_for_sets or not sets) and (room_for_marks or not (sets or marks > 0))
+    def _fits(self, owner: str, sets: int, marks: int) -> bool:
+        """True if so many more stay within the bounds; a bound of sets matters to those that add one."""
+        own_sets, own_marks = self._owners.get(owner, _NOTHING)
+        return (
+            self.marks + marks <= self._max_marks
+            and own_marks + marks <= self._max_marks // _PART
+            and (not sets or (self.sets < self._max_sets and own_sets < self._max_sets // _PART))
+        )
 
-    def _count(self, author: str, sets: int, marks: int) -> None:
-        owner = owner_of(author)
-        own_sets, own_marks = self._owners.get(owner, (0, 0))
+    def _count(self, owner: str, sets: int, marks: int) -> None:
+        own_sets, own_marks = self._owners.get(owner, _NOTHING)
         self._owners[owner] = (own_sets + sets, own_marks + marks)
-        if self._owners[owner] == (0, 0):
+        if self._owners[owner] == _NOTHING:
             del self._owners[owner]
         self.sets += sets
         self.marks += marks

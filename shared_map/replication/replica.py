@@ -125,10 +125,10 @@ class MapReplica:
 
         measured  counts for `take_newest_stamp_ns`; false for the sets of a late join, which are old
         """
-        taken, rest = self._take_first(received) if len(received) >= _MANY else ([], received)
-        before: dict[int, list[MarkSet]] = {each.tile: [] for each in taken}  # tile -> its sets before any of these
-        statements_of = [len(each.kinds) for each in taken]  # and in the set that each replaced
-        for each in rest:
+        taken: list[MarkSet] = []
+        before: dict[int, list[MarkSet]] = {}  # tile -> its sets before any of these
+        statements_of: list[int] = []  # in each of these, and in the set that it replaced
+        for each in received:
             tile, author = each.tile, each.author
             old = self.held.get(tile, author)
             if not self._admits(each, old):
@@ -157,29 +157,6 @@ class MapReplica:
             return Merged(taken, counts)
         in_tile = dict(zip(before, counts, strict=True))
         return Merged(taken, [min(in_tile[s.tile], most) for s, most in zip(taken, statements_of, strict=True)])
-
-    def _take_first(self, received: Sequence[MarkSet]) -> tuple[list[MarkSet], Sequence[MarkSet]]:
-        """(taken, rest): holds the sets which are the first about their tile, as most of a late join are, at once.
-        A fast path (decision 18): `merge` does the same set by set."""
-        author, group = received[0].author, received[0].group
-        if (
-            author == self.author
-            or len(self.held.tombstones)
-            or not self.filter.accepts_author(author, group)
-            or len({each.tile for each in received}) < len(received)
-        ):
-            return [], received
-        taken: list[MarkSet] = []
-        rest: list[MarkSet] = []
-        held, accepts_tile, off_grid = self.held, self.filter.accepts_tile, self.held.off_grid
-        for each in received:
-            first = each.tile not in held and each.kinds and not each.untils_ns
-            ours = each.author == author and each.group == group and accepts_tile(each.tile)
-            sound = first and ours and not off_grid(each) and not is_ahead(each, self._now_ns)
-            (taken if sound else rest).append(each)
-        if not taken or not self.held.put_all(author, taken):
-            return [], received
-        return taken, rest
 
     def _admits(self, received: MarkSet, held: MarkSet | None) -> bool:
         """Whether a set is part of this map, wanted and news; counts why not."""
@@ -302,7 +279,7 @@ class MapReplica:
             return
         self._expiry_ns[tile] = min(ends)
         heapq.heappush(self._expiries, (min(ends), tile))
-        if len(self._expiries) > 2 * len(self._expiry_ns) + _MANY:  # so that no stream of sets makes it grow
+        if len(self._expiries) > 2 * len(self._expiry_ns) + 64:  # so that no stream of sets makes it grow
             self._expiries = [(when_ns, of) for of, when_ns in self._expiry_ns.items()]
             heapq.heapify(self._expiries)
 
@@ -451,8 +428,6 @@ class MapReplica:
         return winners(self.held.of_tile(tile), self._now_ns)
 
 
-_MANY = 64
-"""Fewer sets are merged one by one."""
 _LEARN_EVERY_NS = 5 * NS_PER_S
 """Words of what is learned change the cost map at most this often, whoever says them: each change is one of the
 whole map, and grows every tree anew. What is held alone decides what they change it to, so replicas that hold the
