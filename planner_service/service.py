@@ -265,7 +265,7 @@ class PlannerService:
             self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
-        if not self._listens or not self._sightings.hear(sighted, now_ns):
+        if not self._listens or not self._sightings.receive(sighted, now_ns):
             return  # a tracker knows better
         seen = self._sightings.best(now_ns)
         for each in seen.values():
@@ -353,7 +353,7 @@ class PlannerService:
             heard = readable_for_target(scenario, self._target, lambda group: book.targets_of(group, scenario))
             if heard != self._heard_groups:
                 self._heard_groups = heard
-                self._replica.hear(heard)
+                self._replica.read_groups(heard)
         for _, planner in self._planners:
             self._pace(planner)
 

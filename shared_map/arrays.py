@@ -1,4 +1,5 @@
-"""Short names of array types for signatures; arrays in files which all processes of a machine share."""
+"""Short names of array types for signatures; arrays in files which all processes of a machine share, and the digest
+of the code that made them."""
 
 from __future__ import annotations
 
@@ -104,12 +105,10 @@ class CellsOf:
         return row * int(self.mask.shape[1]) + int(np.flatnonzero(self.mask[row])[number - before])
 
 
-# A digest of source code: what is kept between runs is keyed by the code that made it.
-
-
 @functools.cache
 def source_digest(*folders: Path) -> str:
-    """16 hex digits of all Python files in these folders, and of the version of NumPy."""
+    """16 hex digits of all Python files in these folders, and of the version of NumPy: what is kept between runs is
+    keyed by the code that made it."""
     digest = hashlib.blake2b(np.__version__.encode(), digest_size=8)
     for folder in folders:
         for path in sorted(folder.glob("*.py")):

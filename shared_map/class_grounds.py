@@ -55,13 +55,6 @@ _KNOWN: WeakKeyDictionary[Terrain, dict[bytes, ClassGround]] = WeakKeyDictionary
 """What was prepared beside a terrain, with its truth."""
 
 
-def give_known(scenario: Scenario, common: Terrain, name: str, ground: ClassGround) -> None:
-    """Take this for the ground of a class from now on, beside this terrain."""
-    key = _key(scenario, name)
-    _KNOWN.setdefault(common, {})[key] = ground
-    _MADE.setdefault(common, {})[key] = ground.terrain
-
-
 def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | None = None) -> dict[str, Terrain]:
     """Class -> the terrain by its own rule, of these classes; of all beside "ground" if none are named. Raises
     TerrainError in one sentence.
@@ -150,11 +143,11 @@ def _key(scenario: Scenario, name: str) -> bytes:
     return msgspec.json.encode(parts)
 
 
-# The grounds of classes of vehicles, prepared once in a run's folder for all processes of a machine.
-#
-# What all classes share (heights, photo, classes of ground) lies beside, with the terrain of the run.
+# --- prepared once in a run's folder for all processes of a machine -------------------------------------------
 
 _META = "class.json"
+"""Describes the arrays beside it. What all classes share (heights, photo, classes of ground) lies with the terrain
+of the run."""
 
 
 def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: Floats) -> None:
@@ -182,7 +175,9 @@ def _open(run_dir: Path, scenario: Scenario, common: Terrain) -> None:
     for name in driven_classes(scenario):
         ground = _load(_folder(run_dir, name), _prepared_key(scenario, name), scenario, common, name)
         if ground is not None:
-            give_known(scenario, common, name, ground)
+            key = _key(scenario, name)
+            _KNOWN.setdefault(common, {})[key] = ground
+            _MADE.setdefault(common, {})[key] = ground.terrain
 
 
 def _folder(run_dir: Path, name: str) -> Path:

@@ -46,7 +46,7 @@ class Sightings:
         self._filter = filter
         self._newest: dict[tuple[str, str], _Seen] = {}
 
-    def hear(self, sighted: Sighted, now_ns: int) -> bool:
+    def receive(self, sighted: Sighted, now_ns: int) -> bool:
         """Take in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
 
         An author's sighting with a lower number is news after a silence, as `swarm.liveness.Newest` has it.

@@ -122,7 +122,7 @@ class KeeperService:
     def handle(self, event: Event, now_ns: int) -> None:
         match event:
             case Heard(message=Sighted() as sighted):
-                self._sightings.hear(sighted, now_ns)
+                self._sightings.receive(sighted, now_ns)
                 return
             case Heard(message=Stats() as stats):
                 self._receive_stats(stats)

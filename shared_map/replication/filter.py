@@ -73,9 +73,9 @@ class MarkFilter:
         self.regions: frozenset[int] | None = None
         self._grid = grid
         self._tiles: frozenset[int] | None = None  # those of `regions`
-        self.hear(groups)
+        self.read_groups(groups)
 
-    def hear(self, groups: frozenset[str] | None) -> None:
+    def read_groups(self, groups: frozenset[str] | None) -> None:
         """From now on accept the sets of these groups only; of all if None."""
         self.groups = None if groups is None else groups | {RESERVED_GROUP}
         self._prefixes = None if self.groups is None else tuple(f"{group}." for group in sorted(self.groups))

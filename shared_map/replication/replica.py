@@ -233,10 +233,10 @@ class MapReplica:
         self.filter.limit_to(regions)
         self._drop_unwanted()
 
-    def hear(self, groups: frozenset[str] | None) -> None:
+    def read_groups(self, groups: frozenset[str] | None) -> None:
         """Hold only sets of these groups from now on, besides our own; of all if None. Digests show what is missing
         of those that were not heard before."""
-        self.filter.hear(groups)
+        self.filter.read_groups(groups)
         self._drop_unwanted()
 
     def _drop_unwanted(self) -> None:
@@ -377,31 +377,30 @@ class MapReplica:
         own = self.held.get(tile, self.author)
         return dense(NO_STATEMENTS if own is None else statements(own))
 
-    def _put_own(self, tile: int, said: Statements) -> None:
-        """Replace our set of a tile, under the next number."""
+    def _put_own(self, tile: int, said: Statements, epoch: int | None = None) -> None:
+        """Replaces our set of a tile, under the next number.
+
+        epoch  of that number; None: as before
+        """
         assert self.author is not None
         held = self.held.get(tile, self.author)
-        epoch, seq = (1, 0) if held is None else (held.epoch, next_seq(held.seq))
-        self._replace_own(mark_set(self.author, self.group, tile, epoch, seq, said))
+        last, seq = (1, 0) if held is None else (held.epoch, next_seq(held.seq))
+        own = mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, said)
+        before = {tile: self.held.of_tile(tile)}
+        self.held.put(own, own=True)
+        self.counts["sets_merged"] += 1
+        self._settle(before, self._now_ns, False)
+        self._await_expiry(tile, [own])
+        self._pending[tile] = None
 
     def _reassert(self, received: MarkSet) -> None:
-        """A keeper took us for dead, and replaced our set: state the same again under a higher epoch."""
-        assert self.author is not None
+        """A keeper took us for dead, and replaced our set: states the same again under a higher epoch."""
         if received.epoch + 1 >= 1 << 62:  # no honest writer counts that far, and nothing could follow it
             self.counts["sets_refused"] += 1
             return
         held = self.held.get(received.tile, self.author)
         said = NO_STATEMENTS if held is None else statements(held)
-        seq = 0 if held is None else next_seq(held.seq)
-        self._replace_own(mark_set(self.author, self.group, received.tile, received.epoch + 1, seq, said))
-
-    def _replace_own(self, own: MarkSet) -> None:
-        before = {own.tile: self.held.of_tile(own.tile)}
-        self.held.put(own, own=True)
-        self.counts["sets_merged"] += 1
-        self._settle(before, self._now_ns, False)
-        self._await_expiry(own.tile, [own])
-        self._pending[own.tile] = None
+        self._put_own(received.tile, said, received.epoch + 1)
 
     # --- comparing with others ------------------------------------------------------------------------------
 

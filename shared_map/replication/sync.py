@@ -157,7 +157,7 @@ class MapSync:
         """True if the event concerns the map only, so that no other part needs to handle it."""
         match event:
             case HeardMany(topic=topic, samples=samples) if topic is MARKS:
-                self._hear(samples, now_ns)
+                self._receive(samples, now_ns)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag in (_JOIN, _ENTER):
                 self._merge(self._sets_in(event), measured=False)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
@@ -185,7 +185,7 @@ class MapSync:
         for digest in self._bus.collected(DIGEST):
             assert isinstance(digest.message, Digest)
             self._on_digest(digest.message.author, now_ns)
-            self._hear_digest(digest.message, now_ns)
+            self._receive_digest(digest.message, now_ns)
         self._take_in(now_ns)
         self._merge_waiting(now_ns)
         self._choose_digests(now_ns)
@@ -226,9 +226,9 @@ class MapSync:
     def _take_in(self, now_ns: int) -> None:
         """Merge what others put since the last tick."""
         if self._at_ticks and (samples := self._bus.collected_together(MARKS)):
-            self._hear(samples, now_ns)
+            self._receive(samples, now_ns)
 
-    def _hear(self, samples: Sequence[tuple[str, Message]], now_ns: int) -> None:
+    def _receive(self, samples: Sequence[tuple[str, Message]], now_ns: int) -> None:
         """Sets that were put, each under the key of its tile and author: access is granted by key."""
         sets = [
             each for key, each in samples
@@ -334,7 +334,7 @@ class MapSync:
 
     # --- digests --------------------------------------------------------------------------------------------
 
-    def _hear_digest(self, digest: Digest, now_ns: int) -> None:
+    def _receive_digest(self, digest: Digest, now_ns: int) -> None:
         if digest.author == self._name or not self._digests.add(digest, now_ns):
             return
         if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:

@@ -87,7 +87,7 @@ class History:
         elif what == 8 and self.learning:
             self.learn()
         else:
-            self.replica.hear(None if self.rng.integers(2) else frozenset(["all"]))
+            self.replica.read_groups(None if self.rng.integers(2) else frozenset(["all"]))
 
     def check(self) -> None:
         for _ in range(4):  # what is learned changes the map some seconds later at most

@@ -129,7 +129,7 @@ class UntrackedTargets:
 
     def hear(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
         """The pose of an untracked target after one more sighting; None if that is no news of one."""
-        if sighted.target not in self.targets or not self._sightings.hear(sighted, now_ns):
+        if sighted.target not in self.targets or not self._sightings.receive(sighted, now_ns):
             return None
         best = self._sightings.best(now_ns).get(sighted.target)  # None if the sighting came after it expired
         return None if best is None else pose_of(best)

@@ -131,7 +131,7 @@ class MoversView:
             case Fleet():
                 self._fleets_new = True
             case Sighted() as sighted:
-                self._sightings.hear(sighted, now_ns)
+                self._sightings.receive(sighted, now_ns)
             case Believed() as believed:
                 self._believed[believed.target] = believed, now_ns
             case Body() as body:

@@ -52,9 +52,9 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
     chance.shuffle(again)  # type: ignore[attr-defined]
     one, other = Sightings(MarkFilter(GRID)), Sightings(MarkFilter(GRID))
     for each in told:
-        one.hear(each, 5)
+        one.receive(each, 5)
     for each in again:
-        other.hear(each, 5)
+        other.receive(each, 5)
     assert one.best(4) == other.best(4)
     for target, best in one.best(4).items():
         assert best.until_ns > 4
@@ -63,8 +63,8 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
 
 def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
     seen = Sightings(MarkFilter(GRID))
-    seen.hear(sighted(5, author="red.a0.1", cell=1, until_ns=10), 5)
-    seen.hear(sighted(4, author="blue.a1.1", cell=2, until_ns=20), 5)
+    seen.receive(sighted(5, author="red.a0.1", cell=1, until_ns=10), 5)
+    seen.receive(sighted(4, author="blue.a1.1", cell=2, until_ns=20), 5)
     assert seen.best(9)["t"].cell == 1
     assert seen.best(10)["t"].cell == 2
     assert seen.best(20) == {}
@@ -72,9 +72,9 @@ def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
 
 def test_an_author_with_a_fast_clock_outweighs_nobody_and_its_sightings_expire_all_the_same() -> None:
     seen, hour_ns = Sightings(MarkFilter(GRID)), 3600 * NS_PER_S
-    assert seen.hear(sighted(hour_ns, author="red.a0.1", cell=1, until_ns=2 * hour_ns), NS_PER_S)
+    assert seen.receive(sighted(hour_ns, author="red.a0.1", cell=1, until_ns=2 * hour_ns), NS_PER_S)
     assert seen.best(NS_PER_S)["t"].cell == 1
-    assert seen.hear(sighted(2 * NS_PER_S, author="red.a1.1", cell=2, until_ns=hour_ns), 2 * NS_PER_S)
+    assert seen.receive(sighted(2 * NS_PER_S, author="red.a1.1", cell=2, until_ns=hour_ns), 2 * NS_PER_S)
     assert seen.best(2 * NS_PER_S)["t"].cell == 2
     seen.expire(NS_PER_S + LONGEST_NS)
     assert seen.best(NS_PER_S + LONGEST_NS)["t"].cell == 2
@@ -82,16 +82,16 @@ def test_an_author_with_a_fast_clock_outweighs_nobody_and_its_sightings_expire_a
 
 def test_an_author_whose_clock_is_put_back_is_heard_again_after_the_lease() -> None:
     seen = Sightings(MarkFilter(GRID))
-    seen.hear(sighted(1 << 61, cell=1, until_ns=1 << 62), 0)
-    assert not seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), POSE_SILENCE_NS - 1)
-    assert seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), POSE_SILENCE_NS)
+    seen.receive(sighted(1 << 61, cell=1, until_ns=1 << 62), 0)
+    assert not seen.receive(sighted(5, seq=9, cell=2, until_ns=1 << 62), POSE_SILENCE_NS - 1)
+    assert seen.receive(sighted(5, seq=9, cell=2, until_ns=1 << 62), POSE_SILENCE_NS)
     assert seen.best(POSE_SILENCE_NS)["t"].cell == 2
 
 
 def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
     seen = Sightings(MarkFilter(GRID, frozenset({"red"})))
-    assert not seen.hear(sighted(5, author="blue.a1.1"), 5)
-    assert seen.hear(sighted(4, author="red.a0.1"), 5)
+    assert not seen.receive(sighted(5, author="blue.a1.1"), 5)
+    assert seen.receive(sighted(4, author="red.a0.1"), 5)
     assert pose_of(seen.best(9)["t"]).seq == 4
 
 

@@ -299,12 +299,12 @@ def test_who_hears_other_groups_forgets_those_it_does_not_hear_any_more_and_keep
         world.planner.replica.merge(
             [set_of(f"{group}.a1.1", 0, 1, {0: (MarkKind.LETHAL, 0.0, 5)}, group=group)], measured=False
         )
-    replica.hear(frozenset({"blue"}))
+    replica.read_groups(frozenset({"blue"}))
     assert replica.held.ledger.authors == ["blue.a1.1", "operator.z"]
     assert world.lethal() == SQUARE_CELLS | {0}
-    replica.hear(frozenset({"grey"}))
+    replica.read_groups(frozenset({"grey"}))
     assert world.lethal() == SQUARE_CELLS
-    replica.hear(None)
+    replica.read_groups(None)
     replica.merge([set_of("red.a1.1", 0, 1, {0: (MarkKind.LETHAL, 0.0, 5)}, group="red")])
     assert world.lethal() == SQUARE_CELLS | {0}
 
