@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import logging
 import warnings
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
+from swarm.grid import GridSpec, Window
 
 EXAMPLES = few(60)
 TINY, HUGE = float(np.float32(1e-45)), float(np.finfo(np.float32).max)
@@ -66,34 +65,6 @@ def assert_exact(ground: CostGrid, tree: CostToGoTree, target: int, rules: dict)
     )
 
 
-def cost_by_heap(cost: np.ndarray, target: int, neighbours: int, edge: str, corner_cutting: bool) -> np.ndarray:
-    """Costs-to-go in float32, by a heap: sums and products are rounded as in kernels, in whatever order."""
-    rows, cols = cost.shape
-    walled = np.full((rows + 2, cols + 2), np.inf, np.float32)
-    walled[1:-1, 1:-1] = cost
-    stride, flat = cols + 2, walled.reshape(-1)
-    slant = np.float32(np.sqrt(2)) if edge == "octile" else np.float32(1)
-    steps = [row * stride + col for row, col in zip(STEP_ROW, STEP_COL, strict=True)]
-    lethal, best = np.isinf(flat).tolist(), [np.inf] * flat.size
-    heap, done = [(0.0, (target // cols + 1) * stride + target % cols + 1)], set()
-    best[heap[0][1]] = 0.0
-    while heap:
-        key, u = heapq.heappop(heap)
-        if u in done:
-            continue
-        done.add(u)
-        own = np.float32(key)
-        offers = float(own + flat[u]), float(own + flat[u] * slant)
-        for k in range(0, 8, 2 if neighbours == 4 else 1):
-            v = u + steps[k]
-            shut = k % 2 and not corner_cutting and (lethal[u + steps[k - 1]] or lethal[u + steps[(k + 1) % 8]])
-            if not (lethal[v] or shut) and offers[k % 2] < best[v]:
-                best[v] = offers[k % 2]
-                heapq.heappush(heap, (best[v], v))
-    found: np.ndarray = np.array(best, np.float32).reshape(walled.shape)[1:-1, 1:-1]
-    return found
-
-
 @pytest.mark.parametrize("field", ["terrain", "maze"])
 def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> None:
     pace = make_field(field, 64)
@@ -104,7 +75,7 @@ def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> 
         tree = CostToGoTree(ground)
         target = int(np.flatnonzero(np.isfinite(paces))[1500])
         tree.grow(target)
-        best = cost_by_heap(tree.inner(ground.cell_cost), target, **rules)
+        best = naive.cost_to_go_in_float32(tree.inner(ground.cell_cost), target, **rules)
         np.testing.assert_array_equal(tree.inner(tree.cost), best)
         assert tree.reach >= best[np.isfinite(best)].max()
         starts = ground.pad_all(np.flatnonzero(np.isfinite(best) & (best > 0)))

@@ -8,16 +8,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from laws.test_directed_trees import random_climb
 from support import slow_twins as naive
-from support.planner_strategies import RULES, random_pace
+from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.kernels.directed_buckets import grow_directed_by_buckets, make_scratch
 from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import STEP_COL, STEP_ROW
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 Paces = Callable[[np.random.Generator, int, int], np.ndarray]
 
@@ -47,14 +46,14 @@ GROUNDS: dict[str, Paces] = {
 
 def planned(draw: Paces, seed: int, rows: int, cols: int) -> tuple[CostToGoTree, np.ndarray, int]:
     rng = np.random.default_rng(seed)
-    climb = random_climb(rng, rows, cols, (0.0, 0.1, 0.4)[seed % 3], (0.3, 10.0)[seed % 2])
+    climb = random_climb(rng, GridSpec(rows, cols, 1.0), (0.0, 0.1, 0.4)[seed % 3], (0.3, 10.0)[seed % 2])
     costs = CostGrid(climb.grid, PlannerConfig(**RULES[seed % 5]), climb)
     pace = draw(rng, rows, cols)
     costs.load(pace)
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     tree = CostToGoTree(costs)
     tree.grow(root)
-    best = naive.directed_cost_to_go_in_float32(tree.inner(costs.cell_cost), root, climb, **RULES[seed % 5])
+    best = naive.cost_to_go_in_float32(tree.inner(costs.cell_cost), root, climb=climb, **RULES[seed % 5])
     return tree, best, root
 
 
@@ -93,7 +92,7 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
 
 def test_no_costs_make_a_growth_many_times_as_long() -> None:
     """CPU time of 64 x 64 cells, over that of ordinary ground, in turn: at most 10, measured 0.9 to 5."""
-    climb = random_climb(np.random.default_rng(1), 64, 64, 0.1, 10.0)
+    climb = random_climb(np.random.default_rng(1), GridSpec(64, 64, 1.0), 0.1, 10.0)
 
     def grow(draw: Paces) -> Callable[[], float]:
         rng = np.random.default_rng(1)

@@ -22,45 +22,25 @@ from support.planner_strategies import (
     happenings,
     paces,
     planner_configs,
+    random_climb,
     random_pace,
 )
+from support.repaired_tree import FACTORS, Patchwork
 
-from planner_service.kernels import repair as kernels
 from planner_service.kernels.layout import NONE
-from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
-from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import SlopeRule
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
-
-SLOPES: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
-
-
-def random_climb(rng: np.random.Generator, rows: int, cols: int, relief_m: float, steepest: float) -> Climb:
-    """Rough ground with a void or two. Steps that rise or fall by more than `steepest` are forbidden; falls may be
-    by twice as much, so that some lead one way only. In some of all it is windy."""
-    heights = rng.normal(0, relief_m, (rows, cols)).astype(np.float32)
-    heights[rng.random((rows, cols)) < 0.03] = np.nan
-    rule = SLOPES[int(rng.integers(3))]
-    climb = climb_of(GridSpec(rows, cols, 1.0), heights, CostConfig(directional=True, slope_rule=rule))
-    assert climb is not None
-    entry = int(ENTRIES * min(steepest / climb.steepest, 1.0))
-    factors = climb.factors.copy()
-    factors[ENTRIES + entry + 1 :] = np.inf
-    factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
-    blown = float(rng.choice([0.0, 0.0, 0.3])), float(rng.choice([0.0, -0.2]))
-    return replace(climb, factors=factors, wind=Wind(*blown))
 
 
 @st.composite
 def climbs(draw: st.DrawFn, shape: tuple[int, int]) -> Climb:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     return random_climb(
-        rng, *shape, draw(st.sampled_from([0.0, 0.1, 0.5])), draw(st.sampled_from([0.1, 0.3, 10.0]))
+        rng, GridSpec(*shape, 1.0), draw(st.sampled_from([0.0, 0.1, 0.5])), draw(st.sampled_from([0.1, 0.3, 10.0]))
     )
 
 
@@ -80,79 +60,39 @@ def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_
 def test_a_long_walk_with_marks_keeps_the_laws(strategy: str) -> None:
     rng = np.random.default_rng(5)
     pace = random_pace(rng, 24, 22, 6.0, 0.1)
-    climb = random_climb(rng, 24, 22, 0.15, 0.35)
+    climb = random_climb(rng, GridSpec(24, 22, 1.0), 0.15, 0.35)
     config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
     play = Play(pace, config, climb=climb)
     kinds = play.walk(rng, 40, 8)
     assert strategy in ("full", "exact") or kinds & {"window", "coarse"}, kinds
 
 
-class Ground:
-    """A directed map, a tree that is repaired, and one that is grown anew."""
-
-    def __init__(self, seed: int, rules: dict[str, Any], rows: int = 40, cols: int = 43) -> None:
-        self.rng = np.random.default_rng(seed)
-        self.pace = random_pace(self.rng, rows, cols, (1.0, 4.0, 30.0)[seed % 3], (0.0, 0.15, 0.3)[seed // 3 % 3])
-        self.climb = random_climb(self.rng, rows, cols, (0.0, 0.1, 0.4)[seed % 3], (0.3, 0.6)[seed % 2])
-        self.config = PlannerConfig(**rules)
-        self.costs = self.fresh()
-        self.root = int(self.rng.choice(np.flatnonzero(np.isfinite(self.pace))))
-        self.tree = CostToGoTree(self.costs)
-        self.tree.grow(self.root)
-
-    def fresh(self) -> CostGrid:
-        costs = CostGrid(self.climb.grid, self.config, self.climb)
-        costs.load(self.pace)
-        return costs
-
-    def change(self, factor: float, side: int) -> Window:
-        row, col = (int(self.rng.integers(0, most - side)) for most in self.pace.shape)
-        window = Window(row, col, row + side, col + side)
-        patch = self.pace[row : row + side, col : col + side]
-        patch[:] = random_pace(self.rng, side, side, 5.0, 0.3) if factor == 0 else patch * np.float32(factor)
-        if not np.isfinite(self.pace.flat[self.root]):
-            self.pace.flat[self.root] = 1.0
-        return window
-
-    def check(self) -> None:
-        fresh = CostToGoTree(self.fresh())
-        fresh.grow(self.root)
-        np.testing.assert_array_equal(self.tree.inner(self.tree.cost), fresh.inner(fresh.cost))
-        np.testing.assert_array_equal(self.tree.inner(self.tree.parent), fresh.inner(fresh.parent))
-        assert self.tree.reach >= fresh.cost[np.isfinite(fresh.cost)].max()
+def ground_of(seed: int, rules: dict[str, Any], rows: int = 40, cols: int = 43) -> Patchwork:
+    """A directed map of its own for each seed."""
+    rng = np.random.default_rng(seed)
+    pace = random_pace(rng, rows, cols, (1.0, 4.0, 30.0)[seed % 3], (0.0, 0.15, 0.3)[seed // 3 % 3])
+    grid = GridSpec(rows, cols, 1.0)
+    return Patchwork(rng, pace, rules, random_climb(rng, grid, (0.0, 0.1, 0.4)[seed % 3], (0.3, 0.6)[seed % 2]))
 
 
 @pytest.mark.seeds(15)
 def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent(seed: int) -> None:
-    ground = Ground(seed, RULES[seed % 5])
-    mended = 0
+    work = ground_of(seed, RULES[seed % 5])
     for n in range(12):
-        factors = (0.3, 0.7, 1.5, 3.0, np.inf, 0.0)[n % 6 :][: 1 + n % 2]
-        windows = [ground.change(factor, int(ground.rng.integers(1, 8))) for factor in factors]
-        if ground.tree.repair(ground.costs.apply(ground.pace, windows)) < 0:
-            ground.tree.grow(ground.root)
-        else:
-            mended += 1
-        ground.check()
-    assert mended > 3
+        factors = FACTORS[n % 6 :][: 1 + n % 2]
+        work.mend([work.change(factor, int(work.rng.integers(1, 8))) for factor in factors])
+        work.check()
+    assert work.mended > 3
 
 
 @pytest.mark.seeds(10)
 def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(seed: int) -> None:
-    ground = Ground(seed, RULES[seed % 5])
-    windows = [ground.change(factor, 6) for factor in (0.5, 0.25, 0.9)]
-    changes, costs = ground.costs.apply(ground.pace, windows), ground.costs
-    heuristic = ground.tree.cost.copy()
-    given_ = (costs.padded, costs.climbs, (heuristic, np.empty(0, np.uint8), 0), changes.cells, changes.before)
-    done, _ = kernels.repair(*given_, costs.buckets, (0, 0, 10**9), costs.repair_scratch)
-    assert done > 0
-    ground.tree.grow(ground.root)
-    np.testing.assert_array_equal(ground.tree.inner(heuristic), ground.tree.inner(ground.tree.cost))
+    ground_of(seed, RULES[seed % 5]).check_lowered()
 
 
 @pytest.mark.seeds(30)
 def test_growth_equals_scipys(seed: int) -> None:
-    ground = Ground(seed, RULES[seed % 5], 23, 31)
+    ground = ground_of(seed, RULES[seed % 5], 23, 31)
     tree = ground.tree
     best = naive.cost_to_go(ground.pace, ground.root, **RULES[seed % 5], climb=ground.climb)
     best[~np.isfinite(ground.pace)] = np.inf
@@ -162,7 +102,7 @@ def test_growth_equals_scipys(seed: int) -> None:
 
 @pytest.mark.seeds(4)
 def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
-    ground = Ground(seed, RULES[seed])
+    ground = ground_of(seed, RULES[seed])
     tree, costs = ground.tree, ground.costs
     moved = 0
     for _ in range(20):
@@ -181,7 +121,7 @@ def test_costs_are_told_and_relabelled_to_what_is_driven(seed: int) -> None:
 
 @pytest.mark.seeds(4)
 def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
-    ground = Ground(seed, RULES[seed], 64, 64)
+    ground = ground_of(seed, RULES[seed], 64, 64)
     tree, costs = ground.tree, ground.costs
     network = find_strides(costs)
     visited = 0
@@ -200,7 +140,7 @@ def test_along_strides_no_cost_is_below_what_is_driven(seed: int) -> None:
 @pytest.mark.parametrize("strategy", ["full", "auto", "variable_range+multi_resolution"])
 @pytest.mark.parametrize("most", [0, 5])
 def test_what_is_said_of_a_route_does_not_depend_on_who_else_asks(strategy: str, most: int) -> None:
-    ground = Ground(4, RULES[0], 24, 26)
+    ground = ground_of(4, RULES[0], 24, 26)
     config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
     play = Play(ground.pace, config, climb=ground.climb)
     for _ in range(8):
@@ -238,7 +178,7 @@ def test_marks_as_dear_and_as_cheap_as_can_be_come_and_go_and_the_laws_hold(seed
     rng = np.random.default_rng(seed)
     rows, cols = 13 + seed, 22 - seed
     pace = random_pace(rng, rows, cols, 4.0, 0.15)
-    climb = random_climb(rng, rows, cols, (0.1, 0.3)[seed % 2], 0.25)
+    climb = random_climb(rng, GridSpec(rows, cols, 1.0), (0.1, 0.3)[seed % 2], 0.25)
     strategy = STRATEGIES[1 + seed % 5]
     config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, **RULES[seed % 5])  # type: ignore[arg-type]
     Extremes(pace, config, climb=climb).walk(rng, 18, 3)

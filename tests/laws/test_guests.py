@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import pytest
 from support.guest_world import GuestProcess, GuestWorld
-from support.traffic_world import Faults
+from support.traffic_world import Faults, random_faults
 
 from swarm.config.agents import agent_of
 from swarm.right_of_way.guest import Guest
@@ -33,24 +33,9 @@ SHAPES = (
 """(agents, vehicles each, side of the map, side of a plot, robots, added agents)."""
 
 
-def faults_of(chance: random.Random) -> Faults:
-    return Faults(
-        loss=chance.choice((0, 0.05, 0.3)),
-        repeat=chance.choice((0, 0.1)),
-        late=chance.choice((0, 0.02, 0.2)),
-        delay_ms=chance.choice((1, 50, 300)),
-        crashes=chance.choice((0, 0.5, 2)),
-        hangs=chance.choice((0, 0.3, 1)),
-        cuts=chance.choice((0, 0.3, 1)),
-        leaps=chance.choice((0, 0.3, 2)),
-        twins=chance.choice((0, 0.1, 0.3)),
-        quiet_s=QUIET_S,
-    )
-
-
 def world_of(seed: int, twins: bool = True) -> GuestWorld:
     chance = random.Random(f"guests/{seed}")
-    shape, faults = chance.choice(SHAPES), faults_of(chance)
+    shape, faults = chance.choice(SHAPES), random_faults(chance, QUIET_S)
     agents, each, size, side, robots, added = shape
     return GuestWorld(seed, agents, each, size, side, faults if twins else replace(faults, twins=0), robots, added)
 

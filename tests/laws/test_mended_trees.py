@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -13,14 +12,13 @@ from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
 from support.planner_play import Play
-from support.planner_strategies import RULES, Job, Marks, Move, random_pace
+from support.planner_strategies import RULES, Job, Marks, Move, random_climb, random_pace
 
 from planner_service import target_tree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from swarm.config.ground import CostConfig
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
@@ -30,14 +28,7 @@ SMALL = mock.patch.object(target_tree, "exact_half", lambda grid, old, new: max(
 
 
 def steep_climb(rng: np.random.Generator, rows: int, cols: int) -> Climb:
-    """Rough ground where some steps lead down only."""
-    heights = rng.normal(0, 0.15, (rows, cols)).astype(np.float32)
-    climb = climb_of(GridSpec(rows, cols, 1.0), heights, CostConfig(directional=True))
-    assert climb is not None
-    entry = int(ENTRIES * min(0.5 / climb.steepest, 1.0))
-    factors = climb.factors.copy()
-    factors[ENTRIES + entry + 1 :] = np.inf
-    return replace(climb, factors=factors)
+    return random_climb(rng, GridSpec(rows, cols, 1.0), 0.15, 0.5)
 
 
 class Mended:
@@ -46,7 +37,11 @@ class Mended:
     def __init__(self, seed: int, priced: dict[str, Any], rows: int = 45, cols: int = 52) -> None:
         self.rng = np.random.default_rng(seed)
         rules = dict(priced)
-        climb = steep_climb(self.rng, rows, cols) if rules.pop("directional", False) else None
+        climb = (
+            random_climb(self.rng, GridSpec(rows, cols, 1.0), 0.15, 0.5)
+            if rules.pop("directional", False)
+            else None
+        )
         self.pace = random_pace(self.rng, rows, cols, (1.0, 3.0, 60.0)[seed % 3], (0.0, 0.2, 0.35)[seed // 3 % 3])
         self.costs = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**rules), climb)
         self.costs.load(self.pace)

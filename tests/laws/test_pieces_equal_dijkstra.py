@@ -92,12 +92,7 @@ class Chase:
             factor = float(self.rng.choice([0.0, 0.3, 0.7, 3.0, np.inf]))
             patch[:] = patch * np.float32(factor) if factor else random_pace(self.rng, *patch.shape, 5.0, 0.3)
             windows.append(window)
-        if not np.isfinite(self.pace.flat[self.tree.root]):
-            self.pace.flat[self.tree.root] = 1.0
-        self.tree.repair(self.ground.apply(self.pace, windows))
-        if not self.tree.exact:
-            self.gave_way += 1
-            self.grow(self.tree.root)
+        self.settle(windows)
 
     def strike(self) -> None:
         """Change dots, lines and patches all over the map: dearer, cheaper, closed, opened or all of these."""
@@ -113,6 +108,9 @@ class Chase:
             fresh = other[window.row0 : window.row1, window.col0 : window.col1]
             patch[:] = patch * np.float32(factor) if factor else fresh
             windows.append(window)
+        self.settle(windows)
+
+    def settle(self, windows: list[Window]) -> None:
         if not np.isfinite(self.pace.flat[self.tree.root]):
             self.pace.flat[self.tree.root] = 1.0
         self.tree.repair(self.ground.apply(self.pace, windows))

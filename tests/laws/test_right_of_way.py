@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.traffic_world import Faults, Process, TrafficWorld
+from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Grant
@@ -28,25 +28,12 @@ SHAPES = ((3, 4, 9, 9), (4, 3, 10, 5), (8, 3, 14, 7), (2, 5, 8, 4), (5, 4, 12, 4
 taken."""
 
 
-def faults_of(chance: random.Random) -> Faults:
-    return Faults(
-        loss=chance.choice((0, 0.05, 0.3)),
-        repeat=chance.choice((0, 0.1)),
-        late=chance.choice((0, 0.02, 0.2)),
-        delay_ms=chance.choice((1, 50, 300)),
-        crashes=chance.choice((0, 0.5, 2)),
-        hangs=chance.choice((0, 0.3, 1)),
-        cuts=chance.choice((0, 0.3, 1)),
-        leaps=chance.choice((0, 0.3, 2)),
-        twins=chance.choice((0, 0.1, 0.3)),
-        quiet_s=QUIET_S,
-    )
-
-
 def world_of(seed: int) -> TrafficWorld:
     chance = random.Random(f"world/{seed}")
     agents, each, size, side = chance.choice(SHAPES)
-    return TrafficWorld(seed, agents, each, size, side, faults_of(chance), walls=chance.choice((0, 0.5)))
+    return TrafficWorld(
+        seed, agents, each, size, side, random_faults(chance, QUIET_S), walls=chance.choice((0, 0.5))
+    )
 
 
 def duel_of(seed: int) -> TrafficWorld:

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from support.effort import few
 from support.planner_play import Play
 from support.planner_strategies import (
-    RULES,
     STRATEGIES,
     Job,
     Marks,
@@ -127,20 +126,3 @@ def test_a_window_reaches_at_least_as_far_as_the_target_moved(a: int, b: int, c:
     window = grid.around(new, block_half(grid, old, new, k))
     assert window.contains(a, b)
     assert window.contains(c, d)
-
-
-@pytest.mark.parametrize("rules", RULES)
-def test_repaired_trees_equal_grown_ones_in_every_cost_and_parent(rules: dict) -> None:
-    rng = np.random.default_rng(7)
-    for trial in range(60):
-        pace = random_pace(rng, 20, 23, [1.0, 4.0, 100.0][trial % 3], 0.2)
-        play = Play(pace, PlannerConfig(strategy="full", **rules))
-        for n in range(6):
-            play.happen(Marks(trial * 100 + n, 3))
-            if not play.tree.ready:
-                break
-            fresh = Play(play.pace.copy(), play.config)
-            fresh.tree.update(fresh.pace, play.target, [], 0)
-            mine, other = play.tree._tree, fresh.tree._tree
-            np.testing.assert_array_equal(mine.inner(mine.cost), other.inner(other.cost))
-            np.testing.assert_array_equal(mine.inner(mine.parent), other.inner(other.parent))

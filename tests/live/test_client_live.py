@@ -9,7 +9,6 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,7 +22,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "tutorial"
-EXTERNAL = '\n[[targets]]\nname = "fox"\nwalk = "external"\n'
+ALSO = '\n[[targets]]\nname = "fox"\nwalk = "external"\n'
 RUST = os.environ.get("RUST_VEHICLE", "")
 
 
@@ -31,22 +30,6 @@ def script(page: str, language: str = "python") -> str:
     """The one script of a page."""
     (found,) = re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
     return str(found)
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
-    live = LiveSwarm(tmp_path_factory.mktemp("client"), also=EXTERNAL)
-    try:
-        live.wait_until_up()
-        yield live
-    finally:
-        live.kill()
-
-
-@pytest.fixture
-def swarm(live: LiveSwarm) -> Iterator[Swarm]:
-    with connect(live.endpoint) as swarm:
-        yield swarm
 
 
 class Run:

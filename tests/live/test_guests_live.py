@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,16 +28,6 @@ from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import FLEET, ROUTE, RUN
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
-    live = LiveSwarm(tmp_path_factory.mktemp("guests"))
-    try:
-        live.wait_until_up()
-        yield live
-    finally:
-        live.kill()
 
 
 @pytest.fixture(scope="module")

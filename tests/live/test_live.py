@@ -22,15 +22,7 @@ from swarm.wire.topics import ALIVE_KEY, ROUTE, RUN, TOPICS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
-    live = LiveSwarm(tmp_path_factory.mktemp("live"), "--record-inputs")
-    try:
-        live.wait_until_up()
-        yield live
-    finally:
-        live.kill()
+OPTIONS = ("--record-inputs",)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.live_swarm import SWARM, LiveSwarm
+from support.live_swarm import SWARM, LiveSwarm, running
 from support.processes import eventually
 
 from launch_scripts.ports import free_ports
@@ -94,18 +94,8 @@ class Child:
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
     folder = tmp_path_factory.mktemp("mavlink")
     write_ground(folder / "ground.tif")
-    live = LiveSwarm(folder, text=_SCENARIO)
-    try:
-        live.wait_until_up()
+    with running(folder, text=_SCENARIO) as live:
         yield live
-    finally:
-        live.kill()
-
-
-@pytest.fixture
-def swarm(live: LiveSwarm) -> Iterator[Swarm]:
-    with connect(live.endpoint) as swarm:
-        yield swarm
 
 
 class Pair:

@@ -22,7 +22,8 @@ from swarm.wire.topics import BODY
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 TYPES = types_of(Distribution.JAZZY)
-TARGETS = """
+OPTIONS = ("--no-live",)
+ALSO = """
 [[targets]]
 name = "fox"
 walk = "external"
@@ -54,16 +55,6 @@ topic = "/works"
 name = "seen"
 topic = "/seen"
 """
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
-    live = LiveSwarm(tmp_path_factory.mktemp("ros2"), "--no-live", also=TARGETS)
-    try:
-        live.wait_until_up()
-        yield live
-    finally:
-        live.kill()
 
 
 @pytest.fixture(scope="module")

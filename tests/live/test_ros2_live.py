@@ -30,6 +30,7 @@ from swarm.config.scenario import NetworkConfig
 
 pytestmark = pytest.mark.network
 
+OPTIONS = ("--no-live",)
 TYPES = types_of(Distribution.JAZZY)
 OUT = [row.name for row in TABLE if row.direction is Direction.OUT]
 
@@ -61,16 +62,6 @@ class Gateway:
     @property
     def said(self) -> str:
         return (self.folder / "ros2.log").read_text()
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
-    live = LiveSwarm(tmp_path_factory.mktemp("swarm"), "--no-live")
-    try:
-        live.wait_until_up()
-        yield live
-    finally:
-        live.kill()
 
 
 @pytest.fixture(scope="module")

@@ -15,47 +15,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from support.launchers import Routed
 from support.live_swarm import Hands, client
 from support.processes import eventually, session_of
 from support.silent_link import SilentLink
 
-from swarm.bus.bus import Event, Heard
 from swarm.bus.endpoints import host_port, listening
-from swarm.bus.zenoh_bus import ZenohBus
-from swarm.wire.messages.vehicles import Fleet, VehicleState
-from swarm.wire.topics import FLEET
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-VEHICLES = 12
 BASE = [option for role in ("router", "keeper", "targets", "planner") for option in ("--only", role)]
-ROUTED = (VehicleState.FOLLOWING, VehicleState.ARRIVED)
-
-
-class Routed:
-    """Listens to where vehicles are. `since(s)` counts those which have told after that time, by the monotonic
-    clock, that they are on a route."""
-
-    def __init__(self, bus: ZenohBus) -> None:
-        self._told: dict[str, tuple[float, int]] = {}
-        bus.subscribe(FLEET, self._hear)
-
-    def _hear(self, event: Event) -> None:
-        assert isinstance(event, Heard)
-        assert isinstance(event.message, Fleet)
-        now_s = time.monotonic()
-        self._told |= {
-            id: (now_s, state) for id, state in zip(event.message.ids, event.message.states, strict=True)
-        }
-
-    def since(self, began_s: float) -> int:
-        return sum(when_s > began_s and state in ROUTED for when_s, state in list(self._told.values()))
-
-    def within(self, seconds: float) -> float:
-        """Seconds from now until all are on a route; fails after too many."""
-        began_s = time.monotonic()
-        eventually(lambda: self.since(began_s) == VEHICLES, seconds, "routes for all vehicles")
-        return time.monotonic() - began_s
 
 
 class TwoMachines:
@@ -86,7 +55,7 @@ def two_machines(folder: Path) -> Iterator[tuple[TwoMachines, Routed]]:
         with client(machines.hands.network) as bus:
             routed = Routed(bus)
             machines.start_agents()
-            routed.within(180)
+            routed.again(180)
             yield machines, routed
     finally:
         machines.link.close()
@@ -106,12 +75,12 @@ def test_after_a_silent_cut_and_after_the_death_of_a_whole_machine_all_vehicles_
     with two_machines(tmp_path) as (machines, routed):
         machines.link.cut()
         time.sleep(5)  # longer than the lease
-        assert routed.since(time.monotonic() - 1) == 0
+        assert not routed.any_since(time.monotonic() - 1)
         machines.link.heal()
-        routed.within(20)
+        routed.again(20)
         machines.kill_agents()
         machines.start_agents()
-        routed.within(180)
+        routed.again(180)
         assert machines.base.poll() is None, machines.hands.logs()
 
 
@@ -121,7 +90,7 @@ if __name__ == "__main__":
             machines.link.cut()
             time.sleep(cut_s)
             machines.link.heal()
-            sys.stdout.write(f"cut of {cut_s:g} s: routed again {routed.within(60):.2f} s after it healed\n")
+            sys.stdout.write(f"cut of {cut_s:g} s: routed again {routed.again(60):.2f} s after it healed\n")
         machines.kill_agents()
         machines.start_agents()
-        sys.stdout.write(f"machine killed and started again: routed again after {routed.within(180):.2f} s\n")
+        sys.stdout.write(f"machine killed and started again: routed again after {routed.again(180):.2f} s\n")

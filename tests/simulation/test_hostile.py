@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import random
 
-import msgspec
-import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
-from support.effort import few
-from support.wire_strategies import EXAMPLES, MESSAGES
+from support.wire_strategies import EXAMPLES
 
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
@@ -54,53 +48,6 @@ def test_garbage_on_every_key_is_counted_and_dropped_and_the_swarm_does_its_work
     assert report["vehicles_routed"] == 10
     assert report["captures"] > 0
     assert laws.collisions == laws.lethal == []
-
-
-@pytest.mark.parametrize("topic", FORGEABLE, ids=lambda topic: topic.name)
-def test_any_valid_message_on_its_key_raises_nowhere(topic):
-    """Such as cells outside the grid, tickets near 2**62, and authors that do not exist."""
-    simulation = Simulation(seeded(2))
-    simulation.run_until(2.0)
-    stranger = simulation.network.bus("stranger")
-    chance = random.Random(2)
-
-    @settings(
-        max_examples=few(60), deadline=None, derandomize=True, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
-    @given(MESSAGES[topic.message], st.booleans())
-    def forge(message, as_somebody):
-        if as_somebody:
-            said = [name for name in topic.fields if isinstance(getattr(message, name, None), str)]
-            with contextlib.suppress(ValueError):  # fields that do not fit each other: no codec would take them
-                message = msgspec.structs.replace(message, **{name: chance.choice(KNOWN) for name in said})
-        stranger.publish_bytes(topic, encode(message), key_fields(topic, message, chance))
-        simulation.run_until(simulation.now_s + 0.05)
-
-    forge()
-    simulation.run_until(simulation.now_s + 1)
-
-
-@pytest.mark.parametrize("topic", [topic for topic in TOPICS if topic.request], ids=lambda topic: topic.name)
-def test_any_valid_question_is_answered_or_refused(topic):
-    simulation = Simulation(seeded(2))
-    simulation.run_until(2.0)
-    stranger = simulation.network.bus("stranger")
-    chance = random.Random(3)
-    assert topic.request is not None
-
-    @settings(
-        max_examples=few(60), deadline=None, derandomize=True, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
-    @given(MESSAGES[topic.request], st.booleans())
-    def ask(request, narrow):
-        fields = {name: chance.choice(KNOWN) for name in topic.fields} if narrow else {}
-        stranger.ask(topic, request, ignore, tag="q", **fields)
-        simulation.run_until(simulation.now_s + 0.05)
-
-    ask()
-    simulation.run_until(simulation.now_s + 1)
 
 
 def test_only_a_run_that_differs_ends_a_process():

@@ -148,10 +148,14 @@ class Routed:
         """Whether all vehicles were heard to be on a route after that time, by the monotonic clock."""
         return sum(last_s > began_s for last_s in dict(self._last_s).values()) == VEHICLES
 
-    def again(self, within_s: float) -> None:
-        """Wait until all are on a route from now on."""
+    def any_since(self, began_s: float) -> bool:
+        return any(last_s > began_s for last_s in dict(self._last_s).values())
+
+    def again(self, within_s: float) -> float:
+        """Wait until all are on a route from now on. Returns how long that took, s."""
         began_s = time.monotonic()
         eventually(lambda: self.all_since(began_s), within_s, "routes for all vehicles")
+        return time.monotonic() - began_s
 
 
 @contextmanager

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +131,17 @@ class LiveSwarm:
         if session_of(self.process.pid):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(10)
+
+
+@contextlib.contextmanager
+def running(folder: Path, *options: object, also: str = "", text: str = _SCENARIO) -> Iterator[LiveSwarm]:
+    """A swarm all of whose processes are alive, and which is killed in the end."""
+    live = LiveSwarm(folder, *options, also=also, text=text)
+    try:
+        live.wait_until_up()
+        yield live
+    finally:
+        live.kill()
 
 
 class Hands:

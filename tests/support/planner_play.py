@@ -147,12 +147,9 @@ class Play:
                 assert route.status is RouteStatus.OK
         served = np.isfinite(optimum) & ~lethal
         cells = np.flatnonzero(served)
-        driven = np.empty(cells.size)
-        for n, cell in enumerate(cells.tolist()):
-            found = naive.follow(self.pace, cell, routes[cell].directions, **self.rules)
-            assert found is not None, "the route enters a lethal cell, squeezes or leaves the grid"
-            last, driven[n] = found
-            assert last == target
+        last, seconds = naive.drive(self.grid, self.config, self.pace, self.rules["climb"], routes)
+        assert (last[cells] == target).all(), "a route enters a lethal cell, squeezes or leaves the grid"
+        driven = seconds[cells]
         cost = np.array([routes[cell].cost_s for cell in cells])
         bound = np.array([routes[cell].lower_bound_s for cell in cells])
         upper = self.tree.cost_to_go_at(cells)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
+from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
+from swarm.config.values import SlopeRule
+from swarm.grid import GridSpec
 
 STRATEGIES = (
     "full",
@@ -36,6 +40,23 @@ def random_pace(rng: np.random.Generator, rows: int, cols: int, ratio: float, wa
     if not np.isfinite(pace).any():
         pace[rng.integers(rows), rng.integers(cols)] = 1.0
     return pace
+
+
+def random_climb(rng: np.random.Generator, grid: GridSpec, relief_m: float, steepest: float) -> Climb:
+    """Rough ground with a void or two. Steps that rise or fall by more than `steepest` are forbidden; falls may be
+    by twice as much, so that some lead one way only. In some of all it is windy."""
+    heights = rng.normal(0, relief_m, (grid.rows, grid.cols)).astype(np.float32)
+    heights[rng.random(heights.shape) < 0.03] = np.nan
+    rules: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
+    rule = rules[int(rng.integers(3))]
+    climb = climb_of(grid, heights, CostConfig(directional=True, slope_rule=rule))
+    assert climb is not None
+    entry = int(ENTRIES * min(steepest / climb.steepest, 1.0))
+    factors = climb.factors.copy()
+    factors[ENTRIES + entry + 1 :] = np.inf
+    factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
+    blown = float(rng.choice([0.0, 0.0, 0.3])), float(rng.choice([0.0, -0.2]))
+    return replace(climb, factors=factors, wind=Wind(*blown))
 
 
 @st.composite

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import heapq
 import itertools
 import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,11 @@ from scipy.sparse.csgraph import dijkstra
 
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from shared_map.terrain.step_climb import Climb
-from swarm.grid import STEP_COL, STEP_ROW
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.wire.routes import RouteBatch
+
+Cells = NDArray[np.int64]
 
 
 def step_length(direction: int, edge: str) -> float:
@@ -43,19 +48,13 @@ def steps(
     return found
 
 
-def graph_into(
-    pace: NDArray[np.float32],
-    neighbours: int = 8,
-    edge: str = "octile",
-    corner_cutting: bool = False,
-    climb: Climb | None = None,
-) -> csr_matrix:
-    """The graph of all steps with every edge turned round, so that a search from the target finds the ways to
-    it."""
+def _legal_steps(
+    pace: NDArray[np.float32], neighbours: int, corner_cutting: bool
+) -> Iterator[tuple[int, Cells, Cells]]:
+    """Of each direction: the cells from which a step leads there, and those to which it leads."""
     rows, cols = pace.shape
     cells = np.arange(pace.size).reshape(rows, cols)
     free = np.isfinite(pace)
-    into, out, costs = [], [], []
     for direction in range(0, 8, 2 if neighbours == 4 else 1):
         dr, dc = STEP_ROW[direction], STEP_COL[direction]
         here = np.s_[max(0, -dr) : rows - max(0, dr), max(0, -dc) : cols - max(0, dc)]
@@ -63,30 +62,7 @@ def graph_into(
         legal = free[here] & free[there]
         if direction % 2 and not corner_cutting:
             legal &= free[here[0], there[1]] & free[there[0], here[1]]
-        out.append(cells[here][legal])
-        into.append(cells[there][legal])
-        costs.append(pace[there][legal].astype(np.float64) * step_length(direction, edge))
-        if climb is not None:
-            costs[-1] *= climb.along(out[-1], into[-1])
-            allowed = np.isfinite(costs[-1])
-            out[-1], into[-1], costs[-1] = out[-1][allowed], into[-1][allowed], costs[-1][allowed]
-    shape = (pace.size, pace.size)
-    return csr_matrix((np.concatenate(costs), (np.concatenate(into), np.concatenate(out))), shape=shape)
-
-
-@functools.lru_cache(maxsize=4)
-def factors_of(climb: Climb) -> list[list[float]]:
-    """Of each direction and cell: the factor of the step; 1 where it would leave the grid."""
-    rows, cols = climb.grid.rows, climb.grid.cols
-    row, col = np.divmod(np.arange(rows * cols), cols)
-    found = []
-    for direction in range(8):
-        r = np.clip(row + STEP_ROW[direction], 0, rows - 1)
-        c = np.clip(col + STEP_COL[direction], 0, cols - 1)
-        inside = (abs(r - row) == abs(STEP_ROW[direction])) & (abs(c - col) == abs(STEP_COL[direction]))
-        factors = climb.along(row * cols + col, np.where(inside, r * cols + c, row * cols + col))
-        found.append(np.where(inside, factors, 1.0).tolist())
-    return found
+        yield direction, cells[here][legal], cells[there][legal]
 
 
 def cost_to_go(
@@ -96,41 +72,47 @@ def cost_to_go(
     edge: str = "octile",
     corner_cutting: bool = False,
     climb: Climb | None = None,
+    length_weight: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Cheapest cost from every cell to the target on cells of one metre, by scipy on the reversed graph."""
-    graph = graph_into(pace, neighbours, edge, corner_cutting, climb)
-    found: NDArray[np.float64] = dijkstra(graph, indices=target)
+    """Cheapest cost from every cell to the target on cells of one metre, by scipy on the graph of all steps with
+    every edge turned round, so that a search from the target finds the ways to it.
+
+    length_weight  what a metre costs beside its time
+    """
+    into, out, costs = [], [], []
+    for direction, here, there in _legal_steps(pace, neighbours, corner_cutting):
+        length = step_length(direction, edge)
+        cost = pace.reshape(-1)[there].astype(np.float64) * length
+        if climb is not None:
+            cost *= climb.along(here, there)
+        allowed = np.isfinite(cost)
+        out.append(here[allowed])
+        into.append(there[allowed])
+        costs.append(cost[allowed] + length_weight * length)
+    graph = (np.concatenate(costs), (np.concatenate(into), np.concatenate(out)))
+    found: NDArray[np.float64] = dijkstra(csr_matrix(graph, shape=(pace.size, pace.size)), indices=target)
     return found.reshape(pace.shape)
 
 
-def directed_cost_to_go_in_float32(
+def cost_to_go_in_float32(
     cell_cost: NDArray[np.float32],
     target: int,
-    climb: Climb,
     neighbours: int = 8,
     edge: str = "octile",
     corner_cutting: bool = False,
+    climb: Climb | None = None,
 ) -> NDArray[np.float32]:
-    """What directed trees are to cost, to the last bit, by a heap: each sum and each product rounded as theirs.
+    """What trees are to cost, to the last bit, by a heap: each sum and each product rounded as theirs.
 
     Float32 sums grow with what is added to, so that the order in which cells are served makes no difference.
 
     cell_cost  float32 (rows, cols), s; of the cheapest straight step into each cell
     """
-    rows, cols = cell_cost.shape
-    cells = np.arange(cell_cost.size).reshape(rows, cols)
-    free = np.isfinite(cell_cost)
     into: list[list[tuple[int, np.float32]]] = [[] for _ in range(cell_cost.size)]
-    for direction in range(0, 8, 2 if neighbours == 4 else 1):
-        dr, dc = STEP_ROW[direction], STEP_COL[direction]
-        here = np.s_[max(0, -dr) : rows - max(0, dr), max(0, -dc) : cols - max(0, dc)]
-        there = np.s_[max(0, dr) : rows + min(0, dr), max(0, dc) : cols + min(0, dc)]
-        legal = free[here] & free[there]
-        if direction % 2 and not corner_cutting:
-            legal &= free[here[0], there[1]] & free[there[0], here[1]]
-        out, to = cells[here][legal], cells[there][legal]
-        prices = climb.along(out, to) / np.float32(climb.lowest)
-        prices *= np.float32(step_length(direction, edge))
+    for direction, out, to in _legal_steps(cell_cost, neighbours, corner_cutting):
+        prices = np.full(to.size, step_length(direction, edge), np.float32)
+        if climb is not None:
+            prices *= climb.along(out, to) / np.float32(climb.lowest)
         costs = cell_cost.reshape(-1)[to] * prices
         for v, u, cost in zip(out.tolist(), to.tolist(), costs, strict=True):
             if cost < np.inf:
@@ -146,7 +128,7 @@ def directed_cost_to_go_in_float32(
             if key + cost < best[v]:
                 best[v] = key + cost
                 heapq.heappush(heap, (best[v], v))
-    return best.reshape(rows, cols)
+    return best.reshape(cell_cost.shape)
 
 
 def cost_to_go_by_hand(pace: NDArray[np.float32], target: int, **rules: object) -> NDArray[np.float64]:
@@ -191,7 +173,6 @@ def follow(
     neighbours: int = 8,
     edge: str = "octile",
     corner_cutting: bool = False,
-    climb: Climb | None = None,
 ) -> tuple[int, float] | None:
     """(last cell, cost) of a route on cells of one metre; None if it breaks a rule on the way."""
     rows, cols = pace.shape
@@ -206,12 +187,59 @@ def follow(
                 return None
             if not corner_cutting and (pace[row, c] == math.inf or pace[r, col] == math.inf):
                 return None
-        factor = 1.0 if climb is None else factors_of(climb)[direction][row * cols + col]
-        if factor == math.inf:
-            return None
-        total += float(pace[r, c]) * step_length(direction, edge) * factor
+        total += float(pace[r, c]) * step_length(direction, edge)
         row, col = r, c
     return row * cols + col, total
+
+
+class Driven(NamedTuple):
+    """What became of routes that were driven step by step.
+
+    last    int64 (n,), cell; -1 where a step breaks a rule
+    time_s  float64 (n,), s
+    """
+
+    last: Cells
+    time_s: NDArray[np.float64]
+
+
+def drive(
+    grid: GridSpec, config: PlannerConfig, pace: NDArray[np.float32], climb: Climb | None, routes: RouteBatch
+) -> Driven:
+    """Every route of a batch, step by step from its start to the end of what is given of it."""
+    last, seconds = np.array(routes.starts), np.zeros(len(routes))
+    begin = np.concatenate(([0], routes.ends[:-1])).astype(np.int64)
+    steps = routes.ends - begin
+    order = np.argsort(-steps, kind="stable")
+    for n in range(int(steps.max(initial=0))):
+        going = order[: np.searchsorted(-steps[order], -n, side="left")]
+        going = going[last[going] >= 0]
+        code = routes.directions[begin[going] + n].astype(np.int64)
+        there, taken = _step(grid, config, pace, climb, last[going], code)
+        last[going] = there
+        seconds[going] += taken
+    return Driven(last, seconds)
+
+
+def _step(
+    grid: GridSpec, config: PlannerConfig, pace: NDArray[np.float32], climb: Climb | None, here: Cells, code: Cells
+) -> tuple[Cells, NDArray[np.float64]]:
+    """Where a step leads from each cell and what it takes, s; -1 and inf where the rules forbid it."""
+    row, col = np.divmod(here, grid.cols)
+    r, c = row + np.array(STEP_ROW)[code], col + np.array(STEP_COL)[code]
+    inside = (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.cols)
+    r, c, diagonal = np.where(inside, r, row), np.where(inside, c, col), code % 2 == 1
+    there = r * grid.cols + c
+    length_m = np.where(diagonal & (config.edge == "octile"), math.sqrt(2), 1.0) * grid.resolution_m
+    taken = pace[r, c].astype(np.float64) * length_m
+    if climb is not None:
+        taken = taken * climb.along(here, there)
+    legal = inside & np.isfinite(pace[row, col]) & np.isfinite(taken)
+    if config.neighbours == 4:
+        legal &= ~diagonal
+    elif not config.corner_cutting:
+        legal &= ~diagonal | (np.isfinite(pace[row, c]) & np.isfinite(pace[r, col]))
+    return np.where(legal, there, -1), np.where(legal, taken, math.inf)
 
 
 def lower_bound(tree: CostToGoTree, heuristic: NDArray[np.float32] | None, cell: int, cost: float) -> float:

@@ -46,6 +46,22 @@ class Faults:
     tick_ns: int = TICK_NS
 
 
+def random_faults(chance: random.Random, quiet_s: float) -> Faults:
+    """Of every kind, or not."""
+    return Faults(
+        loss=chance.choice((0, 0.05, 0.3)),
+        repeat=chance.choice((0, 0.1)),
+        late=chance.choice((0, 0.02, 0.2)),
+        delay_ms=chance.choice((1, 50, 300)),
+        crashes=chance.choice((0, 0.5, 2)),
+        hangs=chance.choice((0, 0.3, 1)),
+        cuts=chance.choice((0, 0.3, 1)),
+        leaps=chance.choice((0, 0.3, 2)),
+        twins=chance.choice((0, 0.1, 0.3)),
+        quiet_s=quiet_s,
+    )
+
+
 @dataclass
 class Disk:
     """What survives a process: promises, tables, and the lives that ran on it."""

@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, get_args
+from dataclasses import dataclass, field
+from typing import get_args
 
 import numpy as np
-from support.route_oracle import Cells, Driven, Seconds, best_costs, drive
+from numpy.typing import NDArray
+from support.planner_strategies import RULES, random_climb, random_pace
+from support.slow_twins import Cells, Driven, cost_to_go, drive
 
 from planner_service.full_growth import GrownTree
 from planner_service.kernel_build import load_all
 from planner_service.target_tree import TargetTree
-from shared_map.arrays import Floats
-from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
-from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import SlopeRule, Strategy
+from swarm.config.values import Strategy
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import LETHAL_START, OK, UNREACHABLE, RouteBatch
+
+Seconds = NDArray[np.float64]
 
 LAWS = {
     "status": "a cell has a route exactly where there is a way",
@@ -41,14 +42,6 @@ STATED = 1e-6
 """Relative; what a stated cost may be off by."""
 _FLOAT64 = 1e-12
 """Relative; sums of float64 over other orders of the same steps."""
-
-_RULES: tuple[dict[str, Any], ...] = (
-    {},
-    {"corner_cutting": True},
-    {"edge": "paper"},
-    {"edge": "paper", "corner_cutting": True},
-    {"neighbours": 4},
-)
 
 
 @dataclass
@@ -101,15 +94,17 @@ class Life:
         rows, cols = (int(rng.integers(1, 161 if in_pieces else 49)) for _ in "rc")
         resolution_m = float(rng.choice([1.0, 0.1, 7.3, 30.0]))
         self._grid = GridSpec(rows, cols, resolution_m)
-        self._pace = _random_pace(rng, rows, cols)
+        ratio, walls = float(rng.choice([1.0, 3.0, 100.0, 1e4, 1e8])), float(rng.choice([0.0, 0.1, 0.3, 0.5]))
+        self._pace = random_pace(rng, rows, cols, ratio, walls)
         kind = int(rng.integers(2 if in_pieces else 3))
-        self._climb = _random_climb(rng, self._grid) if kind == 2 else None
+        relief_m, steepest = rng.choice([0.0, 0.1, 0.5]) * resolution_m, float(rng.choice([0.1, 0.3, 10.0]))
+        self._climb = random_climb(rng, self._grid, relief_m, steepest) if kind == 2 else None
         self.config = PlannerConfig(
             strategy=str(rng.choice(["exact", "auto"] if in_pieces else get_args(Strategy))),
             k_min=int(rng.integers(3)),
             cpu_budget=float(rng.choice([1e-9, 1e-4, 0.5])),
             length_weight=float(10.0 ** rng.uniform(-6, 6)) if kind == 1 else 0.0,
-            **_RULES[rng.integers(len(_RULES))],
+            **RULES[rng.integers(len(RULES))],
         )
         self._tree = TargetTree(self._grid, self.config, self._climb)
         self._tree.times.in_pieces = in_pieces  # as if the map were large
@@ -174,7 +169,7 @@ class Life:
         if not self._tree.ready:
             return
         ground = self._grid, self.config, self._pace, self._climb
-        best_s = best_costs(*ground, self._target)
+        best_s = self._best()
         every = np.arange(self._grid.cells)
         if self._rng.random() < 0.5:  # what a cut route says must not need the whole one to have been asked for
             cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
@@ -195,10 +190,15 @@ class Life:
             self._note("bound", _above(routes.lower_bound_s[there], best_s[there]), _FLOAT64)
         self._note("optimum", _above(best_s[there], driven.time_s[there]), _FLOAT64)
         if self._tree.strategy.is_exact:
-            best = best_costs(*ground, self._target, self.config.length_weight)[there]
+            best = self._best(self.config.length_weight)[there]
             asked = driven.time_s[there] + self.config.length_weight * whole.length_m[there]
             self._note("exact", _above(asked, best), self._grid.cells * 2.0**-23)
         self._check_alone(whole, cut, there)
+
+    def _best(self, length_weight: float = 0.0) -> Seconds:
+        config, metres = self.config, self._grid.resolution_m
+        rules = (config.neighbours, config.edge, config.corner_cutting)
+        return metres * cost_to_go(self._pace, self._target, *rules, self._climb, length_weight).reshape(-1)
 
     def _check_statuses(self, routes: RouteBatch, best_s: Seconds) -> None:
         expected = np.where(np.isfinite(best_s), OK, UNREACHABLE)
@@ -241,30 +241,3 @@ def _above(one: Seconds, other: Seconds) -> Seconds:
 
 def _apart(one: Seconds, other: Seconds) -> Seconds:
     return np.maximum(_above(one, other), _above(other, one))
-
-
-def _random_pace(rng: np.random.Generator, rows: int, cols: int) -> Floats:
-    ratio = float(rng.choice([1.0, 3.0, 100.0, 1e4, 1e8]))
-    pace = np.exp(rng.random((rows, cols)) * math.log(ratio)).astype(np.float32)
-    pace[rng.random((rows, cols)) < rng.choice([0.0, 0.1, 0.3, 0.5])] = np.inf
-    if not np.isfinite(pace).any():
-        pace[0, 0] = 1.0
-    return pace
-
-
-def _random_climb(rng: np.random.Generator, grid: GridSpec) -> Climb:
-    """Rough ground with voids, in some winds; steps that rise too steeply are forbidden, and falls from twice as
-    steep on, so that some lead one way only."""
-    heights = rng.normal(0, rng.choice([0.0, 0.1, 0.5]), (grid.rows, grid.cols)).astype(np.float32)
-    heights *= np.float32(grid.resolution_m)
-    heights[rng.random(heights.shape) < 0.03] = np.nan
-    rules: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
-    rule = rules[rng.integers(len(rules))]
-    climb = climb_of(grid, heights, CostConfig(directional=True, slope_rule=rule))
-    assert climb is not None
-    entry = int(ENTRIES * min(float(rng.choice([0.1, 0.3, 10.0])) / climb.steepest, 1.0))
-    factors = climb.factors.copy()
-    factors[ENTRIES + entry + 1 :] = np.inf
-    factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
-    wind = Wind(float(rng.choice([0.0, 0.0, 0.3])), float(rng.choice([0.0, 0.0, -0.2])))
-    return replace(climb, factors=factors, wind=wind)

@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 from support.fields import Field
-from support.route_oracle import drive
+from support.slow_twins import drive
 
 from bench.harness import cpu_ms, track
 from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWorld
