@@ -127,8 +127,6 @@ class Agent:
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
         self._sight_cells = max(sense_cells, config.reserve_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
-        self._reach_cells = int(config.capture_range_m / grid.resolution_m) + 1
-        """No target is within capture range that is so many rows away."""
         self.seen_lethal: set[int] = set()
         """Cells in zones over which no way out leads, as vehicles have seen."""
         self._driven_ns: int | None = None
@@ -287,20 +285,17 @@ class Agent:
             del self._poses[target]
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
-        paths, cols, reach = self.holdings.paths, self._map.grid.cols, self._reach_cells
-        rows = {target: pose.cell // cols for target, pose in self._poses.items()}
+        paths = self.holdings.paths
         waiting = self._steering.waiting_ns
         for vehicle in self.vehicles.values():
-            motion, row = vehicle.motion, rows.get(vehicle.target)
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
-            if vehicle.in_reach or (row is not None and -reach <= motion.cell // cols - row <= reach):
-                self._check_reach(vehicle)
+            self._check_reach(vehicle)
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
             path = paths[vehicle.id]
-            if len(path) > 1 and motion.at_rest:
+            if len(path) > 1 and vehicle.motion.at_rest:
                 # What was granted late may be closed by now, and would be held for good.
                 self._driver.end_path(vehicle)
                 path = paths[vehicle.id]
@@ -340,12 +335,11 @@ class Agent:
         pose = self._poses.get(target)
         if pose is None:
             return False
-        grid, reach = self._map.grid, self._reach_cells
-        rows = cell // grid.cols - pose.cell // grid.cols
-        if not -reach <= rows <= reach:
-            return False
-        cols = cell % grid.cols - pose.cell % grid.cols
-        return math.hypot(rows, cols) * grid.resolution_m <= self._config.capture_range_m
+        grid = self._map.grid
+        return (
+            math.dist(grid.row_col(cell), grid.row_col(pose.cell)) * grid.resolution_m
+            <= self._config.capture_range_m
+        )
 
     def _check_reach(self, vehicle: Vehicle) -> None:
         near = self._in_reach(vehicle.target, vehicle.cell)

@@ -6,6 +6,7 @@ its own class. What is found in a zone is no news, and a vehicle that stands in 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -228,29 +229,27 @@ class ZonesAround:
     def _find_ways_out(self, shut: Collection[int]) -> dict[int, int]:
         """Breadth first from the open cells around zones, along straight steps over cells that only zones close.
         What is shut leads out too, as a vehicle may stand there, but nothing leads over it."""
-        closed = self._closed_by_zones()
-        cols, pace = self._cost_map.grid.cols, self._cost_map.pace_s_per_m.reshape(-1)
-        passable = ~np.isin(closed, list(shut))
-        depth = np.zeros(len(closed), np.int64)
-        beside = _straight(closed, cols, len(pace))
-        at = np.searchsorted(closed, beside.clip(0))
-        at[at == len(closed)] = 0
-        inside = (closed[at] == beside) if len(closed) else np.zeros_like(beside, bool)
-        outside = (beside >= 0) & np.isfinite(pace[beside.clip(0)]) & ~np.isin(beside, list(shut))
-        front = outside.any(axis=1)
-        level = 0
-        while front.any():
-            level += 1
-            depth[front] = level
-            reached = np.zeros(len(closed), bool)
-            reached[at[front & passable][inside[front & passable]]] = True
-            front = reached & (depth == 0)
-        led = depth > 0
-        return dict(zip(closed[led].tolist(), depth[led].tolist(), strict=True))
+        grid, pace, closed = self._replica.grid, self._cost_map.pace_s_per_m.reshape(-1), self._closed_by_zones()
+        beside = {
+            cell: [each for direction, each in grid.neighbours(cell) if direction % 2 == 0] for cell in closed
+        }
+        depth = {
+            cell: 1
+            for cell, around in beside.items()
+            if any(each not in shut and np.isfinite(pace.item(each)) for each in around)
+        }
+        queue = deque(depth)
+        while queue:
+            cell = queue.popleft()
+            for each in () if cell in shut else beside[cell]:
+                if each in beside and each not in depth:
+                    depth[each] = depth[cell] + 1
+                    queue.append(each)
+        return depth
 
-    def _closed_by_zones(self) -> NDArray[np.int64]:
-        """Cells which are lethal, and would not be without the zones; sorted."""
-        grid, cost_map, found = self._replica.grid, self._cost_map, [np.empty(0, np.int64)]
+    def _closed_by_zones(self) -> list[int]:
+        """Cells which are lethal, and would not be without the zones."""
+        grid, cost_map, found = self._replica.grid, self._cost_map, list[int]()
         ground = cost_map.ground_s_per_m.copy()
         flat, prior = ground.reshape(-1), cost_map.terrain.ground_s_per_m.reshape(-1)
         for place in self._tiles:
@@ -279,20 +278,11 @@ class ZonesAround:
             pace = cost_map.inflated(ground, window)
             here = cost_map.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
             rows, cols = np.nonzero(np.isinf(here) & np.isfinite(pace))
-            found.append((rows + window.row0) * grid.cols + cols + window.col0)
-        return np.unique(np.concatenate(found))
+            found += ((rows + window.row0) * grid.cols + cols + window.col0).tolist()
+        return found
 
     def _said_without_zones(self, tile: int) -> tuple[Statements, list[NDArray[np.uint16]]]:
         """What is said of a tile beside its zones, and the cells in it of each zone."""
         sets, now_ns = self._replica.held.of_tile(tile), self._replica.now_ns
         zones = [standing(each, now_ns).cells for each in sets if is_zone(each.author)]
         return winners([each for each in sets if not is_zone(each.author)], now_ns), zones
-
-
-def _straight(cells: NDArray[np.int64], cols: int, area: int) -> NDArray[np.int64]:
-    """The four neighbours beside each cell, int64 (n, 4); -1 where the grid ends."""
-    col = cells % cols
-    beside = np.stack((cells - cols, np.where(col < cols - 1, cells + 1, -1), cells + cols, cells), axis=1)
-    beside[:, 3] = np.where(col > 0, cells - 1, -1)
-    beside[(beside < 0) | (beside >= area)] = -1
-    return beside

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from swarm.grid import GridSpec, Window
 
 _MOST = 1 << 31
+"""Cells from the grid: what lies further is as far."""
 _LEAST = 1e-12
 """Cells to one side: less is straight."""
 
@@ -37,19 +39,10 @@ class Capsule:
         window = self.window(grid)
         if window.empty:
             return []
-        u0, v0, u1, v1, radius = self._in_cells(grid)
+        *line, radius = self._in_cells(grid)
         cols = np.arange(window.col0, window.col1, dtype=np.float64)[None, :]
         rows = np.arange(window.row0, window.row1, dtype=np.float64)[:, None]
-        near = np.minimum(_to_square(cols, rows, u0, v0), _to_square(cols, rows, u1, v1))
-        if (u1 - u0) ** 2 + (v1 - v0) ** 2 > 0.0:  # the square of a tiny length is 0
-            corners = _to_line(
-                np.arange(window.col0, window.col1 + 1.0)[None, :],
-                np.arange(window.row0, window.row1 + 1.0)[:, None],
-                (u0, v0, u1, v1),
-            )
-            corners = np.minimum(corners[1:], corners[:-1])
-            near = np.minimum(near, np.minimum(corners[:, 1:], corners[:, :-1]))
-            near[_crossed(cols, rows, (u0, v0, u1, v1))] = 0.0
+        near = _from_squares(cols, rows, line)
         found_rows, found_cols = np.nonzero(near <= radius + 1e-9)
         flat: list[int] = ((found_rows + window.row0) * grid.cols + found_cols + window.col0).tolist()
         return flat
@@ -80,38 +73,27 @@ def _clipped(low: float, high: float, side: int) -> tuple[int, int]:
     return first, max(last, first if first < side else last)
 
 
-def _to_square(cols: NDArray[np.float64], rows: NDArray[np.float64], u: float, v: float) -> NDArray[np.float64]:
-    """Distance of a point from squares of side 1."""
-    du = np.maximum(np.maximum(cols - u, u - cols - 1.0), 0.0)
-    dv = np.maximum(np.maximum(rows - v, v - rows - 1.0), 0.0)
-    distance: NDArray[np.float64] = np.hypot(du, dv)
-    return distance
+def _from_squares(
+    cols: NDArray[np.float64], rows: NDArray[np.float64], line: Sequence[float]
+) -> NDArray[np.float64]:
+    """Distances of a line, from one (u, v) to another, from squares of side 1 whose north-west corners are these.
 
-
-Line = tuple[float, float, float, float]
-
-
-def _to_line(u: NDArray[np.float64], v: NDArray[np.float64], line: Line) -> NDArray[np.float64]:
-    """Distance of points from a line between two others."""
+    Along a line the distance from a square is convex. It is least at an end, where the line passes a border of the
+    square's row or column, or where it is nearest to a corner; so the least of all these is the distance.
+    """
     u0, v0, u1, v1 = line
     du, dv = u1 - u0, v1 - v0
-    t = np.clip(((u - u0) * du + (v - v0) * dv) / (du * du + dv * dv), 0.0, 1.0)
-    distance: NDArray[np.float64] = np.hypot(u - u0 - t * du, v - v0 - t * dv)
-    return distance
-
-
-def _crossed(cols: NDArray[np.float64], rows: NDArray[np.float64], line: Line) -> NDArray[np.bool_]:
-    """Which squares of side 1 a line enters."""
-    u0, v0, u1, v1 = line
-    enter = np.zeros(np.broadcast_shapes(cols.shape, rows.shape))
-    leave = np.ones_like(enter)
-    for low, start, step in ((cols, u0, u1 - u0), (rows, v0, v1 - v0)):
-        if abs(step) < _LEAST:
-            missed = (start < low) | (start > low + 1.0)
-            enter = np.where(missed, 2.0, enter)
-        else:
-            one, other = (low - start) / step, (low + 1.0 - start) / step
-            enter = np.maximum(enter, np.minimum(one, other))
-            leave = np.minimum(leave, np.maximum(one, other))
-    crossed: NDArray[np.bool_] = enter <= leave
-    return crossed
+    shares: list[NDArray[np.float64]] = [np.zeros(1), np.ones(1)]
+    along = du * du + dv * dv
+    if along > 0.0:  # the square of a tiny length is 0
+        shares += [((cols + e - u0) * du + (rows + s - v0) * dv) / along for e in (0, 1) for s in (0, 1)]
+    for low, start, step in ((cols, u0, du), (rows, v0, dv)):
+        if abs(step) > _LEAST:
+            shares += [(low - start) / step, (low + 1.0 - start) / step]
+    nearest = np.full((rows.size, cols.size), np.inf)
+    for share in shares:
+        t = share.clip(0.0, 1.0)
+        u, v = u0 + t * du, v0 + t * dv
+        east, south = np.maximum(cols - u, u - cols - 1.0), np.maximum(rows - v, v - rows - 1.0)
+        np.minimum(nearest, np.hypot(east.clip(0.0), south.clip(0.0)), out=nearest)
+    return nearest

@@ -15,7 +15,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with, tick_phase
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
-from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, MemoryPromiseStore, PromiseStore
+from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, PromiseStore
 from vehicle_agent.service import AgentService
 
 
@@ -30,7 +30,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     if setup.takes_over and setup.health is not None:
         setup.health.starts(LIFE_BEFORE)
     store: PromiseStore = (
-        MemoryPromiseStore(secrets.randbits(60))
+        PromiseStore(secrets.randbits(60))
         if setup.run_dir is None
         else FilePromiseStore(setup.run_dir / f"promises-{setup.id}", waits=setup.takes_over)
     )

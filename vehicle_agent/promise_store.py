@@ -8,7 +8,6 @@ import fcntl
 import os
 import secrets
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 
@@ -31,27 +30,6 @@ class _Record(msgspec.Struct, array_like=True):
     table: Table | None = None
 
 
-class PromiseStore(Protocol):
-    """own    of the agent itself
-    saved  plot -> (promised epoch, stored table)
-    ready  whether all that one event can bring will find space. While it will not, nothing may be promised
-
-    `reserve` tries to get the space that is missing, and returns why it cannot.
-    """
-
-    own: OwnRecord
-    saved: dict[int, tuple[int, Table]]
-
-    @property
-    def ready(self) -> bool: ...
-
-    def reserve(self) -> str | None: ...
-
-    def save_own(self, own: OwnRecord) -> None: ...
-
-    def save(self, promised: int, table: Table) -> None: ...
-
-
 PROMISE_STORE = ExternalCalls(
     "store",
     calls={"reserve": str | None, "save_own": None, "save": None},
@@ -60,8 +38,12 @@ PROMISE_STORE = ExternalCalls(
 """What an agent uses of its store."""
 
 
-class MemoryPromiseStore:
-    """Survives a simulated process, not this one."""
+class PromiseStore:
+    """What an agent keeps, here in memory only: it survives a simulated process, not this one.
+
+    own    of the agent itself
+    saved  plot -> (promised epoch, stored table)
+    """
 
     def __init__(self, disk: int) -> None:
         self.own = OwnRecord(disk=disk)
@@ -69,9 +51,11 @@ class MemoryPromiseStore:
 
     @property
     def ready(self) -> bool:
+        """True if all that one event can bring will find space. While it will not, nothing may be promised."""
         return True
 
     def reserve(self) -> str | None:
+        """Tries to get the space that is missing. Returns why it cannot."""
         return None
 
     def save_own(self, own: OwnRecord) -> None:
@@ -81,7 +65,7 @@ class MemoryPromiseStore:
         self.saved[table.plot] = (promised, table)
 
 
-class FilePromiseStore(MemoryPromiseStore):
+class FilePromiseStore(PromiseStore):
     """Appends to a file, and goes over to a spare one with what still counts when it is full. What was written
     survives a kill -9 of the process, not a loss of power: nothing is synced.
 

@@ -1,9 +1,9 @@
-"""The messages in which an agent tells each planner where its chasers are: one per target."""
+"""The messages in which an agent tells where its vehicles are: `Chasers` to each planner, one per target, and `Fleet`
+to all who watch, one per region."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from operator import contains
 
@@ -19,14 +19,6 @@ HEARTBEAT_NS = NS_PER_S
 """A target whose chasers stand still is told of them so often: the planner's lease is five times as long."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Told:
-    """What was last published about a target: its chasers' cells, and when."""
-
-    cells: dict[str, int]
-    at_ns: int
-
-
 class ChasersReport:
     """Makes the messages of one author.
 
@@ -38,8 +30,8 @@ class ChasersReport:
     def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._vehicle_class = vehicle_class
-        self._told: dict[str, _Told] = {}
-        """Target -> what its planner knows, for all targets that have chasers among the vehicles."""
+        self._told: dict[str, tuple[dict[str, int], int]] = {}
+        """Target -> the cells of its chasers that its planner was told last, and when; of all that have chasers."""
 
     def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
         """The messages that are due: of targets that a vehicle has taken or left, whose planner knows a cell that a
@@ -53,11 +45,11 @@ class ChasersReport:
                 chasers.setdefault(target, {})[id] = path
         for target, paths in chasers.items():
             told = self._told.get(target)
-            if told is not None and now_ns - told.at_ns < HEARTBEAT_NS and _holds(told.cells, paths):
+            if told is not None and now_ns - told[1] < HEARTBEAT_NS and _holds(told[0], paths):
                 continue
             cells = {id: path[-1] for id, path in paths.items()}
             if cells:
-                self._told[target] = _Told(cells, now_ns)
+                self._told[target] = cells, now_ns
             else:
                 del self._told[target]
             yield Chasers(
@@ -73,11 +65,6 @@ class ChasersReport:
 def _holds(told: dict[str, int], paths: dict[str, Sequence[int]]) -> bool:
     """Whether what was told is still true: the same vehicles, and each may still reach its cell."""
     return told.keys() == paths.keys() and all(map(contains, map(paths.__getitem__, told), told.values()))
-
-
-# The messages in which an agent publishes where its vehicles are: one per region.
-
-_MOST_TARGETS = NO_TARGET
 
 
 class FleetReport:
@@ -108,7 +95,7 @@ class FleetReport:
         vehicles = [places.vehicles[index] for index in inside]
         at = np.array(inside, np.intp)
         named = [vehicle.target for vehicle in vehicles]
-        first = [*islice(dict.fromkeys(target for target in named if target is not None), _MOST_TARGETS)]
+        first = [*islice(dict.fromkeys(target for target in named if target is not None), NO_TARGET)]
         targets: dict[str | None, int] = {target: number for number, target in enumerate(first)}
         return Fleet(
             author=self._author,

@@ -136,10 +136,10 @@ class RightOfWaySync:
             case Replied(message=Known() as known):
                 self._perform(core.hear_known(known))
             case Appeared(peer=Peer(role="agent") as peer):
-                core.hear_token(peer, up=True)
+                core.host.hear_token(peer, up=True)
                 self._unasked = True
             case Disappeared(peer=Peer(role="agent") as peer):
-                core.hear_token(peer, up=False)
+                core.host.hear_token(peer, up=False)
             case AskEnded(topic=topic) if topic is KNOWN:
                 self._known_ended(now_ns)
             case AskEnded(topic=topic) if topic is TABLE:
@@ -153,7 +153,7 @@ class RightOfWaySync:
         have found their places by each message; they are to be placed before the next."""
         for heard in self._bus.collected(GRANTED):
             assert isinstance(heard.message, Granted)
-            yield self.core.hear_granted(heard.message, self._own_time.at(now_ns))
+            yield self.core.host.hear_granted(heard.message, self._own_time.at(now_ns))
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
         own_ns = self._own_time.tick(now_ns)
@@ -164,7 +164,7 @@ class RightOfWaySync:
             assert isinstance(heard.message, Standing)
             self.core.hear_standing(heard.message, own_ns)
         self._perform(self.core.tick(wishes, own_ns))
-        self._tell_unled(self.core.unled(own_ns), now_ns)
+        self._tell_unled(self.core.host.unled(own_ns), now_ns)
 
     def _tell_unled(self, unled: Mapping[int, str], now_ns: int) -> None:
         self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}

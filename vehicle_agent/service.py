@@ -118,7 +118,7 @@ class AgentService:
     def _has_places(self) -> bool:
         """True if all vehicles stand somewhere that have not left. Those that are added enter as there is space."""
         if self._parts.spawning is not None:
-            return self._right_of_way.core.informed
+            return self._right_of_way.core.host.informed
         return len(self.agent.vehicles.keys() | self._removed) == len(self.agent.plan.vehicle_ids)
 
     def lacks(self) -> list[str]:
@@ -189,7 +189,7 @@ class AgentService:
         for placed in self._right_of_way.take_granted(now_ns):
             self._place(placed)
         if parts.spawning is not None:
-            parts.spawning.tick(self._right_of_way.core.informed, now_ns)
+            parts.spawning.tick(self._right_of_way.core.host.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         places = agent.places

@@ -22,7 +22,7 @@ from swarm.recording.recording import Recording
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED
-from vehicle_agent.promise_store import PROMISE_STORE, MemoryPromiseStore
+from vehicle_agent.promise_store import PROMISE_STORE, PromiseStore
 from vehicle_agent.service import AgentService
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class Node:
         """Of this life."""
         self.bus: MemoryBus | None = None
         self.store: KeeperStore | None = None
-        self.promises: MemoryPromiseStore | None = None
+        self.promises: PromiseStore | None = None
         self.skew_ns = skew_ns
         self.retired = False
         """Whether it never starts again."""
@@ -142,7 +142,7 @@ class Node:
             case "targets":
                 return TargetsService(setup, terrain, truth, bus, post)
             case "agent":
-                self.promises = self.promises or MemoryPromiseStore(self._phase_ns + setup.incarnation)
+                self.promises = self.promises or PromiseStore(self._phase_ns + setup.incarnation)
                 promises = boundary.external(self.promises, PROMISE_STORE)
                 return AgentService(setup, terrain, truth, bus, post, promises)
         raise ValueError(f"no simulation of role {self.spec.role}")

@@ -45,7 +45,7 @@ from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import GIVE_ORDER, MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED, ZONES
-from vehicle_agent.promise_store import MemoryPromiseStore
+from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService
 
 PLAIN = """
@@ -160,7 +160,7 @@ class Lied(SwarmModel):
         agents = [plan.id for plan in plan_agents(scenario)]
         self.target, *others = scenario.target_ids
         planners = [self.target] if run == "plain" else [self.target, *others]
-        self.promises = {id: MemoryPromiseStore(n) for n, id in enumerate(agents, 1)}
+        self.promises = {id: PromiseStore(n) for n, id in enumerate(agents, 1)}
         classes = [each.name for each in scenario.classes]
         names = tuple(dict.fromkeys((*NAMES, *NAMED, *AUTHORS)))
         fuzzer = MessageFuzzer(terrain.grid, seed, names, classes, lambda: self.now_ns)

@@ -25,7 +25,7 @@ from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.promise_store import MemoryPromiseStore
+from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService
 
 SCENARIO = """
@@ -181,7 +181,7 @@ class AgentWorld(SwarmModel):
         super().__init__(links, terrain_of_pace(prior, resolution_m), parse_scenario(scenario))
         self.truth = np.array(self.terrain.ground_s_per_m if truth is None else truth, np.float32)
         self.agents: dict[str, AgentService] = {}
-        self.stores: dict[str, MemoryPromiseStore] = {}
+        self.stores: dict[str, PromiseStore] = {}
         self.planners: dict[str, FakePlanner] = {}
         self.poses: dict[str, TargetPose] = {}
         self.fleets: list[Fleet] = []
@@ -224,7 +224,7 @@ class AgentWorld(SwarmModel):
 
     def start_agent(self, id: str) -> AgentService:
         setup = self.setup("agent", id, self.now_ns)
-        self.stores.setdefault(id, MemoryPromiseStore(len(self.stores) + 1))
+        self.stores.setdefault(id, PromiseStore(len(self.stores) + 1))
         hz = self.scenario.vehicles.tick_hz
         self.agents[id] = self.start(
             f"agent-{id}",

@@ -145,7 +145,7 @@ class Process:
         self.perform(self.rights.hear_stored(stored, self.now_ns))
 
     def hear_granted(self, granted: Granted) -> None:
-        self.place(self.rights.hear_granted(granted, self.now_ns))
+        self.place(self.rights.host.hear_granted(granted, self.now_ns))
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
@@ -178,7 +178,7 @@ class Process:
         twins = [each for each in world.processes if each.agent == self.agent and each is not self]
         up = {Peer("agent", each.agent, id(each)) for each in twins if not world.is_cut(self, each)}
         for peer in up ^ self.tokens:
-            self.rights.hear_token(peer, up=peer in up)
+            self.rights.host.hear_token(peer, up=peer in up)
         self.tokens = up
 
     def drive(self, vehicle: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -94,16 +94,10 @@ class TruthSensor:
         return Sight(seen, self._truth.reshape(-1)[seen])
 
 
-SENSORS: Mapping[str, Callable[[SensorWorld], Sensor]] = {
-    "truth": lambda world: TruthSensor(world.grid, world.truth_s_per_m, world.range_m),
-}
-"""The built-in sensors."""
-
-
 def sensor_of(plugin: Plugin, world: SensorWorld, tell: Tell) -> Sensor:
     """The sensor that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
     if plugin.factory is None:
-        return SENSORS[plugin.named.name](world)
+        return TruthSensor(world.grid, world.truth_s_per_m, world.range_m)
     truth = world.truth_s_per_m.view()
     truth.flags.writeable = False
     world = SensorWorld(world.grid, truth, world.range_m, world.agent, world.seed)

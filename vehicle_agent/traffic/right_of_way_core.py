@@ -14,11 +14,10 @@ from msgspec.structs import replace
 from swarm.config.agents import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
-from swarm.liveness import Peer
-from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
+from swarm.right_of_way.holdings import Place, Tell, Wish
 from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host, first_of
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Standing, Stored, Table
+from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
 from vehicle_agent.traffic.member import Member, MemberAction, Refused
 
 
@@ -51,6 +50,7 @@ class RightOfWay:
     place   tells on which of the cells that it was granted a vehicle of a new life stands
     vehicles  of an agent that is not in `spawns`, a guest: it has no seat, and its vehicles enter one by one
 
+    host      our part as a host of vehicles
     holdings  which cells our vehicles hold: none before `begin`
     silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
               our vehicles hold and are granted does not depend on it
@@ -79,29 +79,21 @@ class RightOfWay:
             )
         self.own = own
         self._is_guest = agent not in spawns
-        self._host = Host(plots, agent, vehicles if self._is_guest else spawns[agent], place)
+        self.host = Host(plots, agent, vehicles if self._is_guest else spawns[agent], place)
+        self.holdings = self.host.holdings
         self._spawns = spawns
         self._saved = dict(saved)
         self._members: dict[int, Member] = {}
         self.silent = False
 
-    @property
-    def holdings(self) -> Holdings:
-        return self._host.holdings
-
     # --- beginning a life -----------------------------------------------------------------------------------
-
-    @property
-    def informed(self) -> bool:
-        """Whether we have heard of all plots that may hold cells of ours."""
-        return self._host.informed
 
     @property
     def settled(self) -> bool:
         """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file (a
         guest's nobody notes; it has to hear of its plots), and no later life leaves it to us to say, wherever cells
         of ours are shut, that we have stopped."""
-        noted = self._host.informed if self._is_guest else len(self.own.noted_by) >= len(self._spawns) - 1
+        noted = self.host.informed if self._is_guest else len(self.own.noted_by) >= len(self._spawns) - 1
         return self.holdings.life > 0 and noted and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
@@ -131,7 +123,7 @@ class RightOfWay:
         """An answer to our question."""
         if known.agent not in self._spawns or known.agent == self.agent or known.plot_cells != self.plots.side:
             return []
-        self._host.hear_known(known.agent, known.life, known.plots)
+        self.host.hear_known(known.agent, known.life, known.plots)
         if self.silent or self._is_guest or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
@@ -142,16 +134,12 @@ class RightOfWay:
 
         chance  a random number
         """
-        self._host.hear_known(self.agent, *self._known(self.agent))
-        lives = self._host.begin(self.own.lives, chance)
+        self.host.hear_known(self.agent, *self._known(self.agent))
+        lives = self.host.begin(self.own.lives, chance)
         home = map(self.plots.of, self._spawns.get(self.agent, {}).values())
         self.holdings.watch([plot for plot in home if plot in self.plots.all])
         self.own = replace(self.own, lives=lives)
         return [self.own]
-
-    def hear_token(self, peer: Peer, *, up: bool) -> None:
-        """The liveliness token of another process has risen or fallen."""
-        self._host.hear_token(peer, up=up)
 
     @property
     def _has_quorum(self) -> bool:
@@ -206,10 +194,6 @@ class RightOfWay:
         member = self._member(stored.plot, now_ns)
         return [] if member is None else [*member.hear_stored(stored, now_ns)]
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """A warden's word to us. Returns the vehicles that have found their place."""
-        return self._host.hear_granted(granted, now_ns)
-
     def hear_claim(self, plot: int, epoch: int, now_ns: int) -> list[Action]:
         """Another member asks for our promise: `Save`, then the table to answer with; or nothing."""
         member = self._member(plot, now_ns)
@@ -230,14 +214,10 @@ class RightOfWay:
             actions += member.tick(now_ns)
         if self.holdings.replaced:
             self.holdings.watch(self._known(self.agent)[1])
-        actions += self._host.standings(wishes, now_ns)
-        if self._host.ended_alone(now_ns):
+        actions += self.host.standings(wishes, now_ns)
+        if self.host.ended_alone(now_ns):
             actions.append(AskKnown())
         return actions
-
-    def unled(self, now_ns: int) -> dict[int, str]:
-        """Why vehicles of ours wait: plot -> that no warden of it is heard."""
-        return self._host.unled(now_ns)
 
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is

@@ -475,15 +475,15 @@ def test_whoever_waits_in_a_plot_without_a_warden_says_so() -> None:
     def hear(seq: int, now_ns: int) -> None:
         table = table_of(1, seq, a0=[0])
         table.hosts["a0"] = (life, 1)
-        rights.hear_granted(granted_of(table), now_ns)
+        rights.host.hear_granted(granted_of(table), now_ns)
 
-    assert rights.unled(S) == {}
+    assert rights.host.unled(S) == {}
     hear(1, S)
-    assert rights.unled(3 * S) == {}
-    (sentence,) = rights.unled(4 * S).values()
+    assert rights.host.unled(3 * S) == {}
+    (sentence,) = rights.host.unled(4 * S).values()
     assert all(member in sentence for member in MEMBERS)
     hear(1, 4 * S)  # told again
-    assert rights.unled(5 * S) == {}
+    assert rights.host.unled(5 * S) == {}
 
 
 @pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])
