@@ -1,5 +1,7 @@
-"""The messages in which an agent tells where its vehicles are: `Chasers` to each planner, one per target, and `Fleet`
-to all who watch, one per region."""
+"""The messages in which an agent tells where its vehicles are.
+
+`Chasers` go to each planner, one per target; `Fleet` to all who watch, one per region.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,3 +39,25 @@ def test_a_vehicle_is_in_its_tail_until_it_is_driven_to_the_border(
             motion.turn_back()
         assert motion.cell == (motion.tail if motion.done_m < motion.border_m else motion.head)
         assert motion.at_rest == (motion.tail == motion.head)
+
+
+def test_a_vehicle_that_turns_back_heads_where_it_came_from_over_as_many_metres() -> None:
+    motion = Motion(GRID, 12)
+    motion.set_out(13)  # east
+    motion.advance(0.2, 0.1)
+    motion.turn_back()
+    assert motion.heading_rad == pytest.approx(1.5 * math.pi)
+    assert (motion.head, motion.entering, motion.left_m) == (12, None, pytest.approx(2.0))
+    assert motion.place_m() == pytest.approx((27.0, 25.0))
+    assert motion.advance(1.0, 0.1) == pytest.approx(0.8)
+    assert motion.place_m() == (25.0, 25.0)
+
+
+def test_a_pulled_step_passes_the_border_where_its_own_line_does() -> None:
+    """Its line leads from (2, 2) to a point beside the middle of the cell to the east."""
+    motion = Motion(GRID, 12)
+    motion.set_out(13, (2.4, 3.0))
+    motion.advance(motion.border_m * 0.1, 0.1)
+    east_m, south_m = motion.place_m()
+    assert (east_m, south_m) == pytest.approx((30.0, 27.0))
+    assert motion.length_m == pytest.approx(10.0 * math.hypot(1.0, 0.4))  # it has no bend

@@ -17,6 +17,7 @@ from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 GRID = GridSpec(1100, 1100, 1.0)
 AGENTS = ["a0", "a1", "a2"]
+FIVE = [f"a{n}" for n in range(5)]
 SPAWNS = {agent: {f"{agent}-00": 9 * n} for n, agent in enumerate(AGENTS)}
 WIDE = 2 * REGION_CELLS
 
@@ -81,3 +82,17 @@ def test_every_process_says_how_large_plots_are() -> None:
     scenario = parse_scenario("[[targets]]\n[[groups]]\n[map]\nplot_regions = 3\n")
     info = RoleSetup(scenario, "r", "planner", "t0", 1, 0).info(GRID, "digest")
     assert info.plot_cells == 3 * REGION_CELLS
+
+
+def test_members_are_the_same_in_every_process_and_spread_over_the_agents() -> None:
+    grid = GridSpec(1000, 1000, 1.0)
+    plots, others = Plots(grid, FIVE), Plots(grid, FIVE[::-1])
+    counts = dict.fromkeys(FIVE, 0)
+    for plot in range(plots.count):
+        assert plots.members(plot) == others.members(plot)
+        assert len(set(plots.members(plot))) == 3
+        for member in plots.members(plot):
+            counts[member] += 1
+    assert min(counts.values()) > plots.count // 3
+    assert Plots(grid, ["a0", "a1"]).members(7) in (("a0",), ("a1",))
+    assert plots.of(-1) == plots.of(grid.cells) == -1

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.vehicle_states import record, table
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -247,3 +249,45 @@ def test_whatever_happens_the_state_tells_what_is_so_and_it_never_gives_up(happe
     vehicle.regain_planner(end_ns)
     vehicle.set_in_reach(False)
     assert any(vehicle.route_request(end_ns + wait * S, vehicle.cell) for wait in range(10))
+
+
+def random_call(vehicle: Vehicle, chance: random.Random) -> None:
+    """One thing happens to a vehicle that its agent may let happen."""
+    target, asked, flag = vehicle.target, vehicle.asked, chance.random() < 0.5
+    route = GivenRoute(
+        chance.choice("ab"),
+        chance.choice([(11, 12, 13), (50, 51), (11,)]),
+        1.0,
+        1.0,
+        False,
+        flag,
+        chance.random() < 0.3,
+    )
+    status = chance.choice([RouteStatus.UNREACHABLE, RouteStatus.NO_TARGET])
+    calls: list[tuple[bool, Callable[[], object]]] = [
+        (True, lambda: vehicle.assign(chance.choice("ab"), 0)),
+        (True, lambda: vehicle.set_tracked(flag)),
+        (True, vehicle.no_way),
+        (target is not None, vehicle.release),
+        (target is not None and not vehicle.planner_gone, lambda: vehicle.lose_planner(0)),
+        (target is not None, lambda: vehicle.regain_planner(0)),
+        (target is not None, lambda: vehicle.set_in_reach(flag)),
+        (target is not None, lambda: vehicle.target_jumped(0)),
+        (True, lambda: vehicle.route_request(10 * S, vehicle.cell)),
+        (flag or asked is not None, lambda: vehicle.give_route(route, [11], 0)),
+        *[(asked is not None, lambda: vehicle.refuse_route(asked or "", status, 0))] * 3,
+        *[(asked is not None, lambda: vehicle.no_answer(0))] * 3,
+        (vehicle.route.left > 0, lambda: vehicle.route.cut(lambda cells: 0) and vehicle.cut_route(0)),
+        (vehicle.route.left > 0 and not vehicle.in_reach, lambda: vehicle.blocked_for_long(0)),
+        *[(vehicle.route.left > 0, lambda: [vehicle.route.moved(cell) for cell in vehicle.route.ahead()])] * 3,
+    ]
+    chance.choice([call for may, call in calls if may])()
+
+
+def test_the_table_of_transitions_has_all_that_vehicles_can_make_and_no_other(monkeypatch) -> None:
+    made = record(monkeypatch)
+    for seed in range(5000):
+        chance, vehicle = random.Random(seed), Vehicle("v", GRID, 11)
+        for _ in range(60):
+            random_call(vehicle, chance)
+    assert made == table()

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from swarm.clock import NS_PER_S
+import msgspec
+from support.plot_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table_of
+
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.lock_regions import Plots
-from swarm.wire.messages.traffic import Known, KnownRequest, Table
+from swarm.wire.messages.traffic import Known, KnownRequest, Shut, Table
 from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
-AGENTS = ["a0", "a1", "a2"]
-PLOTS = Plots(GridSpec(8, 8, 1.0), AGENTS)
-SPAWNS = {agent: {f"{agent}-00": 9 * n} for n, agent in enumerate(AGENTS)}
-S = NS_PER_S
+THREE = ["a0", "a1", "a2"]
+PLOTS_OF_THREE = Plots(GridSpec(8, 8, 1.0), THREE)
+SPAWNS = {agent: {f"{agent}-00": 9 * n} for n, agent in enumerate(THREE)}
 
 
 def member() -> RightOfWay:
-    own = OwnRecord(disk=1, lives=[1], noted_by=[agent for agent in AGENTS if agent != "a0"])
-    return RightOfWay("a0", PLOTS, SPAWNS, own, {})
+    own = OwnRecord(disk=1, lives=[1], noted_by=[agent for agent in THREE if agent != "a0"])
+    return RightOfWay("a0", PLOTS_OF_THREE, SPAWNS, own, {})
 
 
 def test_a_silent_member_says_nothing_and_remembers_nothing_that_is_not_on_file() -> None:
     rights = member()
     rights.silent = True
-    epoch = next(n for n in range(1, 9) if PLOTS.warden(0, n) == "a1")
+    epoch = next(n for n in range(1, 9) if PLOTS_OF_THREE.warden(0, n) == "a1")
     table = Table(plot=0, agent="a1", epoch=epoch, seq=1, hosts={}, grants={})
     assert rights.hear_claim(0, epoch, 5 * S) == []
     assert rights.hear_table(table, 5 * S) == []
@@ -60,3 +61,44 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
             if isinstance(action, Tell):
                 rights.hear_standing(action.standing, tick * S // 10)
     return said
+
+
+def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> None:
+    """Nobody else can: the later life has another file. It had left that plot long ago."""
+    table = msgspec.structs.replace(table_of(1, 1), shut=[Shut("a4", 1 << 32, [9])])
+    member = rights_of(MEMBERS[0], {0: (1, table)})
+    (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
+    assert isinstance(known, Known)
+    assert known.plots == [0]
+    older = rights_of("a4")
+    older.begin(0)
+    for name in AGENTS[:4]:
+        older.hear_known(Known(agent=name, disk=7, life=0, plots=[]))
+    assert older.settled
+    older.holdings.plots.clear()
+    older.holdings.replaced = True
+    assert not older.settled  # so it is asked again what is known of it
+    older.hear_known(known)
+    (told,) = older.tick({}, S)
+    assert isinstance(told, Tell)
+    said = told.standing
+    assert (said.plot, said.ended) == (0, True)
+
+
+def test_whoever_waits_in_a_plot_without_a_warden_says_so() -> None:
+    rights = rights_of("a0")
+    rights.begin(0)
+    life = rights.holdings.life
+
+    def hear(seq: int, now_ns: int) -> None:
+        table = table_of(1, seq, a0=[0])
+        table.hosts["a0"] = (life, 1)
+        rights.host.hear_granted(granted_of(table), now_ns)
+
+    assert rights.host.unled(S) == {}
+    hear(1, S)
+    assert rights.host.unled(3 * S) == {}
+    (sentence,) = rights.host.unled(4 * S).values()
+    assert all(member in sentence for member in MEMBERS)
+    hear(1, 4 * S)  # told again
+    assert rights.host.unled(5 * S) == {}

@@ -144,3 +144,18 @@ def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int
     back = [climb.allows(each, here) for each in wants]
     assert sorted(wants) == sorted(steering.steps(here))
     assert back == sorted(back, reverse=True)
+
+
+@given(st.integers(0, 1 << 32), st.booleans(), st.floats(0.0, 0.4))
+def test_steps_of_a_route_around_corners_are_judged_together_as_they_are_one_by_one(
+    seed: int, corners: bool, share: float
+) -> None:
+    chance = random.Random(seed)
+    pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
+    rules = PlannerConfig(corner_cutting=corners)
+    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, Bodies(GRID))
+    cells = [chance.randrange(GRID.cells)]
+    for _ in range(chance.randint(0, 20)):
+        cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))
+    one_by_one = [steering.passable(tail, head) for tail, head in pairwise(cells)]
+    assert steering.passable_steps(cells) == [*one_by_one, False].index(False)

@@ -1,0 +1,55 @@
+"""What members, wardens and hosts of one plot say in tests: plot 0 of a grid of 8 x 8 cells, and five agents."""
+
+from __future__ import annotations
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.lock_regions import Plots
+from swarm.wire.messages.traffic import Grant, Granted, Stand, Standing, Table
+from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
+
+GRID = GridSpec(8, 8, 1.0)
+AGENTS = [f"a{n}" for n in range(5)]
+PLOTS = Plots(GRID, AGENTS)
+MEMBERS = PLOTS.members(0)
+S = NS_PER_S
+
+
+def table_of(epoch: int, seq: int, **grants: list[int]) -> Table:
+    """Vehicles are named by their host: a0=[5] is the vehicle a0-00 on cell 5."""
+    held = {f"{host}-00": Grant(cells, (epoch, seq)) for host, cells in grants.items()}
+    hosts = dict.fromkeys(grants, (1, seq))
+    return Table(plot=0, agent=PLOTS.warden(0, epoch), epoch=epoch, seq=seq, hosts=hosts, grants=held)
+
+
+def standing(host: str, cells: list[int], seq: int, knows: tuple[int, int] = (0, 0), **more: object) -> Standing:
+    stand = Stand(f"{host}-00", cells[0], cells[-1], cells, [], [], 0, 0)
+    fields = {"life": 1, "vehicles": [stand], **more}
+    return Standing(plot=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
+
+
+def holdings_of() -> Holdings:
+    holdings = Holdings(PLOTS, "a0", ["a0-00"])
+    holdings.begin(1, [])
+    holdings.watch([0])
+    return holdings
+
+
+def granted_of(table: Table, host: str = "a0") -> Granted:
+    """What a table says to one host."""
+    life, heard = table.hosts.get(host, (0, 0))
+    grants = {vehicle: grant.cells for vehicle, grant in table.grants.items() if vehicle.startswith(host)}
+    return Granted(
+        plot=table.plot, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, life=life, heard=heard,
+        grants=grants,
+    )  # fmt: skip
+
+
+def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
+    holdings.hear_granted(granted_of(table), lambda vehicle, cells: cells[0], now_ns)
+
+
+def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
+    spawns = {name: {f"{name}-00": n} for n, name in enumerate(AGENTS)}
+    return RightOfWay(agent, PLOTS, spawns, OwnRecord(disk=7), saved or {})

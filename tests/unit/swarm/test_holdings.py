@@ -1,0 +1,100 @@
+"""What a host holds by what wardens grant, and what it asks for."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from support.plot_tables import (
+    GRID,
+    MEMBERS,
+    PLOTS,
+    S,
+    granted_of,
+    hear,
+    holdings_of,
+    table_of,
+)
+
+from swarm.right_of_way.holdings import Wish
+from swarm.right_of_way.incarnations import BEAT_NS
+from swarm.wire.topics import STANDING
+
+
+def test_no_word_of_one_life_hides_that_of_another() -> None:
+    """Both are heard under one key; what says that an older one has ended is said by no other."""
+    assert not STANDING.newest
+
+
+def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
+    holdings = holdings_of()
+    far = 3 * ((1 << 40) + 1)
+    for lie in (table_of(far, 1, a0=[9]), table_of(1, 1 << 40, a0=[9])):
+        hear(holdings, lie, S)
+        assert "implausibly far ahead" in holdings.refused.pop()
+        assert holdings.heard_ns(0) == 0
+    hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
+    assert (list(holdings.path("a0-00")), holdings.heard_ns(0)) == ([9], 2 * S)
+
+
+def test_a_life_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
+    holdings = holdings_of()
+    younger = msgspec.structs.replace(granted_of(table_of(1, 1, a0=[9])), life=2)
+    holdings.hear_granted(younger, lambda vehicle, cells: cells[0], S)
+    assert holdings.replaced
+    hear(holdings, table_of(1, 2, a0=[9]), S)
+    assert list(holdings.path("a0-00")) == []
+
+
+def test_a_host_takes_what_follows_its_path() -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=[9]))
+    assert list(holdings.path("a0-00")) == [9]
+    hear(holdings, table_of(1, 2, a0=[9, 10, 20]))
+    assert list(holdings.path("a0-00")) == [9, 10]  # 20 does not follow
+
+
+def test_a_cell_given_back_is_not_asked_for_before_the_table_shows_that_it_is_free() -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=[9]))
+    hear(holdings, table_of(1, 2, a0=[9, 10, 11]))
+    holdings.give_back("a0-00")
+    wishes = {"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}
+    (told,) = holdings.standings(wishes, S)
+    said = told.standing
+    assert holdings.standings(wishes, S + BEAT_NS - 1) == []  # nothing new
+    assert len(holdings.standings(wishes, S + BEAT_NS)) == 1
+    assert (said.vehicles[0].holds, said.vehicles[0].ahead, said.vehicles[0].wants) == ([9], [], [17, 1])
+    hear(holdings, table_of(1, 3, a0=[9]))
+    (told,) = holdings.standings(wishes, S + BEAT_NS)
+    said = told.standing
+    assert (said.vehicles[0].ahead, said.vehicles[0].wants) == ([10, 11], [10, 17, 1])
+
+
+def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
+    holdings = holdings_of()
+    table = table_of(1, 1, a0=[9])
+    table.hosts["a0"] = (2, 1)
+    hear(holdings, table)
+    assert holdings.replaced
+    assert list(holdings.path("a0-00")) == []
+    assert all(told.standing.ended for told in holdings.standings({}, S))
+
+
+def test_a_host_speaks_to_the_warden_that_it_hears_and_else_to_all_members() -> None:
+    holdings = holdings_of()
+    assert [told.members for told in holdings.standings({}, S)] == [MEMBERS]
+    hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
+    assert [told.members for told in holdings.standings({}, 2 * S)] == [(PLOTS.warden(0, 1),)]
+    hear(holdings, table_of(1, 1, a0=[9]), 3 * S)  # told again
+    assert [told.members for told in holdings.standings({}, 3 * S)] == [(PLOTS.warden(0, 1),)]
+    assert [told.members for told in holdings.standings({}, 4 * S)] == [MEMBERS]
+    hear(holdings, table_of(0, 9, a0=[9]), 5 * S)  # of one that was replaced
+    assert [told.members for told in holdings.standings({}, 5 * S)] == [MEMBERS]
+
+
+@pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])
+def test_cells_from_nowhere_are_not_driven_to(lie: list[int]) -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=lie))
+    hear(holdings, table_of(1, 2, a0=[*lie, -16]))
+    assert all(0 <= cell < GRID.cells for cell in holdings.path("a0-00"))
