@@ -226,20 +226,19 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
 
 def lines_of(alarms: Iterable[Alarm], grid: GridSpec, most: int) -> list[str]:
     """Alarms in lines for people, and how many lines are left out."""
-    found: list[str] = []
-    for group in grouped(alarms):
-        found += [together(group)] if len(group) > 1 else [alarm.line(grid) for alarm in group]
+    found = [line for line, _ in grouped(alarms, grid)]
     return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
 
 
-def grouped(alarms: Iterable[Alarm]) -> list[list[Alarm]]:
-    """Alarms that people should read as one: many of a kind, all over or all not; others each alone."""
+def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[Alarm]]]:
+    """Lines for people, and the alarms of each: many of a kind, all over or all not, are in one line."""
     kinds: dict[tuple[str, bool], list[Alarm]] = {}
     for alarm in alarms:
         kinds.setdefault((alarm.kind, alarm.lasts), []).append(alarm)
-    found: list[list[Alarm]] = []
+    found: list[tuple[str, list[Alarm]]] = []
     for of_kind in kinds.values():
-        found += [of_kind] if len(of_kind) > _SAID_SINGLY else [[alarm] for alarm in of_kind]
+        many = len(of_kind) > _SAID_SINGLY
+        found += [(together(of_kind), of_kind)] if many else [(each.line(grid), [each]) for each in of_kind]
     return found
 
 

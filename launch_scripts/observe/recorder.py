@@ -284,15 +284,8 @@ class Recorder(RunFigures):
         ]
 
     def _gap(self) -> dict[str, float | None]:
-        """Driven cost over optimum, as the planners measured it.
-
-        `gap_excess` counts gap - 1, which tells 1.002 from 1.01; `gap` itself has buckets of 4 %.
-        """
-        fine, coarse = self.observed.histogram("gap_excess"), self.observed.histogram("gap")
-        if fine.count:
-            gap = of_excess(fine)
-        else:
-            gap = {"mean": coarse.mean(), "p95": coarse.quantile(0.95), "max": coarse.quantile(1.0)}
+        """Driven cost over optimum, as the planners measured it."""
+        gap = of_excess(self.observed.histogram("gap_excess"))
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 

@@ -273,27 +273,21 @@ def _column(layer: Layer, name: str, kind: FieldKind, default: Value) -> NDArray
 
 
 def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
-    """A row per point, with metres of the map, and degrees where it has a place. What has no time or other value of
-    each of its points is one row, with its shape as WKT, longitude first."""
+    """A row per point, with metres of the map, and degrees where it has a place. An area, and a line without times,
+    is one row, with its shape as WKT, longitude first."""
+    layer = _places_of(layer) if _is_timed(layer) else layer
     placed = frame.grid.crs != "local"
-    whole = layer.shape == "Polygon" or (layer.shape == "LineString" and not _is_timed(layer))
-    own = list(layer.fields) if whole else [name for name in layer.fields if name not in TIMED]
-    timed = ["at"] if not whole and (_is_timed(layer) or "begins" in layer.fields) else []
-    where = ["wkt"] if whole else ["x_m", "y_m", *(["lat", "lon"] if placed else [])]
+    names, where = ["wkt"], [[_wkt(layer, each, frame)] for each in layer.features if layer.shape != "Point"]
+    if layer.shape == "Point":
+        points = np.concatenate([np.empty((0, 2)), *(each.parts[0][:, :2] for each in layer.features)])
+        degrees = _placed(points, frame)[:, ::-1].round(8) if placed else np.empty((len(points), 0))
+        names = ["x_m", "y_m", *(["lat", "lon"] if placed else [])]
+        where = [[*xy, *lat_lon] for xy, lat_lon in zip(points.round(3).tolist(), degrees.tolist(), strict=True)]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*own, *timed, *where])
-        for feature in layer.features:
-            values = [_cell(feature.values[name]) for name in own]
-            if whole:
-                writer.writerow([*values, _wkt(layer, feature, frame)])
-                continue
-            begins = feature.values.get("begins")
-            times = [begins] if feature.time_ns is None else map(moment, feature.time_ns)
-            (part,) = feature.parts
-            degrees = _placed(part, frame).round(8) if placed else np.empty((len(part), 0))
-            for at, (x_m, y_m, *_), lon_lat in zip(times, part.round(3).tolist(), degrees.tolist(), strict=True):
-                writer.writerow([*values, *([_cell(at)] if timed else []), x_m, y_m, *lon_lat[1::-1]])
+        writer.writerow([*layer.fields, *names])
+        for feature, place in zip(layer.features, where, strict=True):
+            writer.writerow([*(_cell(feature.values[name]) for name in layer.fields), *place])
 
 
 def _wkt(layer: Layer, feature: Feature, frame: MapFrame) -> str:

@@ -124,6 +124,7 @@ def mark_layer(
     stamps_ns  int64 (rows, cols), UNIX time of the mark
     """
     from rasterio.features import rasterize
+    from scipy import ndimage
 
     layer = Layer(
         "marks", "Polygon",
@@ -140,21 +141,20 @@ def mark_layer(
         return layer
     shapes = [({"type": "Polygon", "coordinates": rings}, n) for n, (_, rings) in enumerate(areas, 1)]
     numbers = rasterize(shapes, kinds.shape, transform=transform_of(grid), dtype=np.int32)
-    flat, inside = numbers.reshape(-1), np.flatnonzero(numbers)
-    many = len(areas) + 1
-    cells = np.bincount(flat, minlength=many)
-    oldest, newest = np.full(many, np.iinfo(np.int64).max), np.zeros(many, np.int64)
-    np.minimum.at(oldest, flat[inside], stamps_ns.reshape(-1)[inside])
-    np.maximum.at(newest, flat[inside], stamps_ns.reshape(-1)[inside])
-    pace_sums = np.bincount(flat, weights=np.where(paced, paces, 0).reshape(-1), minlength=many)
-    for number, (code, rings) in enumerate(areas, 1):
+    each = np.arange(1, len(areas) + 1)
+    cells = np.bincount(numbers.reshape(-1), minlength=len(areas) + 1)[1:].tolist()
+    oldest, newest, mean = (
+        of(values, numbers, each)
+        for of, values in ((ndimage.minimum, stamps_ns), (ndimage.maximum, stamps_ns), (ndimage.mean, paces))
+    )
+    for n, (code, rings) in enumerate(areas):
         values: dict[str, Value] = {
             "kind": "lethal" if code == 1 else "pace",
-            "pace_s_per_m": None if code == 1 else float(f"{pace_sums[number] / cells[number]:.4g}"),
-            "cells": int(cells[number]),
-            "area_m2": round(float(cells[number]) * grid.resolution_m**2, 3),
-            "oldest": moment(oldest[number]),
-            "newest": moment(newest[number]),
+            "pace_s_per_m": None if code == 1 else float(f"{mean[n]:.4g}"),
+            "cells": cells[n],
+            "area_m2": round(cells[n] * grid.resolution_m**2, 3),
+            "oldest": moment(oldest[n]),
+            "newest": moment(newest[n]),
         }
         layer.features.append(Feature(rings, values))
     return layer

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from launch_scripts.observe.counts import percent
-from launch_scripts.observe.facts import count, grouped, together
+from launch_scripts.observe.facts import count, grouped
 from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
@@ -124,10 +124,8 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
         for row in report.get("alarms") or []
     ]  # fmt: skip
     groups = [
-        (together(group), group[0].serious, [alarm.line(grid) for alarm in group])
-        if len(group) > 1
-        else (group[0].line(grid), group[0].serious, [])
-        for group in grouped(told)
+        (line, alarms[0].serious, [each.line(grid) for each in alarms] if len(alarms) > 1 else [])
+        for line, alarms in grouped(told, grid)
     ]
     return sorted(groups, key=lambda group: not group[1])
 

@@ -129,9 +129,8 @@ def csv_of(section: str, report: Mapping[str, Any]) -> bytes:
     rows = [flat(id, row) for id, row in report[section].items()]
     columns = list(dict.fromkeys(name for row in rows for name in row))
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([TABLES[section][1], *columns[1:]])
-    writer.writerows([row.get(name) for name in columns] for row in rows)
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writerows([{**dict(zip(columns, columns, strict=True)), "id": TABLES[section][1]}, *rows])
     return file.getvalue().encode()
 
 
