@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from skimage.graph import MCP_Geometric
 
+from launch_scripts.observe.recorder import Recorder
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
@@ -16,7 +18,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import STEP_COL, STEP_ROW, TILE_CELLS, walk
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, GAPS_TO, Counters
-from swarm.wire.fields import pack_column
+from swarm.wire.fields import column, pack_column
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
@@ -220,3 +222,19 @@ def _stats(role: str, id: str, counters: Counters, now_ns: int) -> Stats:
             for name, each in counters.histograms_by.items()
         },
     )  # fmt: skip
+
+
+def played(
+    terrain: Terrain, truth: NDArray[np.float32], scenario: Scenario, began_ns: int = 0, hz: float = 2.0
+) -> Recorder:
+    """The recorder of a fake run which began then: it has heard all of it."""
+    recorder = Recorder(scenario, terrain.grid)
+    for now_ns, told in fake_run(terrain, truth, scenario, hz):
+        if isinstance(told, Peer):
+            recorder.alive(told, True, began_ns + now_ns)
+            continue
+        if isinstance(told, MarkSet):
+            stamps_ns = pack_column(column(told.stamps_ns, "<i8") + began_ns, "<i8")
+            told = msgspec.structs.replace(told, stamps_ns=stamps_ns)
+        recorder.heard(told, began_ns + now_ns)
+    return recorder

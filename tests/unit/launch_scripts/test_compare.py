@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.command import Swarm
 
-from launch_scripts.cli import main
 from launch_scripts.launcher.console import REPORTED
 from launch_scripts.report.compare import LeftRun, circumstances_that_differ, figures, settings_that_differ
 from swarm.config.load import parse_scenario
@@ -65,24 +65,14 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def compare(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
-    monkeypatch.setattr("sys.argv", ["swarm", "compare", *words])
-    try:
-        return main()
-    except SystemExit as ended:
-        return int(str(ended.code or 0))
-
-
-def test_the_command_shows_settings_and_figures(
-    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert compare(monkeypatch, "r1", str(runs / "r2"), "--runs", str(runs)) == 0
-    told = [line.replace("│", "").split() for line in capsys.readouterr().out.splitlines()]
+def test_the_command_shows_settings_and_figures(runs: Path, swarm: Swarm) -> None:
+    code, out, _ = swarm("compare r1 --runs", runs, runs / "r2")
+    assert code == 0
+    told = [line.replace("│", "").split() for line in out.splitlines()]
     assert ["seed", "1", "2"] in told
     assert ["certified", "gap,", "mean", "5.00%", "5.00%"] in told
     assert ["captures", "1", "2"] in told
-    assert compare(monkeypatch, "r1", "r2", "--runs", str(runs), "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(swarm("compare r1 r2 --json --runs", runs)[1])
     assert found["scenario"] == {"seed": [1, 2]}
     assert found["figures"]["certified gap, mean"] == [1.05, 1.05]
 
@@ -99,26 +89,19 @@ def test_the_command_shows_settings_and_figures(
     ],
 )
 def test_damaged_files_are_one_sentence(
-    runs: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    file: str,
-    content: bytes | None,
-    sentence: str,
+    runs: Path, swarm: Swarm, file: str, content: bytes | None, sentence: str
 ) -> None:
     damaged = runs / "r2" / file
     if content is None:
         damaged.unlink()
     else:
         damaged.write_bytes(content)
-    assert compare(monkeypatch, "r1", "r2", "--runs", str(runs)) != 0
-    (line,) = capsys.readouterr().err.splitlines()
-    assert re.search(sentence, line), line
+    code, _, told = swarm("compare r1 r2 --runs", runs)
+    assert (code > 0, told.count("\n")) == (True, 1)
+    assert re.search(sentence, told), told
 
 
-def test_figures_that_are_none_of_ours_end_no_comparison(
-    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_figures_that_are_none_of_ours_end_no_comparison(runs: Path, swarm: Swarm) -> None:
     strange = {
         "captures": {"a": [1]},
         "certified_gap": {"mean": "[red]x", "max": True},
@@ -127,5 +110,5 @@ def test_figures_that_are_none_of_ours_end_no_comparison(
         "made": {"versions": [1]},
     }
     (runs / "r2" / "report.json").write_text(json.dumps(strange))
-    assert compare(monkeypatch, "r1", "r2", "--runs", str(runs)) == 0
-    assert "[red]x" in capsys.readouterr().out
+    code, out, _ = swarm("compare r1 r2 --runs", runs)
+    assert (code, "[red]x" in out) == (0, True)

@@ -6,12 +6,10 @@ import dataclasses
 import itertools
 import json
 import math
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,11 +17,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from support.fake_run import fake_run
+from support.command import Swarm
+from support.fake_run import played
 
-from launch_scripts.cli import main
 from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
-from launch_scripts.observe.recorder import Recorder
+from launch_scripts.report.mcap_export import export_mcap
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
 from launch_scripts.report.timeline import frame_names, instants_of
 from launch_scripts.report.write_report import make_report, write_report
@@ -31,8 +29,7 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
-from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.processes import Note
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
@@ -53,15 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
     truth = np.array(pace)
     truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    recorder = Recorder(scenario, GRID)
-    for now_ns, told in fake_run(terrain, truth, scenario):
-        if isinstance(told, Peer):
-            recorder.alive(told, True, BEGAN_NS + now_ns)
-        else:
-            if isinstance(told, MarkSet):
-                stamps_ns = np.frombuffer(told.stamps_ns, "<i8") + BEGAN_NS
-                told = msgspec.structs.replace(told, stamps_ns=stamps_ns.tobytes())
-            recorder.heard(told, BEGAN_NS + now_ns)
+    recorder = played(terrain, truth, scenario, BEGAN_NS)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
     recorder.heard(note, BEGAN_NS + 3 * NS_PER_S)
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
@@ -78,8 +67,7 @@ def tracks(run: Path) -> RunTracks:
 @pytest.fixture(scope="module")
 def recording(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
-    with pytest.MonkeyPatch.context() as patched:
-        assert swarm(patched, "export", run, "--mcap", "--out", out) == 0
+    export_mcap(run, out, force=False)
     return out / "r1.mcap"
 
 
@@ -92,14 +80,6 @@ def heard(recording: Path) -> dict[str, list[tuple[int, Any]]]:
         for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
             topics[channel.topic].append((message.log_time, decoded))
     return topics
-
-
-def swarm(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["swarm", *map(str, words)])
-    try:
-        return main()
-    except SystemExit as end:  # of a command that went well
-        return int(end.code or 0)
 
 
 def in_map(xy_m: np.ndarray[Any, np.dtype[np.float64]]) -> list[tuple[float, float]]:
@@ -257,15 +237,13 @@ def test_rosbags_reads_the_same(recording: Path, heard: dict[str, list[tuple[int
     assert many == {topic: len(told) for topic, told in heard.items()}
 
 
-def test_an_older_run_has_no_map_and_says_so(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_older_run_has_no_map_and_says_so(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     old = tmp_path / "old"
     old.mkdir()
     with np.load(run / TRACKS_FILE) as arrays:
         np.savez(old / TRACKS_FILE, **{name: arrays[name] for name in arrays if name != "began_ns"})
-    assert swarm(monkeypatch, "export", old, "--mcap") == 0
-    assert f"no /map: there is no {GROUND_PACE_FILE}" in capsys.readouterr().out
+    code, out, _ = swarm("export --mcap", old)
+    assert (code, f"no /map: there is no {GROUND_PACE_FILE}" in out) == (0, True)
     with (old / "export" / "old.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
         assert summary is not None
@@ -273,7 +251,7 @@ def test_an_older_run_has_no_map_and_says_so(
 
 
 def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Path, tmp_path: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     damaged = tmp_path / "damaged"
     for file, content, complaint in (
@@ -286,28 +264,24 @@ def test_what_cannot_be_exported_is_said_in_a_sentence_and_leaves_no_file(
         damaged.mkdir(exist_ok=True)
         for each in (TRACKS_FILE, GROUND_PACE_FILE, "report.json"):
             (damaged / each).write_bytes(content if each == file else (run / each).read_bytes())
-        assert swarm(monkeypatch, "export", damaged, "--mcap") != 0
-        told = capsys.readouterr().err
-        assert complaint in told
-        assert told.count("\n") == 1
+        code, _, told = swarm("export --mcap", damaged)
+        assert (code > 0, complaint in told, told.count("\n")) == (True, True, 1), told
         assert not list(damaged.rglob("*.mcap*"))
     with monkeypatch.context() as patched:
         patched.setattr("launch_scripts.report.mcap_export.find_spec", lambda name: None)
-        assert swarm(patched, "export", run, "--mcap") == 2
-    assert "--mcap needs mcap and rosbags and xxhash" in (told := capsys.readouterr().err)
+        code, _, told = swarm("export --mcap", run)
+    assert (code, "--mcap needs mcap and rosbags and xxhash" in told) == (2, True)
     assert "pip install 'terrain-swarm[ros2]'" in told
     (tmp_path / "empty").mkdir()
-    assert swarm(monkeypatch, "export", tmp_path / "empty", "--mcap") == 2
-    assert "has no tracks.npz" in capsys.readouterr().err
+    code, _, told = swarm("export --mcap", tmp_path / "empty")
+    assert (code, "has no tracks.npz" in told) == (2, True)
 
 
-def test_no_recording_is_replaced_unless_told(
-    recording: Path, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_recording_is_replaced_unless_told(recording: Path, run: Path, swarm: Swarm) -> None:
     before = recording.read_bytes()
-    assert swarm(monkeypatch, "export", run, "--mcap", "--out", recording.parent) == 2
-    assert "--force replaces it" in capsys.readouterr().err
-    assert swarm(monkeypatch, "export", run, "--mcap", "--out", recording.parent, "--force") == 0
+    code, _, told = swarm("export --mcap", run, "--out", recording.parent)
+    assert (code, "--force replaces it" in told) == (2, True)
+    assert swarm("export --mcap --force", run, "--out", recording.parent)[0] == 0
     assert recording.read_bytes() == before
 
 

@@ -8,6 +8,7 @@ import pickle
 import msgspec
 import numpy as np
 import pytest
+from support.map_strategies import set_of
 
 from launch_scripts.launcher.tables import plain_line
 from launch_scripts.observe import facts
@@ -25,7 +26,7 @@ from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET, pack_column
 from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
@@ -134,21 +135,6 @@ def status(target: str, gap_max: float | None, following: int = 1) -> PlannerSta
         gap_mean=gap_max,
         gap_p95=gap_max,
         gap_max=gap_max,
-    )
-
-
-def marks(author: str, seq: int, statements: dict[int, tuple[MarkKind, float, int]], tile: int = 0) -> MarkSet:
-    cells = sorted(statements)
-    return MarkSet(
-        author=author,
-        group="all",
-        tile=tile,
-        epoch=1,
-        seq=seq,
-        cells=pack_column(cells, "<u2"),
-        kinds=bytes(int(statements[cell][0]) for cell in cells),
-        paces=pack_column([statements[cell][1] for cell in cells], "<f4"),
-        stamps_ns=pack_column([statements[cell][2] for cell in cells], "<i8"),
     )
 
 
@@ -286,8 +272,8 @@ def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> Non
 def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recorder: Recorder) -> None:
     hear(
         recorder,
-        marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10), 40: (MarkKind.LETHAL, 0.0, 10)}),
-        marks("a1.1", 1, {33: (MarkKind.PACE, 0.5, 20), 40: (MarkKind.CLEAR, 0.0, 20)}),
+        set_of("a0.1", 0, 1, {33: (MarkKind.LETHAL, 0.0, 10), 40: (MarkKind.LETHAL, 0.0, 10)}),
+        set_of("a1.1", 0, 1, {33: (MarkKind.PACE, 0.5, 20), 40: (MarkKind.CLEAR, 0.0, 20)}),
     )
     marked = recorder.observed.marked()
     assert marked.cells.tolist() == [1 * GRID.cols + 1]
@@ -297,7 +283,7 @@ def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recor
 
 
 def test_an_authors_older_set_does_not_replace_its_newer_one(recorder: Recorder) -> None:
-    hear(recorder, marks("a0.1", 2, {}), marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10)}))
+    hear(recorder, set_of("a0.1", 0, 2, {}), set_of("a0.1", 0, 1, {33: (MarkKind.LETHAL, 0.0, 10)}))
     assert recorder.observed.marked().cells.tolist() == []
 
 

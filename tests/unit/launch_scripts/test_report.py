@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 from numpy.typing import NDArray
-from support.fake_run import fake_run
+from support import fake_run
 
 from launch_scripts.observe.palette import STATE_COLOURS, STYLE, hillshade
 from launch_scripts.observe.recorder import Recorder
@@ -30,7 +30,6 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
 from swarm.wire.messages.vehicles import VehicleState
 
 ASKED_FOR = (
@@ -71,13 +70,7 @@ def ground() -> tuple[Terrain, NDArray[np.float32]]:
 
 @pytest.fixture(scope="module")
 def played(scenario: Scenario, ground: tuple[Terrain, NDArray[np.float32]]) -> Recorder:
-    recorder = Recorder(scenario, ground[0].grid)
-    for now_ns, told in fake_run(*ground, scenario):
-        if isinstance(told, Peer):
-            recorder.alive(told, True, now_ns)
-        else:
-            recorder.heard(told, now_ns)
-    return recorder
+    return fake_run.played(*ground, scenario)
 
 
 def test_the_report_has_every_number_that_was_asked_for(

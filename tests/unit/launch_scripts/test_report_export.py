@@ -18,10 +18,10 @@ import pytest
 from numpy.typing import NDArray
 from rasterio.features import rasterize
 from rasterio.transform import from_origin
-from support.fake_run import fake_run
+from support.command import Swarm
+from support.fake_run import played
 from support.map_strategies import set_of
 
-from launch_scripts.cli import main
 from launch_scripts.observe.history import BegunRoute
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.exporter import COSTS, in_degrees
@@ -34,7 +34,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import GridSpec, walk
-from swarm.liveness import Peer
 from swarm.wire.messages.map_data import MarkKind
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
@@ -50,13 +49,7 @@ def recorder() -> Recorder:
     terrain = dataclasses.replace(terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0), grid=GRID)
     truth = np.array(terrain.pace_s_per_m)
     truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    recorder = Recorder(scenario, GRID)
-    for now_ns, told in fake_run(terrain, truth, scenario):
-        if isinstance(told, Peer):
-            recorder.alive(told, True, BEGAN_NS + now_ns)
-        else:
-            recorder.heard(told, BEGAN_NS + now_ns)
-    return recorder
+    return played(terrain, truth, scenario, BEGAN_NS)
 
 
 @pytest.fixture(scope="module")
@@ -76,14 +69,6 @@ def run(recorder: Recorder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def swarm(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["swarm", *map(str, words)])
-    try:
-        return main()
-    except SystemExit as end:  # of a command that went well
-        return int(end.code or 0)
-
-
 def read_layers(folder: Path) -> dict[str, list[Any]]:
     return {
         path.stem.partition("-")[2]: json.loads(path.read_text())["features"] for path in folder.glob("*.geojson")
@@ -94,11 +79,10 @@ def test_a_geojson_has_every_place_and_time_in_wgs84(
     run: Path,
     recorder: Recorder,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    swarm: Swarm,
 ) -> None:
-    assert swarm(monkeypatch, "export", run.name, "--runs", run.parent, "--out", tmp_path) == 0
-    assert "4 vehicle_tracks" in capsys.readouterr().out
+    code, out, _ = swarm(f"export {run.name} --runs", run.parent, "--out", tmp_path)
+    assert (code, "4 vehicle_tracks" in out) == (0, True)
     layers = read_layers(tmp_path)
     assert len(layers["captures"]) == len(recorder.captures) > 0
     lines = recorder.vehicle_tracks.lines()
@@ -148,9 +132,9 @@ def test_what_never_moved_is_a_point_and_no_line_without_a_length(run: Path) -> 
 
 
 def test_a_table_has_a_row_per_place_with_degrees(
-    run: Path, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm
 ) -> None:
-    assert swarm(monkeypatch, "export", run, "--out", tmp_path, "--format", "csv", "--what", "captures") == 0
+    assert swarm("export", run, "--out", tmp_path, "--format", "csv", "--what", "captures")[0] == 0
     (path,) = tmp_path.iterdir()
     rows = list(csv.DictReader(path.open()))
     assert len(rows) == len(recorder.captures)
@@ -162,11 +146,9 @@ def test_a_table_has_a_row_per_place_with_degrees(
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_every_format_holds_all_layers_that_it_can(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
-) -> None:
+def test_every_format_holds_all_layers_that_it_can(run: Path, tmp_path: Path, swarm: Swarm, ending: str) -> None:
     raw = pytest.importorskip("pyogrio.raw", reason="the extra vectors is not installed")
-    assert swarm(monkeypatch, "export", run, "--format", ending, "--out", tmp_path) == 0
+    assert swarm("export", run, "--format", ending, "--out", tmp_path)[0] == 0
     tracks = read_tracks(run / TRACKS_FILE)
     if ending == "csv":
         rows = list(csv.DictReader((tmp_path / f"{run.name}-vehicle_tracks.csv").open()))
@@ -180,7 +162,7 @@ def test_every_format_holds_all_layers_that_it_can(
         found = dict(zip(meta["fields"].tolist(), values, strict=True))
         assert set(found["track_fid"].tolist()) == set(range(len(tracks.vehicles)))
         assert not np.isnat(found["time"]).any()
-        assert swarm(monkeypatch, "export", run, "--format", "gpx", "--what", "marks", "--out", tmp_path) != 0
+        assert swarm("export", run, "--format", "gpx", "--what", "marks", "--out", tmp_path)[0] != 0
         return
     several = ending in ("gpkg", "kml")
     for name in ("vehicle_tracks", "target_tracks", "captures", "routes", "marks"):
@@ -190,19 +172,19 @@ def test_every_format_holds_all_layers_that_it_can(
         assert ending == "gpkg" or meta["crs"] == "EPSG:4326"
 
 
-def test_a_file_with_costs_says_how_they_count(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert swarm(monkeypatch, "export", run, "--what", "routes", "--out", tmp_path) == 0
+def test_a_file_with_costs_says_how_they_count(run: Path, tmp_path: Path, swarm: Swarm) -> None:
+    assert swarm("export", run, "--what", "routes", "--out", tmp_path)[0] == 0
     (path,) = tmp_path.iterdir()
     assert json.loads(path.read_text())["description"] == COSTS
 
 
 def test_without_pyogrio_a_sentence_says_what_to_install_and_tables_are_written(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Path, tmp_path: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyogrio", None)
-    assert swarm(monkeypatch, "export", run, "--what", "captures", "--format", "csv", "--out", tmp_path) == 0
-    assert swarm(monkeypatch, "export", run, "--what", "captures", "--out", tmp_path) == 2
-    assert "pip install 'terrain-swarm[vectors]'" in capsys.readouterr().err
+    assert swarm("export", run, "--what", "captures", "--format", "csv", "--out", tmp_path)[0] == 0
+    code, _, told = swarm("export --what captures", run, "--out", tmp_path)
+    assert (code, "pip install 'terrain-swarm[vectors]'" in told) == (2, True)
 
 
 def test_no_route_that_leaves_the_map_harms_the_others(recorder: Recorder, tmp_path: Path) -> None:
@@ -222,26 +204,24 @@ def test_no_route_that_leaves_the_map_harms_the_others(recorder: Recorder, tmp_p
     ]
 
 
-def test_nothing_is_replaced_unless_asked(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_replaced_unless_asked(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     words = ("export", run, "--out", tmp_path / "new", "--what", "captures")
-    assert swarm(monkeypatch, *words) == 0
+    assert swarm(*words)[0] == 0
     (path,) = (tmp_path / "new").iterdir()
     path.write_text("mine")
-    assert swarm(monkeypatch, *words) == 2
-    assert f"{path} is there already; --force replaces it" in capsys.readouterr().err
+    code, _, told = swarm(*words)
+    assert (code, f"{path} is there already; --force replaces it" in told) == (2, True)
     assert path.read_text() == "mine"
-    assert swarm(monkeypatch, *words, "--force") == 0
+    assert swarm(*words, "--force")[0] == 0
     assert path.read_text() != "mine"
 
 
 def test_another_program_reads_the_same_from_a_geopackage(
-    run: Path, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm
 ) -> None:
     raw = pytest.importorskip("pyogrio.raw", reason="the extra vectors is not installed")
     out = tmp_path / f"{run.name}.gpkg"
-    assert swarm(monkeypatch, "export", run, "--format", "gpkg", "--out", tmp_path) == 0
+    assert swarm("export", run, "--format", "gpkg", "--out", tmp_path)[0] == 0
     tracks = read_tracks(run / TRACKS_FILE)
     meta, _, shapes, values = raw.read(out, layer="vehicle_tracks")
     assert meta["crs"] == "EPSG:32632"
@@ -269,7 +249,7 @@ def test_another_program_reads_the_same_from_a_geopackage(
     assert cells.sum() == len(recorder.observed.marked().cells)
     assert len(raw.read(out, layer="routes")[2]) == len(recorder.routes.kept)
     assert len(raw.read(out, layer="captures")[2]) == len(recorder.captures)
-    assert swarm(monkeypatch, "map", "export", run / "map.sqlite", tmp_path / "marks.gpkg") == 0
+    assert swarm("map", "export", run / "map.sqlite", tmp_path / "marks.gpkg")[0] == 0
     assert len(raw.read(tmp_path / "marks.gpkg", layer="marks")[2]) == 3
 
 
@@ -297,9 +277,7 @@ def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others() -> No
     assert sum(int(each.values["cells"] or 0) for each in layer.features) == (expected > 0).sum()  # type: ignore[arg-type]
 
 
-def test_what_cannot_be_exported_is_said_in_a_sentence(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     (tmp_path / "empty").mkdir()
     for words, complaint in (
         (("nowhere",), "there is no run 'nowhere'"),
@@ -308,10 +286,8 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(
         ((run, "--out", run / TRACKS_FILE), "is a file; expected a folder"),
         ((tmp_path / "empty",), "has no tracks.npz: the run has not ended yet"),
     ):
-        assert swarm(monkeypatch, "export", *words) == 2
-        told = capsys.readouterr().err
-        assert complaint in told
-        assert told.count("\n") == 1
+        code, _, told = swarm("export", *words)
+        assert (code, complaint in told, told.count("\n")) == (2, True, 1), told
     whole = (run / TRACKS_FILE).read_bytes()
     for number, broken in enumerate((b"", b"PK", whole[: len(whole) // 2], whole[:300] + bytes(100) + whole[400:])):
         (tmp_path / f"{number}.npz").write_bytes(broken)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.fake_run import fake_run
+from support.fake_run import played
 
 from launch_scripts.launcher.options import SCENARIOS, find_scenario
 from launch_scripts.observe.latest_state import VehicleColumns
@@ -24,7 +24,6 @@ from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
 from swarm.errors import ConfigError, StoreError
-from swarm.liveness import Peer
 from swarm.wire.messages.vehicles import VehicleState
 
 F, W = VehicleState.FOLLOWING, VehicleState.WAITING
@@ -178,12 +177,7 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recorder]:
     )
     begin_run(folder, scenario, "r1")
     terrain = terrain_of_pace(np.full((24, 32), 0.1, np.float32), 25.0)
-    recorder = Recorder(scenario, terrain.grid)
-    for now_ns, told in fake_run(terrain, terrain.pace_s_per_m, scenario):
-        if isinstance(told, Peer):
-            recorder.alive(told, True, now_ns)
-        else:
-            recorder.heard(told, now_ns)
+    recorder = played(terrain, terrain.pace_s_per_m, scenario)
     write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain)
     return folder, recorder
 

@@ -10,16 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.fake_run import fake_run
+from support.command import Swarm
+from support.fake_run import played
 
-from launch_scripts.cli import main
 from launch_scripts.observe.counts import percent
-from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.load import parse_scenario
 from swarm.config.write import scenario_text
-from swarm.liveness import Peer
 from swarm.wire.messages.processes import Note
 
 HOSTILE = "<script>alert(1)</script>\"'><img src=http://example.org/x onerror=alert(2)>"
@@ -39,12 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     terrain = terrain_of_pace(pace, 25.0)
     truth = np.array(pace)
     truth[14:20, 4:30] = np.inf
-    recorder = Recorder(scenario, terrain.grid)
-    for now_ns, told in fake_run(terrain, truth, scenario):
-        if isinstance(told, Peer):
-            recorder.alive(told, True, now_ns)
-        else:
-            recorder.heard(told, now_ns)
+    recorder = played(terrain, truth, scenario)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
     recorder.heard(note, recorder.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
@@ -121,50 +114,30 @@ def test_certified_gaps_over_time_are_of_the_routes_begun_in_between(run: Path) 
     assert np.nansum((told - 1) * begun) / begun.sum() == pytest.approx(whole["mean"] - 1, rel=1e-3)
 
 
-def swarm(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    monkeypatch.setattr("sys.argv", ["swarm", *map(str, words)])
-    try:
-        return main()
-    except SystemExit as end:
-        return int(str(end.code or 0))
-
-
-def test_the_page_is_written_again_from_the_folder_alone(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_is_written_again_from_the_folder_alone(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     copy = tmp_path / "r1"
     shutil.copytree(run, copy)
     before = (copy / "report.html").read_text()
     (copy / "report.html").unlink()
-    assert swarm(monkeypatch, "report", "r1", "--runs", tmp_path) == 0
+    assert swarm("report r1 --runs", tmp_path)[0] == 0
     assert (copy / "report.html").read_text() == before.replace(f"up {run.parent.name}/", f"up {tmp_path.name}/")
     for content, sentence in ((b"{}", "is damaged"), (b'{"series": 3, "by_vehicle": 7}', "is damaged")):
         (copy / "report.json").write_bytes(content)
-        assert swarm(monkeypatch, "report", "r1", "--runs", tmp_path) != 0
-        (line,) = capsys.readouterr().err.splitlines()
-        assert sentence in line
+        code, _, told = swarm("report r1 --runs", tmp_path)
+        assert (code > 0, told.count("\n"), sentence in told) == (True, 1, True)
 
 
-@pytest.fixture
-def unlike(run: Path, tmp_path: Path) -> tuple[object, ...]:
-    """What compares three runs which differ in seed and terrain."""
+def test_a_comparison_says_first_what_makes_runs_unlike(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     for name, changes in (("r1", {}), ("r2", {"seed": 9}), ("r3", {"terrain": {"digest": "0" * 16}})):
         (tmp_path / name).mkdir()
         report = json.loads((run / "report.json").read_text()) | changes
         (tmp_path / name / "report.json").write_text(json.dumps(report))
         shutil.copy(run / "scenario.toml", tmp_path / name)
-    return "compare", "r1", "r2", "r3", "--runs", tmp_path
-
-
-def test_a_comparison_says_first_what_makes_runs_unlike(
-    unlike: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert swarm(monkeypatch, *unlike) == 0
-    told = capsys.readouterr().out
+    code, told, _ = swarm("compare r1 r2 r3 --runs", tmp_path)
+    assert code == 0
     assert "The terrains differ" in told
     assert "The seeds differ (3, 9, 3)" in told
     (tmp_path / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
-    assert swarm(monkeypatch, "compare", "r1", "r2", "--runs", tmp_path) == 0
-    assert "\x1b" not in capsys.readouterr().out
-    assert swarm(monkeypatch, "compare", "r1", "r1", "--runs", tmp_path, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["remarks"] == []
+    code, told, _ = swarm("compare r1 r2 --runs", tmp_path)
+    assert (code, "\x1b" in told) == (0, False)
+    assert json.loads(swarm("compare r1 r1 --json --runs", tmp_path)[1])["remarks"] == []
