@@ -127,10 +127,11 @@ _GAP = ("mean", "p95", "max", "unproven")
 def csv_of(section: str, report: Mapping[str, Any]) -> bytes:
     """One row per target, group or vehicle. What has no value is empty."""
     rows = [flat(id, row) for id, row in report[section].items()]
-    columns = list(dict.fromkeys(name for row in rows for name in row))
+    columns = list(dict.fromkeys(["id", *(name for row in rows for name in row)]))
     file = io.StringIO()
     writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writerows([{**dict(zip(columns, columns, strict=True)), "id": TABLES[section][1]}, *rows])
+    writer.writerow({**dict(zip(columns, columns, strict=True)), "id": TABLES[section][1]})
+    writer.writerows(rows)
     return file.getvalue().encode()
 
 
