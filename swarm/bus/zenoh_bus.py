@@ -242,17 +242,12 @@ class ZenohBus:
     ) -> None:
         check_subscription(topic, together, every_s)
 
-        def arrive(sample: zenoh.Sample) -> None:
-            heard = self.intake.arrived(topic, sample)
-            if heard is not None:
-                post(heard)
-
         def arrive_together(samples: list[zenoh.Sample]) -> None:
             heard = self.intake.together(topic, samples)
             if heard:
                 post(HeardMany(topic, heard))
 
-        def arrive_sampled(samples: list[zenoh.Sample]) -> None:
+        def arrive(samples: list[zenoh.Sample]) -> None:
             for heard in self.intake.newest(topic, samples):
                 post(heard)
 
@@ -262,9 +257,9 @@ class ZenohBus:
         if together:
             self._read(subscriber, arrive_together, name, partial(waiting_in, channel))
         elif every_s:
-            self._read(subscriber, arrive_sampled, name, partial(taken_after, channel, self._closing, every_s))
+            self._read(subscriber, arrive, name, partial(taken_after, channel, self._closing, every_s))
         else:
-            self._read(subscriber, arrive, name, channel.recv)
+            self._read(subscriber, arrive, name, lambda: [channel.recv()])
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)

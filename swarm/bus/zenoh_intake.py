@@ -155,12 +155,6 @@ class Intake:
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
 
-    def arrived(self, topic: Topic, sample: zenoh.Sample) -> Heard | None:
-        """The event of a sample that has just come; None if it is rejected."""
-        payload = sample.payload.to_bytes()
-        self.received(payload)
-        return self._heard(topic, sample, payload)
-
     def _heard(self, topic: Topic, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
         key = str(sample.key_expr)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from swarm.runtime.inbox import Inbox
 
 _ASK_S = 1.0
+"""Longest wait for one round of answers; rounds follow until the timeout of `connect`."""
 
 
 class Swarm:

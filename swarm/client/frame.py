@@ -18,6 +18,7 @@ from swarm.wire.messages.processes import RunInfo
 
 WGS84 = "EPSG:4326"
 _EARTH_M = 6_371_000.0
+"""Mean radius of the Earth: a body within 1 % of it is taken for the Earth."""
 Point = tuple[float, float]
 _Transform = Callable[[float, float], Point]
 

@@ -18,10 +18,13 @@ from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
 
 CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
+"""A fleet that was silent for so long is shown no more. Agents tell at each tick, and at once when they leave."""
 EVERY_S = 0.2
+"""Time between two readings of positions if a program does not say: five a second are smooth to an eye."""
 _HEARD = (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS)
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
+"""Sets of marks that are held: a quarter of what a replica may hold (decision 18)."""
 _ZONES = "operator."
 """Authors that begin so are zones."""
 

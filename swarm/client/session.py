@@ -31,12 +31,17 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
+"""Time between two ticks: a tenth of that between two reports of a vehicle with the usual lease."""
 _RUN_TIMEOUT_S = 2.0
+"""Longest wait for the answer to which run is in the namespace."""
 _COMPARE_AGAIN_NS = 2 * NS_PER_S
+"""Time until that is asked again where nobody has answered."""
 _SAY_AGAIN_NS = 60 * NS_PER_S
+"""Time until the same problem is told again: once a minute, as logs of the bus are."""
 _SAME_CLOCK_NS = NS_PER_S
 """Clocks that differ by less are not corrected: an answer is as old as a tick."""
 _MOST_SAID = 1024
+"""Sentences that are remembered for it. Beyond that all are forgotten, and told again at most."""
 
 
 class Part(Protocol):

@@ -28,8 +28,11 @@ _REPEAT_NS = NS_PER_S // 2
 _ASK_AGAIN_NS = NS_PER_S
 """A follower asks again so often, from where it is: planners forget vehicles that were silent for five seconds."""
 _DIGEST_NS = NS_PER_S
+"""Time between two digests of marks, by which replicas notice what they have missed."""
 _TIMEOUT_S = 5.0
+"""Longest wait for a route if a program does not say: a planner that begins grows its tree for seconds."""
 _NEAR_END_CELLS = 16
+"""A vehicle that is within so many cells of the end of a cut route asks for its continuation."""
 
 
 class Vehicle(Reported):

@@ -16,6 +16,7 @@ T = TypeVar("T")
 KILLED_BY = signal.SIGVTALRM
 """What ends a process whose call cannot be broken off."""
 _KILL_FACTOR = 5
+"""A call that goes on for so many times its limit, or swallows so many alarms, ends its process."""
 
 
 class Hangs(BaseException):

@@ -16,8 +16,8 @@ from swarm.wire.messages.traffic import Granted, Known
 
 MOST_AHEAD = 16
 """Cells ahead of itself that a guest is granted at most."""
-_MS = NS_PER_S // 1000
 _OLDEST_MS = 1 << 31
+"""Greatest age that is told: half of what the message has room for, so that a push may still add to it."""
 
 
 @dataclass(frozen=True, slots=True)

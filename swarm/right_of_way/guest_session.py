@@ -33,6 +33,7 @@ _NOBODY_NS = 10 * NS_PER_S
 _ANSWERS_S = 0.3
 """A new life waits so long for the agents' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
+"""Time until agents are asked again what they know, where too few have answered."""
 _ROLE = "rover"
 
 
@@ -204,6 +205,7 @@ def _tells_of_larger(known: Known, guest: Guest) -> bool:
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.1
+"""Time between two ticks: half a beat, so that each beat is told in time."""
 _ENTER_S, _LEAVE_S = 5.0, 3.0
 """Longest waits for the first cell, and at the end for the word that all cells are free: a few hops, or an election
 of a warden, which takes a second."""

@@ -15,8 +15,10 @@ from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
 _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
 _FURTHEST_SEQ = 1 << 32
+"""Tables of one epoch: ten a second for thirteen years."""
 _BEFORE_ALL: Stamp = (0, 0)
 _MOST_CELLS = 1 << 12
+"""Cells whose plot is remembered: more than the vehicles of one host have near them."""
 Place = Callable[[str, Sequence[int]], int | None]
 """On which of the cells that it was granted a vehicle of a new life stands; None if it does not stand there."""
 

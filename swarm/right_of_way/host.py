@@ -13,6 +13,7 @@ from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.traffic import Granted
 
 LIVES_KEPT = 32
+"""Numbers of lives on file, as many as a `Standing` has room for."""
 _ALONE_NS = NS_PER_S // 2
 """A life that has been replaced begins again once no other process of its host has been alive for so long."""
 _UNLED_NS = 2 * NS_PER_S

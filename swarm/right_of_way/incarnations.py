@@ -15,7 +15,9 @@ BEAT_NS = NS_PER_S // 5
 FURTHEST_EPOCH = 3 << 20
 """No run gets so many epochs further while somebody does not hear of it."""
 _LIFE_BITS = 32
+"""Bits of chance in a life's number, by which two that begin at once differ."""
 _FURTHEST_LIFE = 1 << 16
+"""Restarts of a host beyond what is known, which no host has in a run."""
 
 
 def first_life(after: int, chance: int) -> int:

@@ -11,6 +11,7 @@ from swarm.grid import MOST_PLOT_REGIONS, MOST_PLOTS, REGION_CELLS, GridSpec
 MOST_PLOTS_AN_AGENT = 8
 """With few plots for each agent some are wardens of much more than others; many cost messages."""
 _LAYERS = 2
+"""The ground and the air."""
 FEWEST_FOR_MAJORITY = 3
 """Members of a plot; a layer of fewer agents has one for each plot."""
 

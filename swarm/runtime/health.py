@@ -98,12 +98,16 @@ def _opened() -> socket.socket:
 HUNG_S, HUNG_PERIODS = 10.0, 20
 """A loop that has not ticked for so long hangs: longer than a busy machine keeps a process from its tick."""
 SLOT_BYTES = 1024
+"""Bytes of one record: a head of 23 and what is lacking, some ten needs of `_LONGEST_NEED` characters at most."""
 BOARD_BYTES = 2 * SLOT_BYTES
 _HEAD = struct.Struct("<IQQBH")
 """Checksum of all behind it, when it was written, `limit_ns`, phase, length of what follows."""
 _CHECKED = 4
+"""Bytes of the checksum itself, which it does not cover."""
 _WRITE_NS = NS_PER_S // 10
+"""Least time between two records without news: a hundredth of `HUNG_S`, by which readers judge."""
 _LONGEST_NEED = 100
+"""Characters of one need: a line in a terminal."""
 LIFE_BEFORE = "the end of the life before it"
 """What a process waits for that is started to follow one which still runs."""
 

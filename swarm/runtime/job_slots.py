@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 LONG_NS = 200_000_000
 """Jobs that are expected to take less do not queue."""
 _LOOK_AGAIN_S = 0.02
+"""Time between two looks for a free slot: a tenth of the shortest job that queues."""
 _LONGEST_S = 20.0
 """Nobody waits longer: the one whose turn it is may be stopped for good. Turns make jobs quick, not right."""
 

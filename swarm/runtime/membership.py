@@ -81,6 +81,7 @@ NO_RUN = ""
 """The run id of what belongs to no run: a router passes on all messages."""
 _TAG = "run-check"
 _MOST_STRANGERS = 256
+"""Strangers that are counted and named: whoever may put on the namespace can make up any number."""
 _RATE_LEAST_S = 0.5
 """Over a shorter time no rate is measured, as at the end."""
 _BEHIND_TICKS = 5

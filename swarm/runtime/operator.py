@@ -21,10 +21,15 @@ from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic
 
 _OBEY_ZONES = frozenset({"agent", "planner"})
 _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
+"""Roles that answer `Obey`: zones concern those which hold a map, other orders those which move things, too."""
 _FIND_S = 3.0
+"""Longest wait for all members to say who they are: some ticks of a process that is behind."""
 _ORDER_S = 5.0
+"""Longest wait for a keeper, which answers once the order is on its disk."""
 _OBEY_S = 3.0
+"""Longest wait for all to obey. An order reaches who misses it with the next word of a keeper, a second later."""
 _LEAVE_S = 0.3
+"""After the last answer, time for tokens of those who leave to fall: Zenoh takes 3 to 8 ms for a killed process."""
 _MOST_REPLIES = 1 << 16
 """More than any swarm has processes, tiles with marks or orders: who floods a question fills no memory."""
 _MOST_SEEN = 1 << 12

@@ -13,10 +13,14 @@ from swarm.wire.messages.orders import Obey, Obeyed, Orders
 from swarm.wire.topics import OBEYED, ORDERS
 
 _MOST_WAITING = 64
+"""Operators that wait here at once. Each waits for seconds at most, so more of them are no operators."""
 _TAG = "orders"
 _ASK_AGAIN_NS = NS_PER_S // 4
+"""Time between two questions for the book: a process that starts stands still until it has one."""
 _ASK_S = 2.0
+"""Longest wait for the answers to one question."""
 _ASKS_OF_KEEPERS = 2
+"""Questions to keepers alone, before everybody is asked: a keeper knows best, others may know as much."""
 _ASKS_OF_NOBODY = 4
 """So many asks, a second in all, that reached nobody who knows: a keeper may start a little later than others."""
 _ASKS = 10

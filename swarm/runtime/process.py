@@ -49,6 +49,7 @@ def collected_rarely() -> Iterator[None]:
 log = logging.getLogger(__name__)
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+"""Multiples of it lie spread over a period, however many there are (`tick_phase`)."""
 _WORKER_NICE = 5
 """By how much less urgent jobs of a worker are than their process, after the first."""
 

@@ -43,6 +43,7 @@ READY = "ready"
 """Gauge: 1 while the process has all that its role needs."""
 
 _BASE = 1.04
+"""Width of a bucket: quantiles are within half of it, 2 %."""
 _LOG_BASE = math.log(_BASE)
 _FEW = 16
 """Up to so many values are added faster one by one."""

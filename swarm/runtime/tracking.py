@@ -38,6 +38,7 @@ LONGEST_AGE_NS = 366 * 86_400 * NS_PER_S
 MOST_LIVES = 16
 """Of trackers of one target, remembered. Of more that live the youngest are refused."""
 _MOST_TARGETS = 4096
+"""Targets of which anything is remembered: whoever may put poses can make up any number."""
 
 
 class Verdict(Enum):
