@@ -348,12 +348,11 @@ class Stream(Generic[T]):
     It ends when it is closed, or the connection is: loops over it end then.
     """
 
-    def __init__(self, most: int = MOST_WAITING, on_close: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, most: int = MOST_WAITING) -> None:
         self._waiting: deque[T] = deque(maxlen=most)
         self._changed = threading.Condition()
         self._sleepers: list[tuple[asyncio.AbstractEventLoop, asyncio.Future[None]]] = []
         """Readers in asyncio that wait for a value; each is woken once."""
-        self._on_close = on_close
         self.closed = False
         self.newest: T | None = None
         """The value that came last, whether it was read or not; None before the first."""
@@ -369,11 +368,8 @@ class Stream(Generic[T]):
     def close(self) -> None:
         """End it: readers take what waits, and then stop."""
         with self._changed:
-            if self.closed:
-                return
             self.closed = True
             self._wake()
-        self._on_close()
 
     def next(self, timeout_s: float | None = None) -> T | None:
         """The next value; None if there is none within the timeout, or it has ended."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from hashlib import blake2s
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
-from swarm.clock import NS_PER_S, Clock, MonotonicClock
+from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
@@ -231,8 +231,8 @@ class GuestSession:
     lives  the vehicle's file; closed with this session, as the bus is
     """
 
-    def __init__(self, name: str, grid: GridSpec, bus: Bus, lives: MemoryLives, clock: Clock | None = None) -> None:
-        self._clock = clock or MonotonicClock()
+    def __init__(self, name: str, grid: GridSpec, bus: Bus, lives: MemoryLives) -> None:
+        self._clock = MonotonicClock()
         self._inbox = Inbox()
         self._changed = threading.Condition(threading.RLock())
         """Guards the service; notified whenever it may have come to hold other cells."""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.bus_world import answering
 from support.client_rig import Program, run_info
 from support.effort import few
 from support.map_strategies import GRID as MAP_GRID
@@ -547,41 +548,21 @@ def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> N
     assert bodies[-1].x_m == 15.0
 
 
-def test_another_run_that_begins_long_after_the_link_is_back_ends_the_connection_too(world: Swarm) -> None:
-    program = Program(world)
-    world.kill("planner-t-1")
-    world.kill("a0.1")
-    world.cut(program.bus)
-    world.run(0.5)
-    world.heal(program.bus)
-    world.run(20.0)
-    assert program.swarm.ended is None, "nobody has answered yet"
-
-    def answer(event: Any) -> None:
-        event.answer(run_info(GRID, "run2"))
-        event.end()
-
-    world.bus("other").serve(RUN, answer, role="keeper", id="0")
-    world.run(6.0)
-    assert isinstance(program.swarm.ended, RunMismatchError)
-
-
-def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm) -> None:
+@pytest.mark.parametrize("late", [False, True])
+def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm, late: bool) -> None:
     program = Program(world)
     rover = program.swarm.vehicle("rover")
     world.kill("planner-t-1")
     world.kill("a0.1")
     world.cut(program.bus)
-    other = world.bus("other")
-
-    def answer(event: Any) -> None:
-        event.answer(run_info(GRID, "run2"))
-        event.end()
-
-    other.serve(RUN, answer, role="keeper", id="0")
     world.run(0.5)
+    if late:
+        world.heal(program.bus)
+        world.run(20.0)
+        assert program.swarm.ended is None, "nobody has answered yet"
+    world.bus("other").serve(RUN, answering((run_info(GRID, "run2"), {})), role="keeper", id="0")
     world.heal(program.bus)
-    world.run(3.0)
+    world.run(6.0)
     with pytest.raises(RunMismatchError, match="run run is over, and run run2 is in its namespace: connect again"):
         rover.at(5.0, -5.0)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import dataclass, field
 
 import pytest
@@ -13,6 +15,7 @@ from swarm.bus.bus import (
     Disappeared,
     Event,
     Heard,
+    HeardMany,
     LinkChanged,
     Replied,
     Undecoded,
@@ -64,8 +67,9 @@ class Asker:
         self.ended_s = self.time.now_s
 
 
-def note(n: int) -> Heard:
-    return Heard(NOTE, {"role": "agent", "id": "a0"}, Note(role="agent", id="a0", stamp_ns=n, kind="k", text=""))
+def note(n: object) -> Heard:
+    message = Note(role="agent", id="a0", stamp_ns=1, kind="k", text=str(n))
+    return Heard(NOTE, {"role": "agent", "id": "a0"}, message)
 
 
 def pose(target: str, seq: int) -> Heard:
@@ -78,6 +82,90 @@ def drain(inbox: Inbox) -> list[Event]:
     while (event := inbox.take(0)) is not None:
         taken.append(event)
     return taken
+
+
+def test_of_samples_that_say_everything_only_the_newest_per_key_is_kept_in_the_oldest_place():
+    inbox = Inbox()
+    for event in (pose("t0", 1), note("x"), pose("t1", 1), pose("t0", 2), note("y"), pose("t0", 3)):
+        inbox.post(event)
+    assert len(inbox) == 4
+    assert inbox.superseded == 2
+    assert drain(inbox) == [pose("t0", 3), note("x"), pose("t1", 1), note("y")]
+    inbox.post(pose("t0", 4))
+    assert drain(inbox) == [pose("t0", 4)]
+
+
+def test_many_threads_may_post():
+    inbox = Inbox()
+
+    def post(name: str) -> None:
+        for n in range(500):
+            inbox.post(note(f"{name}{n}"))
+            inbox.post(pose(name, n))
+
+    threads = [threading.Thread(target=post, args=(name,)) for name in "abcd"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    taken = drain(inbox)
+    for name in "abcd":
+        texts = [e.message.text for e in taken if e.topic is NOTE and e.message.text.startswith(name)]
+        assert texts == [f"{name}{n}" for n in range(500)]
+        assert [e.message.seq for e in taken if e.fields.get("target") == name] == [499]
+
+
+def batch(n: int) -> HeardMany:
+    return HeardMany(NOTE, [(f"note/agent/a{n}", note(n).message)])
+
+
+def test_who_brings_batches_waits_until_the_owner_has_kept_up():
+    inbox = Inbox()
+    brought: list[int] = []
+
+    def bring() -> None:
+        for n in range(10):
+            inbox.post(batch(n))
+            brought.append(n)
+
+    bringer = threading.Thread(target=bring)
+    bringer.start()
+    taken = []
+    while len(taken) < 10:
+        event = inbox.take(1.0)
+        assert isinstance(event, HeardMany)
+        taken.append(event)
+        assert len(brought) <= len(taken) + 3
+    bringer.join(1.0)
+    assert taken == [batch(n) for n in range(10)]
+
+
+def test_nobody_waits_for_an_owner_that_has_ended():
+    inbox = Inbox()
+    bringer = threading.Thread(target=lambda: [inbox.post(batch(n)) for n in range(5)])
+    bringer.start()
+    bringer.join(0.1)
+    assert bringer.is_alive()
+    inbox.close()
+    bringer.join(1.0)
+    assert not bringer.is_alive()
+
+
+def test_a_take_waits_for_a_post_and_no_longer():
+    inbox = Inbox()
+    threading.Timer(0.05, inbox.post, [note("x")]).start()
+    began_s = time.monotonic()
+    assert inbox.take(5.0) == note("x")
+    assert time.monotonic() - began_s < 2.0
+
+
+def test_what_a_worker_fails_with_is_raised_where_the_state_is_owned():
+    inbox = Inbox()
+    inbox.post(note("x"))
+    inbox.fail(RuntimeError("boom"))
+    assert inbox.take(0) == note("x")
+    with pytest.raises(RuntimeError, match="boom"):
+        inbox.take(0)
 
 
 def test_of_a_topics_samples_the_oldest_go_beyond_the_capacity_and_no_other_topics():
@@ -118,8 +206,8 @@ def test_replies_tokens_links_and_results_are_never_dropped():
 
 
 def test_a_question_too_many_refuses_the_oldest_in_words():
-    inbox, time = Inbox(), Time()
-    askers = [Asker(time) for _ in range(CAPACITY + 1)]
+    inbox, clock = Inbox(), Time()
+    askers = [Asker(clock) for _ in range(CAPACITY + 1)]
     for asker in askers:
         inbox.post(asker.question)
     assert askers[0].refusals == ["cost: too many questions wait"]
@@ -129,12 +217,12 @@ def test_a_question_too_many_refuses_the_oldest_in_words():
 
 
 def test_a_question_whose_asker_has_left_is_refused_and_never_taken():
-    inbox, time = Inbox(), Time()
-    short, long = Asker(time, timeout_s=1.0), Asker(time, timeout_s=5.0)
-    newest_but_short = Asker(time, timeout_s=1.5)
+    inbox, clock = Inbox(), Time()
+    short, long = Asker(clock, timeout_s=1.0), Asker(clock, timeout_s=5.0)
+    newest_but_short = Asker(clock, timeout_s=1.5)
     for asker in (short, long, newest_but_short):
         inbox.post(asker.question)
-    time.now_s = 3.0
+    clock.now_s = 3.0
     assert drain(inbox) == [long.question]
     assert [asker.ended_s for asker in (short, long, newest_but_short)] == [3.0, None, 3.0]
     assert short.refusals == ["cost: no answer within the 1 s of its asker: too many questions"]
@@ -143,8 +231,8 @@ def test_a_question_whose_asker_has_left_is_refused_and_never_taken():
 
 
 def test_an_undecoded_question_is_decoded_once_when_its_turn_comes():
-    inbox, time = Inbox(), Time()
-    asker = Asker(time)
+    inbox, clock = Inbox(), Time()
+    asker = Asker(clock)
     for event in (note(1), asker.undecoded, note(2)):
         inbox.post(event)
     assert inbox.take(0) == note(1)
@@ -155,44 +243,51 @@ def test_an_undecoded_question_is_decoded_once_when_its_turn_comes():
 
 
 def test_a_question_that_is_rejected_when_its_turn_comes_is_no_event():
-    inbox, time = Inbox(), Time()
-    inbox.post(Asker(time, rejected=True).undecoded)
+    inbox, clock = Inbox(), Time()
+    inbox.post(Asker(clock, rejected=True).undecoded)
     inbox.post(note(1))
     assert [inbox.take(0), inbox.take(0)] == [None, note(1)]
 
 
 def test_an_undecoded_question_that_nobody_answers_is_refused_and_never_decoded():
-    inbox, time = Inbox(), Time()
-    askers = [Asker(time, timeout_s=1.0) for _ in range(CAPACITY + 1)]
+    inbox, clock = Inbox(), Time()
+    askers = [Asker(clock, timeout_s=1.0) for _ in range(CAPACITY + 1)]
     for asker in askers:
         inbox.post(asker.undecoded)
-    time.now_s = 3.0
+    clock.now_s = 3.0
     assert drain(inbox) == []
     assert inbox.counts == {"events_dropped": 1, "asks_expired": CAPACITY}
     assert all(len(asker.refusals) == 1 and asker.decoded == 0 for asker in askers)
 
 
 def test_without_overload_questions_and_samples_come_in_the_order_of_their_arrival():
-    inbox, time = Inbox(), Time()
-    events = [Asker(time).question, note(1), Asker(time, topic=ROUTE).question, note(2), Asker(time).question]
+    inbox, clock = Inbox(), Time()
+    events = [
+        Asker(clock).question,
+        note(1),
+        Asker(clock, topic=ROUTE).question,
+        note(2),
+        Asker(clock).question,
+        LinkChanged(up=False),
+    ]
     for event in events:
         inbox.post(event)
-    time.now_s = 0.4
+    clock.now_s = 0.4
     assert drain(inbox) == events
 
 
 @pytest.mark.parametrize("load", [2.0, 2.5, 10.0])
 def test_under_overload_what_is_answered_goes_to_those_who_still_wait(load):
     """Ten seconds, 5 ms for each answer: 200 a second are answered, all but the first few at once."""
-    inbox, time = Inbox(), Time()
+    inbox, clock = Inbox(), Time()
     askers: list[Asker] = []
     waits: list[float] = []
-    while time.now_s < 10.0:
-        while len(askers) < time.now_s * 200 * load:
-            askers.append(Asker(time))
+    while clock.now_s < 10.0:
+        while len(askers) < clock.now_s * 200 * load:
+            askers.append(Asker(clock))
             inbox.post(askers[-1].question)
         event = inbox.take(0)
-        time.now_s += 0.005
+        clock.now_s += 0.005
         if event is not None:
             waits.append(event.waited_s)
     assert len(waits) > 1990
@@ -204,11 +299,11 @@ def test_under_overload_what_is_answered_goes_to_those_who_still_wait(load):
 
 
 def test_while_questions_come_late_samples_and_other_questions_take_turns_with_them():
-    inbox, time = Inbox(), Time()
+    inbox, clock = Inbox(), Time()
     for _ in range(100):
-        inbox.post(Asker(time).question)
-    time.now_s = 1.0
-    route = Asker(time, topic=ROUTE)
+        inbox.post(Asker(clock).question)
+    clock.now_s = 1.0
+    route = Asker(clock, topic=ROUTE)
     inbox.post(route.question)
     for n in range(3):
         inbox.post(note(n))
@@ -224,9 +319,9 @@ def test_while_questions_come_late_samples_and_other_questions_take_turns_with_t
 def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(
     timeout_s: float, waited_s: float, late: bool
 ) -> None:
-    inbox, time = Inbox(), Time()
-    askers = [Asker(time, timeout_s=timeout_s) for _ in range(2)]
+    inbox, clock = Inbox(), Time()
+    askers = [Asker(clock, timeout_s=timeout_s) for _ in range(2)]
     for asker in askers:
         inbox.post(asker.question)
-    time.now_s = waited_s
+    clock.now_s = waited_s
     assert inbox.take(0) is askers[late].question  # of late ones the newest is taken

@@ -1,4 +1,4 @@
-"""The loop: late ticks are dropped, the inbox keeps the newest, a failed worker ends the process."""
+"""The loop: late ticks are dropped, events and ticks share the thread, a failed worker ends the process."""
 
 from __future__ import annotations
 
@@ -14,30 +14,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm.bus.bus import Event, Heard, HeardMany, LinkChanged, WorkDone
+from swarm.bus.bus import Event, Heard, WorkDone
 from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, tick_phase
 from swarm.runtime.stats import Counters
-from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.topics import NOTE, TRUE_POSE
-
-
-def pose(target: str, seq: int) -> Heard:
-    message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
-    return Heard(TRUE_POSE, {"target": target}, message)
+from swarm.wire.topics import NOTE
 
 
 def note(text: str) -> Heard:
     return Heard(NOTE, {"role": "agent", "id": "a0"}, Note(role="agent", id="a0", stamp_ns=1, kind="k", text=text))
-
-
-def drain(inbox: Inbox) -> list[Event]:
-    taken = []
-    while (event := inbox.take(0)) is not None:
-        taken.append(event)
-    return taken
 
 
 class Recording:
@@ -63,99 +50,6 @@ class Recording:
 
     def stop(self, now_ns: int) -> None:
         self.log.append("stop")
-
-
-def test_of_samples_that_say_everything_only_the_newest_per_key_is_kept_in_the_oldest_place():
-    inbox = Inbox()
-    for event in (pose("t0", 1), note("x"), pose("t1", 1), pose("t0", 2), note("y"), pose("t0", 3)):
-        inbox.post(event)
-    assert len(inbox) == 4
-    assert inbox.superseded == 2
-    assert drain(inbox) == [pose("t0", 3), note("x"), pose("t1", 1), note("y")]
-    inbox.post(pose("t0", 4))
-    assert drain(inbox) == [pose("t0", 4)]
-
-
-def test_every_other_event_is_kept_in_order():
-    inbox = Inbox()
-    events = [note(str(n)) for n in range(100)] + [LinkChanged(True), LinkChanged(False)]
-    for event in events:
-        inbox.post(event)
-    assert drain(inbox) == events
-    assert inbox.take(0) is None
-
-
-def test_many_threads_may_post():
-    inbox = Inbox()
-
-    def post(name: str) -> None:
-        for n in range(500):
-            inbox.post(note(f"{name}{n}"))
-            inbox.post(pose(name, n))
-
-    threads = [threading.Thread(target=post, args=(name,)) for name in "abcd"]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    taken = drain(inbox)
-    for name in "abcd":
-        texts = [e.message.text for e in taken if e.topic is NOTE and e.message.text.startswith(name)]
-        assert texts == [f"{name}{n}" for n in range(500)]
-        assert [e.message.seq for e in taken if e.fields.get("target") == name] == [499]
-
-
-def batch(n: int) -> HeardMany:
-    return HeardMany(NOTE, [(f"note/agent/a{n}", note(str(n)).message)])
-
-
-def test_who_brings_batches_waits_until_the_owner_has_kept_up():
-    inbox = Inbox()
-    brought: list[int] = []
-
-    def bring() -> None:
-        for n in range(10):
-            inbox.post(batch(n))
-            brought.append(n)
-
-    bringer = threading.Thread(target=bring)
-    bringer.start()
-    taken = []
-    while len(taken) < 10:
-        event = inbox.take(1.0)
-        assert isinstance(event, HeardMany)
-        taken.append(event)
-        assert len(brought) <= len(taken) + 3
-    bringer.join(1.0)
-    assert taken == [batch(n) for n in range(10)]
-
-
-def test_nobody_waits_for_an_owner_that_has_ended():
-    inbox = Inbox()
-    bringer = threading.Thread(target=lambda: [inbox.post(batch(n)) for n in range(5)])
-    bringer.start()
-    bringer.join(0.1)
-    assert bringer.is_alive()
-    inbox.close()
-    bringer.join(1.0)
-    assert not bringer.is_alive()
-
-
-def test_a_take_waits_for_a_post_and_no_longer():
-    inbox = Inbox()
-    threading.Timer(0.05, inbox.post, [note("x")]).start()
-    began_s = time.monotonic()
-    assert inbox.take(5.0) == note("x")
-    assert time.monotonic() - began_s < 2.0
-
-
-def test_what_a_worker_fails_with_is_raised_where_the_state_is_owned():
-    inbox = Inbox()
-    inbox.post(note("x"))
-    inbox.fail(RuntimeError("boom"))
-    assert inbox.take(0) == note("x")
-    with pytest.raises(RuntimeError, match="boom"):
-        inbox.take(0)
 
 
 def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
