@@ -7,7 +7,7 @@ run. Nothing is buffered but what is collected: a handler takes no simulated tim
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -300,10 +300,8 @@ class MemoryNetwork:
         self.trace = trace
         self.buses: list[MemoryBus] = []
         """Open buses in the order of their opening, which is the order of queries and tokens."""
-        self.subscriptions: dict[tuple[str, str], Subscriptions] = {}
+        self.subscriptions: defaultdict[tuple[str, str], Subscriptions] = defaultdict(Subscriptions)
         """(namespace, topic) -> subscriptions of open buses."""
-        self._down: set[str] = set()
-        """Nodes cut off by `link_changed`."""
 
     def bus(self, node: str, namespace: str = "swarm", authenticator: Authenticator | None = None) -> MemoryBus:
         """Open a bus. A node that was started again opens a new one."""
@@ -311,26 +309,9 @@ class MemoryNetwork:
         self.buses.append(bus)
         return bus
 
-    def subscribers(self, namespace: str, topic: str, fields: Mapping[str, str]) -> list[Declaration]:
-        """The subscriptions that a value with these fields reaches, in the order in which it is delivered."""
-        subscriptions = self.subscriptions.get((namespace, topic))
-        return [] if subscriptions is None else subscriptions.find(fields)
-
     def connected(self, source: MemoryBus, to: MemoryBus) -> bool:
         """Whether queries and tokens of `source` reach `to` now."""
-        if source is to:
-            return True
-        if source.node in self._down or to.node in self._down:
-            return False
-        return self.links.connected(source.node, to.node, self.scheduler.clock.now_ns())
-
-    def link_changed(self, node: str, up: bool) -> None:
-        """Cut a node off from all others, or bring it back."""
-        if up:
-            self._down.discard(node)
-        else:
-            self._down.add(node)
-        self.relink([node], up)
+        return source is to or self.links.connected(source.node, to.node, self.scheduler.clock.now_ns())
 
     def relink(self, nodes: Sequence[str], up: bool) -> None:
         """Let nodes notice that their link came up or went down, and all nodes which tokens they see now."""
@@ -350,8 +331,6 @@ class MemoryNetwork:
         """After how long each copy of a message sent now arrives; a node hears itself at once."""
         if source is to:
             return _AT_ONCE
-        if self._down and (source.node in self._down or to.node in self._down):
-            return ()
         return self.links.delays_ns(source.node, to.node, what, self.scheduler.clock.now_ns())
 
 
@@ -392,7 +371,7 @@ class MemoryBus:
         sample = _Sample(topic, named, key, payload, code, in_json)
         network = self.network
         arrivals: dict[int, list[Declaration]] = {}
-        for subscription in network.subscribers(self.namespace, topic.name, named):
+        for subscription in network.subscriptions[self.namespace, topic.name].find(named):
             if subscription.bus is self and not topic.echoed:
                 continue
             for delay_ns in network.delays_ns(self, subscription.bus, topic.name):
@@ -418,7 +397,7 @@ class MemoryBus:
         self._declare(topic, Declaration(self, narrowed(topic, fields), None))
 
     def _declare(self, topic: Topic, subscription: Declaration) -> None:
-        self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions()).add(subscription)
+        self.network.subscriptions[self.namespace, topic.name].add(subscription)
 
     def collected(self, topic: Topic) -> list[Heard]:
         kept = self._kept.pop(topic.name, ())
@@ -448,10 +427,7 @@ class MemoryBus:
         return heard
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        narrow = narrowed(topic, fields)
-        subscriptions = self.network.subscriptions.get((self.namespace, topic.name))
-        if subscriptions is not None:
-            subscriptions.remove(self, narrow)
+        self.network.subscriptions[self.namespace, topic.name].remove(self, narrowed(topic, fields))
 
     def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
         if topic.request is None:

@@ -62,6 +62,23 @@ class LossyLinks:
         return [int(2e5 + self._random.random() * self.jitter_ms * 1e6) for _ in range(copies)]
 
 
+class CuttableNetwork(MemoryNetwork):
+    """A network of which single nodes can be cut off from all others, whatever its links say."""
+
+    down: frozenset[str] = frozenset()
+
+    def link_changed(self, node: str, up: bool) -> None:
+        self.down = self.down - {node} if up else self.down | {node}
+        self.relink([node], up)
+
+    def connected(self, source: MemoryBus, to: MemoryBus) -> bool:
+        return source is to or (not self.down & {source.node, to.node} and super().connected(source, to))
+
+    def delays_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
+        apart = source is not to and self.down & {source.node, to.node}
+        return () if apart else super().delays_ns(source, to, what)
+
+
 class SwarmModel:
     """Services by the names of their nodes, each with a bus and ticks of its own.
 
@@ -80,7 +97,7 @@ class SwarmModel:
         self.start_ns = start_ns
         self.scheduler = Scheduler(ManualClock(start_ns))
         self.deliveries: list[tuple[int, str, str, str, bytes]] = []
-        self.network = MemoryNetwork(
+        self.network = CuttableNetwork(
             self.scheduler, links or PerfectLinks(), lambda *delivery: self.deliveries.append(delivery)
         )
         self.terrain = terrain or terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))
