@@ -45,8 +45,6 @@ READY = "ready"
 _BASE = 1.04
 """Width of a bucket: quantiles are within half of it, 2 %."""
 _LOG_BASE = math.log(_BASE)
-_FEW = 16
-"""Up to so many values are added faster one by one."""
 
 
 class Histogram:
@@ -68,10 +66,6 @@ class Histogram:
 
     def add_all(self, values: NDArray[np.float64]) -> None:
         """As `add` of each, the positive ones first and in order: the order of buckets reaches the wire."""
-        if values.size <= _FEW:
-            for value in sorted(filter(math.isfinite, values.tolist()), key=lambda value: (value <= 0, value)):
-                self.add(value)
-            return
         values = values[np.isfinite(values)]
         positive = values[values > 0]
         found = np.minimum(np.rint(np.log(positive) / _LOG_BASE), TOP_BUCKET).astype(np.int64)

@@ -83,13 +83,13 @@ def test_counters_count_gauge_and_observe():
 
 
 @given(st.lists(st.floats() | st.sampled_from([0.0, -1.0, 1.0, 1.02, 1e-300]), max_size=16))
-def test_few_values_are_counted_as_many_are_and_in_the_same_order(values: list[float]) -> None:
-    few, many = Histogram(), Histogram()
-    few.add_all(np.array(values, np.float64))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("swarm.runtime.stats._FEW", -1)
-        many.add_all(np.array(values, np.float64))
-    assert list(few.buckets.items()) == list(many.buckets.items())
+def test_values_added_together_are_counted_as_one_by_one_the_positive_ones_first_and_in_order(
+    values: list[float],
+) -> None:
+    together = Histogram()
+    together.add_all(np.array(values, np.float64))
+    finite = sorted(filter(math.isfinite, values), key=lambda value: (value <= 0, value))
+    assert list(together.buckets.items()) == list(histogram(finite).buckets.items())
 
 
 def test_a_later_life_counts_on_and_says_since_when_the_first_has_counted() -> None:
