@@ -22,7 +22,7 @@ class Reported:
     """
 
     def __init__(self, session: Session, topic: Topic, kind: str, id: str, lease_s: float, repeat_ns: int) -> None:
-        """Raises ConfigError where the id is in use in this program.
+        """Does not take part before `_join`.
 
         kind       the noun for it in sentences
         repeat_ns  time from a word to its repetition; a fourth of the lease if that is shorter
@@ -39,8 +39,14 @@ class Reported:
         """The message that was said last; None before the first, and once it has left."""
         self._seq = 0
         self._repeat_due_ns = 0
-        session.add(self)
-        session.bus.subscribe(topic, session.post, **self._key)
+
+    def _join(self) -> None:
+        """Take part from now on: the last step of its making, as events and ticks come on another thread.
+
+        Raises ConfigError where the id is in use in this program.
+        """
+        self._session.add(self)
+        self._session.bus.subscribe(self._topic, self._session.post, **self._key)
 
     def __enter__(self: R) -> R:
         return self

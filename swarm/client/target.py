@@ -34,6 +34,7 @@ class Target(Reported):
         self.tracker = tracker
         self._tracking = Tracking(session.frame.grid)
         super().__init__(session, POSE, "target", id, lease_s, _REPEAT_NS)
+        self._join()
 
     def at(self, x_m: float, y_m: float) -> None:
         """Say where the target is, in the terrain's frame. It is repeated until the next call or `leave`.

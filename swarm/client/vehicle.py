@@ -72,6 +72,7 @@ class Vehicle(Reported):
         self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
         self._digest_due_ns = 0
         self._way: GuestSession | None = None
+        self._join()
 
     # --- place --------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from support.swarm_model import LossyLinks, SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.replica import MapReplica
-from swarm.bus.bus import Heard
+from swarm.bus.bus import Heard, LinkChanged
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
 from swarm.client.connection import agreed
 from swarm.client.observer import marked
@@ -125,6 +125,22 @@ def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) ->
             make("one")
         first.leave()
         make("one")
+
+
+def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_thread(
+    world: Swarm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = Program(world)
+    add = program.session.add
+
+    def add_and_tick(part: Any) -> None:
+        add(part)
+        part.tick(world.now_ns)
+        part.on_event(LinkChanged(up=True), world.now_ns)
+
+    monkeypatch.setattr(program.session, "add", add_and_tick)
+    for thing in (program.swarm.vehicle("rover"), program.swarm.target("t9"), program.swarm.observer()):
+        thing.leave()
 
 
 def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(world: Swarm) -> None:
