@@ -24,10 +24,10 @@ from swarm.errors import ConfigError, StoreError, writing
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from launch_scripts.simulation.campaign import Verdict
     from launch_scripts.simulation.study.summary import Summary
     from launch_scripts.simulation.study.sweep import Sweep
     from launch_scripts.simulation.study.trials import Result, Trial
-    from launch_scripts.simulation.trial import Verdict
 
 app = typer.Typer()
 _SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
@@ -132,8 +132,7 @@ def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: in
     import msgspec
 
     from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds
-    from launch_scripts.simulation.trial import SECONDS
+    from launch_scripts.simulation.campaign import MIX, SECONDS, parse_seeds, run_seeds
     from launch_scripts.simulation.worlds import WORLDS
 
     some = parse_seeds(seeds)
@@ -232,10 +231,10 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
         raise ConfigError(
             f"--scheduler: found {quoted(scheduler)}, expected an address such as tcp://127.0.0.1:8786"
         )
-    from launch_scripts.simulation.study.cluster import cores
+    from dask.system import CPU_COUNT
+
     from launch_scripts.simulation.study.study import study_path
-    from launch_scripts.simulation.study.summary import as_json as told
-    from launch_scripts.simulation.study.sweep import Sweep
+    from launch_scripts.simulation.study.sweep import NUMBERS, Sweep
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -244,7 +243,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
         console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
     stops = _hear_stops()
     try:
-        _run(sweep, console, workers or cores(), scheduler, stops)
+        _run(sweep, console, workers or CPU_COUNT, scheduler, stops)
     except KeyboardInterrupt:
         there = sum(trial.key in sweep.store.results for trial in sweep.missing) + kept
         with contextlib.suppress(KeyboardInterrupt):
@@ -252,7 +251,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
         raise
     summary = sweep.finish()
     if as_json:
-        typer.echo(json.dumps(told(summary), indent=2))
+        typer.echo((sweep.folder / NUMBERS).read_text(encoding="utf-8"))
     else:
         _print_summary(summary, sweep.folder)
     return not summary.failing and not summary.missing
@@ -301,32 +300,13 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
 
 
 def _print_summary(summary: Summary, folder: Path) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    from launch_scripts.simulation.study.summary_page import between, number
+    from launch_scripts.simulation.study.summary_page import outcome_table
     from launch_scripts.simulation.study.sweep import PAGE, RESULTS
 
-    console = Console(highlight=False, markup=False, emoji=False)
-    several = len({case.scenario for case in summary.cases}) > 1
     for name in summary.cases[0].outcomes:
-        table = Table("case", title=name, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-        for heading in ("n", "mean", "95 %", "to the first", "95 %"):
-            table.add_column(heading, justify="right")
-        for case in summary.cases:
-            outcome = case.outcomes[name]
-            table.add_row(
-                f"{case.scenario}: {case.label}" if several else case.label,
-                str(len(outcome.values)),
-                number(outcome.mean),
-                between(outcome.mean),
-                number(outcome.difference, "+"),
-                between(outcome.difference, "+"),
-            )
-        console.print(table)
+        typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
     for failure in summary.failing[:_SHOWN_FAILURES]:
-        console.print(f"failed: {failure.replay}", soft_wrap=True)
+        typer.echo(f"failed: {failure.replay}")
     missing = f"; {summary.missing:,} have no result" if summary.missing else ""
-    console.print(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
-    console.print(f"summary: {folder / PAGE}, results: {folder / RESULTS}", soft_wrap=True)
+    typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
+    typer.echo(f"summary: {folder / PAGE}, results: {folder / RESULTS}")

@@ -1,4 +1,4 @@
-"""Many seeds, over several processes of this machine: a stream of verdicts."""
+"""One seed of a world with everything at once, and what it breaks; many seeds, over the processors of a machine."""
 
 from __future__ import annotations
 
@@ -6,22 +6,138 @@ import functools
 import multiprocessing
 import re
 import signal
+import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import msgspec
 
 from launch_scripts.parent_death import end_with_parent
-from launch_scripts.simulation.trial import SECONDS, Verdict, try_seed
-from launch_scripts.simulation.worlds import MIXED
+from launch_scripts.process_table import SIMULATED_ROLES, processes_of
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.laws import BrokenLaw, LawBook
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import MIXED, world
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.agents import plan_agents
+from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
+from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
+from swarm.runtime.process import collected_rarely
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 MIX = "mix"
 """Each seed in the world of `MIXED` that is its turn."""
+SECONDS = 30.0
+"""Faults in the first 18, quiet in the rest: a wait of ten seconds has its place in it."""
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of one seed.
+
+    broken          each law that did not hold
+    longest_wait_s  see `laws.Waits`
+    entered         cells that vehicles entered; near_rovers: within two cells of one; met_rovers: onto one, which
+                    had not been reported in time
+    routed_after_s  from when all processes work again until every vehicle has a route; None if one never has
+    faults          how many of each kind there were
+    """
+
+    world: str
+    seed: int
+    seconds: float
+    broken: list[BrokenLaw]
+    longest_wait_s: float = 0.0
+    routed_after_s: float | None = None
+    captures: int = 0
+    entered: int = 0
+    near_rovers: int = 0
+    met_rovers: int = 0
+    deliveries: int = 0
+    faults: dict[str, int] = {}
+    wall_s: float = 0.0
+
+    @property
+    def replay(self) -> str:
+        """The command that runs this seed again."""
+        return replay_of(self.world, self.seed, self.seconds, SECONDS)
+
+
+def replay_of(name: str, seed: int, seconds: float, usual_s: float, option: str = "seeds") -> str:
+    """The command that runs a seed again: with all faults, or by `option` "seed" without."""
+    seeds = f"{seed}:{seed + 1}" if option == "seeds" else f"{seed}"
+    longer = "" if seconds == usual_s else f" --seconds {seconds:g}"
+    return f"swarm simulate {name} --{option} {seeds}{longer}"
+
+
+def nodes_of(scenario: Scenario) -> list[str]:
+    return [spec.name for spec in processes_of(scenario, SIMULATED_ROLES)]
+
+
+def few_of_layer(scenario: Scenario) -> list[str]:
+    """The nodes of agents that are less than three on the ground, or in the air: each has its own right of way."""
+    layers: dict[bool, list[str]] = {}
+    for plan in plan_agents(scenario):
+        layers.setdefault(flies(scenario, plan.group.vehicle_class), []).append(f"agent-{plan.id}")
+    return [name for layer in layers.values() if len(layer) < FEWEST_FOR_MAJORITY for name in layer]
+
+
+def try_seed(
+    name: str, seed: int, seconds: float = SECONDS, given: Scenario | None = None
+) -> tuple[Verdict, dict[str, Any]]:
+    """Runs a world with all faults of a seed. A service that raises is a broken law, too.
+
+    given  the scenario of that name, where it is none of `WORLDS`
+
+    Returns the verdict, and the figures of the run's report.
+    """
+    if given is None:
+        scenario, terrain = world(name, seed)
+    else:
+        scenario = msgspec.structs.replace(given, seed=seed)
+        terrain = build_terrain(scenario)
+    plan = random_plan(seed, nodes_of(scenario), seconds, few_of_layer(scenario))
+    simulation = Simulation(scenario, faults=plan, terrain=terrain)
+    began_s = time.perf_counter()
+    book = LawBook(simulation)
+    try:
+        with collected_rarely():
+            broken = book.run(seconds)
+    except Exception as error:
+        broken = [raised(error, simulation.now_s)]
+    report = simulation.report(seconds)
+    verdict = Verdict(
+        world=name,
+        seed=seed,
+        seconds=seconds,
+        broken=broken,
+        longest_wait_s=book.waits.longest_s,
+        routed_after_s=book.routed.after_s,
+        captures=report["captures"] or 0,
+        entered=book.bodies.entered,
+        near_rovers=book.bodies.near,
+        met_rovers=len(book.bodies.met),
+        deliveries=simulation.log.deliveries,
+        faults=plan.counts(),
+        wall_s=time.perf_counter() - began_s,
+    )
+    return verdict, report
+
+
+def raised(error: Exception, now_s: float) -> BrokenLaw:
+    """That a service ended by an error."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"
+    return BrokenLaw("a service raised", f"a service raised at {now_s:.1f} s: {text}", now_s)
+
+
+# --- many seeds -----------------------------------------------------------------------------------------------
 
 
 def parse_seeds(text: str, where: str = "--seeds") -> range:
@@ -47,7 +163,7 @@ def run_seeds(
 
 
 def _try(name: str, seconds: float, given: Scenario | None, seed: int) -> Verdict:
-    return try_seed(world_of(name, seed), seed, seconds, given)
+    return try_seed(world_of(name, seed), seed, seconds, given)[0]
 
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Iterator[R]:
@@ -63,13 +179,11 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Itera
     rest = iter(items)
     try:
         while True:
-            for item in islice(rest, jobs + 1 - len(waiting)):
-                waiting.add(executor.submit(work, item))
+            waiting |= {executor.submit(work, item) for item in islice(rest, jobs + 1 - len(waiting))}
             if not waiting:
                 return
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
+            yield from (future.result() for future in done)
     finally:
         if waiting:
             for child in set(multiprocessing.active_children()) - before:

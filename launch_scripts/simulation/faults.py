@@ -95,6 +95,17 @@ class FaultPlan:
     clock_steps: tuple[ClockStep, ...] = ()
     twins: tuple[Twin, ...] = ()
 
+    def counts(self) -> dict[str, int]:
+        """How many faults of each kind there are."""
+        return {
+            "crashes": len(self.crashes),
+            "cuts": len(self.partitions),
+            "one_way_cuts": sum(cut.one_way for cut in self.partitions),
+            "hangs": len(self.hangs),
+            "clock_steps": len(self.clock_steps),
+            "second_lives": len(self.twins),
+        }
+
 
 class FaultyLinks:
     """The `LinkModel` of a plan. Messages from one node to another keep their order unless they are reordered."""

@@ -1,19 +1,31 @@
-"""The laws that hold in every simulation, whatever goes wrong in it: what no process could see."""
+"""The laws that hold in every simulation, whatever goes wrong in it: what no process could see.
+
+A `Law` watches a simulation from its beginning and says at the end what broke. `LawBook` runs a simulation to its
+end and holds it against all of them:
+
+    no collision, no lethal entry     by where vehicles truly are, at every tick of their agents
+    acknowledged marks stay           what a keeper said it had committed is on its disk
+    marks reach everybody             what an agent said four seconds before the end, every process holds
+    replicas are equal                once nobody says anything new
+    bodies are avoided                no vehicle enters a cell that a body had closed in time
+    no wait without a reason          of ten seconds while everything works
+    vehicles are routed again         within five seconds of the last fault
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.world.rovers import Rover
 from launch_scripts.simulation.world.service import TargetsService
+from planner_service.search.target_search import LISTEN_NS
 from shared_map.class_grounds import class_grounds, class_truths
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Event, Heard
@@ -28,9 +40,34 @@ from swarm.wire.topics import BODY, DIGEST
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.service import AgentService
 
-Stamp = tuple[int, int]
-Sets = dict[tuple[str, int], Stamp]
+LONGEST_WAIT_S = 10.0
+ROUTED_WITHIN_S = 5.0
+SETTLED_S = 4.0
+"""What was said so long before the end has reached everybody."""
+LAST_WORDS_S = 6.0
+"""Once nobody says anything new, all hold the same after so long."""
+_SHOWN = 3
+"""Cases of one law that are told of a run: what follows on the first says little."""
+
+Sets = dict[tuple[str, int], tuple[int, int]]
 """(author, tile) -> (epoch, seq)."""
+_NEVER = (-1, -1)
+
+
+class BrokenLaw(msgspec.Struct, frozen=True):
+    """A law that did not hold.
+
+    law       its name, of a few words
+    sentence  what happened
+    at_s      when; None: it is only seen at the end
+    """
+
+    law: str
+    sentence: str
+    at_s: float | None = None
+
+    def __str__(self) -> str:
+        return self.sentence
 
 
 def sets_of(held: Mapping[str, bytes]) -> Sets:
@@ -40,37 +77,45 @@ def sets_of(held: Mapping[str, bytes]) -> Sets:
 
 
 def missing(has: Sets, wanted: Sets) -> list[tuple[str, int]]:
-    return [key for key, stamp in wanted.items() if has.get(key, (-1, -1)) < stamp]
+    return [key for key, stamp in wanted.items() if has.get(key, _NEVER) < stamp]
 
 
-def replica_of(node: Node) -> MapReplica | None:
-    service: Any = node.service
-    replica = getattr(service, "replica", None) or getattr(service, "_replica", None)
-    assert replica is None or isinstance(replica, MapReplica)
-    return replica
+class Law:
+    """Watches the agents of a simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        simulation.after_tick.append(self._ticked)
+
+    def _ticked(self, node: Node) -> None:
+        if isinstance(node.service, AgentService):
+            self.look(node, node.service, self.simulation.now_s)
+
+    def look(self, node: Node, service: AgentService, now_s: float) -> None:
+        """Takes in the state of an agent after a tick."""
+        raise NotImplementedError
+
+    def broken_at_end(self) -> list[BrokenLaw]:
+        """What did not hold, once the run is over."""
+        raise NotImplementedError
 
 
-_ROUTED = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED)
-"""States of vehicles that have what they need; those that search have a place to look at."""
-_HAS_TO_GO = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.WAITING)
-"""States of vehicles that have somewhere to go, or ask for it."""
+class Laws(Law):
+    """No vehicles on one cell, none on a lethal one, and no acknowledged mark lost.
 
-
-class Laws:
-    """Looks at everything in a simulation that no process could see.
-
-    collisions    (when, vehicle, vehicle, cell), by where vehicles truly are; those of a dead process stay put
-    lethal        (when, vehicle, cell), of cells that are lethal in truth to the vehicle's class
+    collisions    by where vehicles truly are; those of a dead process stay put
+    lethal        entries of cells that are lethal in truth to the vehicle's class
     acknowledged  the newest of each set that a keeper ever said it had committed
     """
 
     def __init__(self, simulation: Simulation) -> None:
-        self.simulation = simulation
-        self.collisions: list[tuple[float, str, str, int]] = []
-        self.lethal: list[tuple[float, str, int]] = []
+        super().__init__(simulation)
+        self.collisions: list[BrokenLaw] = []
+        self.lethal: list[BrokenLaw] = []
         self.acknowledged: Sets = {}
-        grounds = class_grounds(simulation.scenario, simulation.terrain, simulation.truth)
-        spawns = spawn_cells(simulation.scenario, simulation.terrain.grid, grounds)
+        scenario = simulation.scenario
+        grounds = class_grounds(scenario, simulation.terrain, simulation.truth)
+        spawns = spawn_cells(scenario, simulation.terrain.grid, grounds)
         self._unmoved = {id: cell for each in spawns.values() for id, cell in each.items()}
         """Vehicle -> cell, of those that no process has placed yet."""
         self._bodies: dict[str, dict[str, int]] = {}
@@ -79,32 +124,24 @@ class Laws:
         """Agent -> the node on which its newest life began."""
         self._passable = {name: np.isfinite(each.truth).ravel() for name, each in grounds.items()}
         """Class of vehicles -> the cells that it may enter, in truth."""
-        self._aloft = {
-            id
-            for plan in plan_agents(simulation.scenario)
-            if flies(simulation.scenario, plan.group.vehicle_class)
-            for id in plan.vehicle_ids
-        }
-        simulation.after_tick.append(self._look)
+        flying = [plan for plan in plan_agents(scenario) if flies(scenario, plan.group.vehicle_class)]
+        self._aloft = {id for plan in flying for id in plan.vehicle_ids}
         simulation.after_boot.append(self._began)
-        bus = simulation.network.bus(OBSERVER, simulation.scenario.network.namespace)
-        bus.subscribe(DIGEST, self._hear)
+        simulation.network.bus(OBSERVER, scenario.network.namespace).subscribe(DIGEST, self._take_digest)
 
     def _began(self, node: Node) -> None:
         if self._last.get(node.spec.id, node) is not node:
             self._bodies.pop(node.name, None)  # they have been driven from elsewhere since
         self._last[node.spec.id] = node
 
-    def _look(self, node: Node) -> None:
-        if not isinstance(node.service, AgentService):
-            return
-        now_s = self.simulation.now_s
-        agent = node.service.agent
+    def look(self, node: Node, service: AgentService, now_s: float) -> None:
+        agent = service.agent
         bodies = self._bodies.setdefault(node.name, {})
         passable = self._passable[agent.plan.group.vehicle_class]
         for id, vehicle in agent.vehicles.items():
             if bodies.get(id) != vehicle.cell and not passable[vehicle.cell]:
-                self.lethal.append((now_s, id, vehicle.cell))
+                text = f"lethal entry at {now_s:.2f} s: {id} on cell {vehicle.cell}"
+                self.lethal.append(BrokenLaw("no lethal entry", text, now_s))
             bodies[id] = vehicle.cell
             self._unmoved.pop(id, None)
         if agent.holdings.replaced:
@@ -112,54 +149,44 @@ class Laws:
         on: dict[tuple[int, bool], str] = {}
         for each in (self._unmoved, *self._bodies.values()):
             for id, cell in each.items():
-                place = cell, id in self._aloft
-                if on.setdefault(place, id) != id:
-                    self.collisions.append((now_s, *sorted((on[place], id)), cell))  # type: ignore[arg-type]
+                other = on.setdefault((cell, id in self._aloft), id)
+                if other != id:
+                    first, second = sorted((other, id))
+                    text = f"collision at {now_s:.2f} s: {first} and {second} on cell {cell}"
+                    self.collisions.append(BrokenLaw("no collision", text, now_s))
 
-    def _hear(self, event: Event) -> None:
+    def _take_digest(self, event: Event) -> None:
         assert isinstance(event, Heard)
         digest = event.message
         if isinstance(digest, Digest) and digest.role == "keeper":
             for key, stamp in sets_of(digest.held).items():
-                self.acknowledged[key] = max(stamp, self.acknowledged.get(key, (-1, -1)))
+                self.acknowledged[key] = max(stamp, self.acknowledged.get(key, _NEVER))
 
-    def said(self) -> Sets:
-        """The newest of each set that a living agent has said itself."""
-        told: Sets = {}
-        for node in self.simulation.nodes.values():
-            replica = replica_of(node)
-            if node.spec.role == "agent" and replica is not None:
-                told |= sets_of(replica.own_digest())
-        return told
-
-    def held(self) -> dict[str, Sets]:
-        """What each living process holds."""
-        nodes = self.simulation.nodes.values()
-        replicas = {node.name: replica_of(node) for node in nodes if node.service is not None}
-        return {
-            name: sets_of(replica.held.ledger.held()) for name, replica in replicas.items() if replica is not None
-        }
-
-    def stored(self) -> Sets:
-        """What is on the keeper's disk."""
+    def broken_at_end(self) -> list[BrokenLaw]:
+        broken = self.collisions[:_SHOWN] + self.lethal[:_SHOWN]
         store = self.simulation.nodes["keeper-0"].store
         assert store is not None
-        return {(each.author, each.tile): (each.epoch, each.seq) for each in store.load()}
+        stored = {(each.author, each.tile): (each.epoch, each.seq) for each in store.load()}
+        if lost := missing(stored, self.acknowledged):
+            text = f"{len(lost)} acknowledged sets are lost, such as {lost[0]}"
+            broken.append(BrokenLaw("acknowledged marks stay", text))
+        return broken
 
 
-class Waits:
+class Waits(Law):
     """How long vehicles are on one cell, less the time to drive across it, although they have somewhere to go and
     nothing is down.
 
     A second counts if every process works: one that is dead, hung or cut off is a reason to stand, as it may hold
     the cell ahead, or be the planner or a warden that a vehicle waits for. Messages that are lost or late are none.
+
+    longest  when the longest wait ended or was last seen, vehicle and cell
     """
 
     def __init__(self, simulation: Simulation) -> None:
+        super().__init__(simulation)
         self.longest_s = 0.0
         self.longest: tuple[float, str, int] | None = None
-        """When the longest wait ended or was last seen, vehicle and cell."""
-        self._simulation = simulation
         truths = class_truths(simulation.scenario, simulation.terrain, simulation.truth)
         across_m = math.sqrt(2) * simulation.terrain.grid.resolution_m
         self._across_s = {name: across_m / simulation.scenario.time_scale * each for name, each in truths.items()}
@@ -167,28 +194,31 @@ class Waits:
         self._waited_s: dict[str, tuple[int, float]] = {}
         """Vehicle -> its cell, and the seconds that count since it came there."""
         self._looked_s: dict[str, float] = {}
-        simulation.after_tick.append(self._look)
 
-    def _look(self, node: Node) -> None:
-        if not isinstance(node.service, AgentService):
-            return
-        now_s = self._simulation.now_s
+    def look(self, node: Node, service: AgentService, now_s: float) -> None:
         passed_s = now_s - self._looked_s.get(node.name, now_s)
         self._looked_s[node.name] = now_s
-        counts_s = 0.0 if self._simulation.disturbed() else passed_s
-        across_s = self._across_s[node.service.agent.plan.group.vehicle_class]
-        for vehicle in node.service.agent.vehicles.values():
+        counts_s = 0.0 if self.simulation.disturbed() else passed_s
+        across_s = self._across_s[service.agent.plan.group.vehicle_class]
+        for vehicle in service.agent.vehicles.values():
             cell, waited_s = self._waited_s.get(vehicle.id, (-1, 0.0))
-            waits = vehicle.state in _HAS_TO_GO
-            waits = waits and not node.service.agent.stopped(vehicle.id)
-            waited_s = waited_s + counts_s if waits and cell == vehicle.cell else 0.0
+            to_go = vehicle.state in (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.WAITING)
+            waits = to_go and cell == vehicle.cell and not service.agent.stopped(vehicle.id)
+            waited_s = waited_s + counts_s if waits else 0.0
             self._waited_s[vehicle.id] = (vehicle.cell, waited_s)
             wait_s = waited_s - across_s.item(vehicle.cell)
             if wait_s > self.longest_s:
                 self.longest_s, self.longest = wait_s, (now_s, vehicle.id, vehicle.cell)
 
+    def broken_at_end(self) -> list[BrokenLaw]:
+        if self.longest is None or self.longest_s <= LONGEST_WAIT_S:
+            return []
+        when_s, vehicle, cell = self.longest
+        text = f"{vehicle} waits {self.longest_s:.1f} s on cell {cell} without a reason, until {when_s:.1f} s"
+        return [BrokenLaw("no wait without a reason", text, when_s)]
 
-class Routed:
+
+class Routed(Law):
     """When vehicles have a route, to their target or to where they search for it, or their target within reach,
     once nothing goes wrong any more.
 
@@ -196,24 +226,24 @@ class Routed:
     """
 
     def __init__(self, simulation: Simulation) -> None:
+        super().__init__(simulation)
         self.whole_s: float | None = None
-        self._simulation = simulation
         self._at_s: dict[str, float] = {}
-        simulation.after_tick.append(self._look)
 
-    def _look(self, node: Node) -> None:
-        simulation, now_s = self._simulation, self._simulation.now_s
+    def _ticked(self, node: Node) -> None:
+        simulation, now_s = self.simulation, self.simulation.now_s
         if self.whole_s is None and now_s >= (simulation.faults.quiet_s or 0.0) and not simulation.disturbed():
             self.whole_s = now_s
-        if self.whole_s is None or not isinstance(node.service, AgentService):
-            return
-        for vehicle in node.service.agent.vehicles.values():
-            if vehicle.state in _ROUTED:
+        super()._ticked(node)
+
+    def look(self, node: Node, service: AgentService, now_s: float) -> None:
+        for vehicle in service.agent.vehicles.values() if self.whole_s is not None else ():
+            if vehicle.state in (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.ARRIVED):
                 self._at_s.setdefault(vehicle.id, now_s)
 
     def missing(self) -> list[str]:
         """Vehicles that have had no route since."""
-        every = [id for plan in plan_agents(self._simulation.scenario) for id in plan.vehicle_ids]
+        every = [id for plan in plan_agents(self.simulation.scenario) for id in plan.vehicle_ids]
         return [id for id in every if id not in self._at_s]
 
     @property
@@ -223,31 +253,39 @@ class Routed:
             return None
         return max(self._at_s.values()) - self.whole_s
 
+    def broken_at_end(self) -> list[BrokenLaw]:
+        if self.whole_s is None:
+            return [BrokenLaw("processes start again", "a process did not start again")]
+        if late := self.missing():
+            text = f"{len(late)} vehicles have no route any more, such as {', '.join(late[:_SHOWN])}"
+            return [BrokenLaw("vehicles are routed again", text)]
+        # A planner that has just begun listens for a while before it searches for a target that nobody tracks.
+        listens_s = LISTEN_NS / NS_PER_S if self.simulation.scenario.untracked else 0.0
+        if (after_s := self.after_s) is None or after_s <= ROUTED_WITHIN_S + listens_s:
+            return []
+        text = f"the last vehicle has a route {after_s:.1f} s after the last fault"
+        return [BrokenLaw("vehicles are routed again", text, after_s)]
 
-@dataclass(slots=True)
-class _DeliveredBody:
-    body: Body
-    at_ns: int
 
-
-class BodyLaw:
+class BodyLaw(Law):
     """No vehicle drives into a body that was reported in time: judged by what the network delivered to each agent,
     and by where rovers truly are, at every step of every vehicle.
 
-    broken   (when, vehicle, body, cell): it entered a cell that a report had closed, which its agent had been
-             delivered at an earlier tick, and whose lease lasted
+    broken   a vehicle entered a cell that a report had closed, which its agent had been delivered at an earlier
+             tick, and whose lease lasted
     met      (when, vehicle, rover, cell): it entered a cell on which a rover truly was, reported in time or not
     entered  cells that vehicles entered in all
     near     of these, how many were within two cells of a rover
     """
 
     def __init__(self, simulation: Simulation) -> None:
-        self.simulation = simulation
-        self.broken: list[tuple[float, str, str, int]] = []
+        super().__init__(simulation)
+        self.broken: list[BrokenLaw] = []
         self.met: list[tuple[float, str, str, int]] = []
         self.entered = self.near = 0
         self._grid = simulation.terrain.grid
-        self._delivered: dict[str, dict[tuple[str, int], _DeliveredBody]] = {}
+        self._delivered: dict[str, dict[tuple[str, int], tuple[Body, int]]] = {}
+        """Node -> (body, incarnation) -> the newest report, and when it was delivered."""
         self._looked_ns: dict[str, int] = {}
         self._cells: dict[tuple[str, str], int] = {}
         """(node, vehicle) -> its cell: two lives of an agent each have their own idea of it."""
@@ -261,7 +299,6 @@ class BodyLaw:
 
         simulation.network.trace = trace
         simulation.after_boot.append(self._boot)
-        simulation.after_tick.append(self._look)
 
     def _boot(self, node: Node) -> None:
         self._delivered.pop(node.name, None)
@@ -270,37 +307,36 @@ class BodyLaw:
 
     def _deliver(self, body: Body, agent: str, now_ns: int) -> None:
         known = self._delivered.setdefault(agent, {})
-        key = body.id, body.incarnation
-        last = known.get(key)
-        if last is None or body.seq > last.body.seq or now_ns - last.at_ns >= last.body.lease_s * NS_PER_S:
-            known[key] = _DeliveredBody(body, now_ns)
+        last = known.get((body.id, body.incarnation))
+        if last is None or body.seq > last[0].seq or now_ns - last[1] >= last[0].lease_s * NS_PER_S:
+            known[body.id, body.incarnation] = body, now_ns
 
-    def _look(self, node: Node) -> None:
-        if not isinstance(node.service, AgentService):
-            return
-        now_ns, now_s = self.simulation.scheduler.clock.now_ns(), self.simulation.now_s
+    def look(self, node: Node, service: AgentService, now_s: float) -> None:
+        now_ns = self.simulation.scheduler.clock.now_ns()
         looked_ns = self._looked_ns.get(node.name, now_ns)
         self._looked_ns[node.name] = now_ns
-        for id, vehicle in node.service.agent.vehicles.items():
-            before, self._cells[node.name, id] = self._cells.get((node.name, id)), vehicle.cell
-            if before is None or before == vehicle.cell:
+        for id, vehicle in service.agent.vehicles.items():
+            cell = vehicle.cell
+            before, self._cells[node.name, id] = self._cells.get((node.name, id)), cell
+            if before is None or before == cell:
                 continue
             self.entered += 1
-            for (name, _), each in self._delivered.get(node.name, {}).items():
-                lasts = each.at_ns <= looked_ns and now_ns < each.at_ns + each.body.lease_s * NS_PER_S
-                far_m = from_square_m(self._grid, vehicle.cell, each.body.x_m, each.body.y_m)
-                if lasts and far_m < each.body.radius_m:
-                    self.broken.append((now_s, id, name, vehicle.cell))
-            for rover in self._rovers():
-                far_m = from_square_m(self._grid, vehicle.cell, rover.x_m, rover.y_m) - rover.config.radius_m
-                self.near += far_m <= 2 * self._grid.resolution_m
-                if far_m < 0.0:
-                    self.met.append((now_s, id, rover.id, vehicle.cell))
+            for body, at_ns in self._delivered.get(node.name, {}).values():
+                lasts = at_ns <= looked_ns and now_ns < at_ns + body.lease_s * NS_PER_S
+                if lasts and from_square_m(self._grid, cell, body.x_m, body.y_m) < body.radius_m:
+                    text = f"driven into body {body.id} at {now_s:.2f} s: {id} on cell {cell}"
+                    self.broken.append(BrokenLaw("bodies are avoided", text, now_s))
+            for other in self.simulation.nodes.values():
+                if not isinstance(other.service, TargetsService) or not other.service.leads:
+                    continue
+                for rover in other.service.rovers.all:
+                    far_m = from_square_m(self._grid, cell, rover.x_m, rover.y_m) - rover.config.radius_m
+                    self.near += far_m <= 2 * self._grid.resolution_m
+                    if far_m < 0.0:
+                        self.met.append((now_s, id, rover.id, cell))
 
-    def _rovers(self) -> Iterator[Rover]:
-        for node in self.simulation.nodes.values():
-            if isinstance(node.service, TargetsService) and node.service.leads:
-                yield from node.service.rovers.all
+    def broken_at_end(self) -> list[BrokenLaw]:
+        return self.broken[:_SHOWN]
 
 
 def from_square_m(grid: GridSpec, cell: int, x_m: float, y_m: float) -> float:
@@ -310,3 +346,50 @@ def from_square_m(grid: GridSpec, cell: int, x_m: float, y_m: float) -> float:
     east = max(west_m - x_m, x_m - west_m - grid.resolution_m, 0.0)
     south = max(y_m - north_m, north_m - grid.resolution_m - y_m, 0.0)
     return math.hypot(east, south)
+
+
+class LawBook:
+    """Runs a simulation to its end and holds it against every law."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.bodies, self.laws = BodyLaw(simulation), Laws(simulation)
+        self.waits, self.routed = Waits(simulation), Routed(simulation)
+
+    def run(self, seconds: float) -> list[BrokenLaw]:
+        """Returns the laws that broke. At the end the agents die, so that nothing new is said."""
+        simulation = self.simulation
+        simulation.run_until(seconds - SETTLED_S)
+        said: Sets = {}
+        for name, replica in self._replicas().items():
+            if simulation.nodes[name].spec.role == "agent":
+                said |= sets_of(replica.own_digest())
+        simulation.run_until(seconds)
+        broken: list[BrokenLaw] = []
+        for name, replica in self._replicas().items() if simulation.scenario.map.interest == "all" else ():
+            if lacks := missing(sets_of(replica.held.ledger.held()), said):
+                first = f"{len(lacks)} sets that were said {SETTLED_S:g} s ago, such as {lacks[0]}"
+                broken.append(BrokenLaw("marks reach everybody", f"{name} lacks {first}"))
+        for node in simulation.nodes.values():
+            if node.spec.role == "agent":
+                node.crash()
+        simulation.run_until(seconds + LAST_WORDS_S)
+        for law in (self.laws, self.bodies, self.waits, self.routed):
+            broken += law.broken_at_end()
+        prints: dict[object, list[str]] = {}
+        for name, replica in self._replicas().items():
+            prints.setdefault(replica.held.fingerprint(), []).append(name)
+        if len(prints) > 1:
+            apart = " | ".join(", ".join(names) for names in prints.values())
+            broken.append(BrokenLaw("replicas are equal", f"replicas differ: {apart}"))
+        return broken
+
+    def _replicas(self) -> dict[str, MapReplica]:
+        """The map of each living process that has one, by the name of its node."""
+        found: dict[str, MapReplica] = {}
+        for name, node in self.simulation.nodes.items():
+            service: Any = node.service
+            replica = getattr(service, "replica", None) or getattr(service, "_replica", None)
+            if isinstance(replica, MapReplica):
+                found[name] = replica
+        return found

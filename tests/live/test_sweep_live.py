@@ -15,7 +15,7 @@ from support.small_study import STUDY, dies_of_seed_one, write_study
 
 from launch_scripts.simulation.study import cluster
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
-from launch_scripts.simulation.study.study import load_study, plan, trials_of
+from launch_scripts.simulation.study.study import load_study, plan
 from launch_scripts.simulation.study.sweep import RESULTS, ResultStore, Sweep
 from launch_scripts.simulation.study.trials import run_trial
 from swarm.errors import BusError
@@ -39,7 +39,7 @@ def alive(pid: int) -> bool:
 
 
 def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: Path):
-    trials = list(trials_of(plan(load_study(write_study(tmp_path)), tmp_path, "x")))
+    trials = [trial for case in plan(load_study(write_study(tmp_path)), tmp_path, "x") for trial in case.trials]
     found: dict[str, dict[str, float]] = {}
     with local_client(2) as client:
         assert client.scheduler_info()["address"].startswith("tcp://127.0.0.1:")
@@ -119,7 +119,7 @@ def _left(session: int) -> list[int]:
 def test_a_scheduler_that_is_there_is_used_and_one_that_is_not_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    [trial, *_] = trials_of(plan(load_study(write_study(tmp_path)), tmp_path, "x"))
+    trial = plan(load_study(write_study(tmp_path)), tmp_path, "x")[0].trials[0]
     with local_client(1) as there, client_of(there.scheduler_info()["address"]) as client:
         [(_, result)] = run_trials(client, [trial])
         assert result is not None

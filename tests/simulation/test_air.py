@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from support.class_world import captures_by_class, made
 
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.air import clearance_floor
 from swarm.config.load import parse_scenario
@@ -80,7 +80,7 @@ def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(
             cells[name] |= found
 
     simulation.after_tick.append(look)
-    trial = Trial(simulation)
+    trial = LawBook(simulation)
     assert trial.run(SECONDS) == []
     report = simulation.report(SECONDS)
     assert report["collisions"] == report["lethal_entries"] == 0

@@ -7,10 +7,10 @@ import math
 import msgspec
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import BodyLaw
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.worlds import CROWDS, SMALL, crowd, seeded
 from swarm.config.scenario import RoverConfig

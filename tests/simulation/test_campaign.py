@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import gc
 import json
+import re
 
 import msgspec
 import pytest
 
 from launch_scripts.commands.simulation_commands import simulate_seeds
-from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds, world_of
+from launch_scripts.simulation.campaign import MIX, Verdict, parse_seeds, run_seeds, try_seed, world_of
 from launch_scripts.simulation.faults import FaultPlan
+from launch_scripts.simulation.laws import BrokenLaw, LawBook
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import BrokenLaw, Trial, Verdict, try_seed
 from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
 from swarm.errors import ConfigError
 
@@ -38,18 +39,18 @@ def test_the_mix_takes_every_world_in_turn_and_a_replay_names_it():
 def test_a_scenario_of_ones_own_is_tried_too():
     given = msgspec.structs.replace(SMALL, name="mine")
     [verdict] = run_seeds("mine", range(3, 4), jobs=1, seconds=4, given=given)
-    assert same(verdict) == same(msgspec.structs.replace(try_seed("small", 3, 4), world="mine"))
+    assert same(verdict) == same(msgspec.structs.replace(try_seed("small", 3, 4)[0], world="mine"))
 
 
 def test_garbage_is_collected_rarely_while_a_seed_runs_and_as_before_once_it_has(monkeypatch: pytest.MonkeyPatch):
     before, meanwhile = gc.get_threshold(), []
 
-    def run(trial: Trial, seconds: float) -> list[str]:
+    def run(trial: LawBook, seconds: float) -> list[str]:
         meanwhile.append(gc.get_threshold()[0])
         raise RuntimeError("a service fails")
 
-    monkeypatch.setattr(Trial, "run", run)
-    assert "a service fails" in str(try_seed("small", 1, 4).broken[0])
+    monkeypatch.setattr(LawBook, "run", run)
+    assert "a service fails" in str(try_seed("small", 1, 4)[0].broken[0])
     assert meanwhile[0] >= 10 * before[0]
     assert gc.get_threshold() == before
 
@@ -63,7 +64,7 @@ def test_seeds_that_are_no_range_are_refused_with_what_was_expected(text):
 
 def test_a_process_that_never_comes_back_breaks_a_law():
     simulation = Simulation(seeded(1), faults=FaultPlan(quiet_s=4))
-    trial = Trial(simulation)
+    trial = LawBook(simulation)
     simulation.run_until(3)
     simulation.nodes["agent-a1"].crash()
     assert "a process did not start again" in map(str, trial.run(10))
@@ -71,19 +72,24 @@ def test_a_process_that_never_comes_back_breaks_a_law():
 
 def test_each_law_has_its_sentence():
     simulation = Simulation(seeded(1), faults=FaultPlan(quiet_s=4))
-    trial = Trial(simulation)
-    trial.laws.collisions.append((1.0, "v", "w", 3))
-    trial.laws.lethal.append((2.0, "v", 4))
-    trial.laws.acknowledged["nobody.a9.1", 0] = (1, 1)
-    trial.waits.longest_s, trial.waits.longest = 11.0, (12.0, "v", 5)
-    broken = trial.run(10)
-    assert [law.at_s for law in broken] == [1.0, 2.0, None, 12.0]
-    assert [str(law) for law in broken] == [
-        "collision at 1.00 s: v and w on cell 3",
-        "lethal entry at 2.00 s: v on cell 4",
-        "1 acknowledged sets are lost, such as ('nobody.a9.1', 0)",
-        "v waits 11.0 s on cell 5 without a reason, until 12.0 s",
-    ]
+    book = LawBook(simulation)
+    simulation.run_until(3)
+    book.laws._unmoved |= {f"w{cell}": cell for cell in range(simulation.terrain.grid.cells)}
+    book.laws._passable["ground"][:] = False
+    book.laws.acknowledged["nobody.a9.1", 0] = (1, 1)
+    book.waits.longest_s, book.waits.longest = 11.0, (12.0, "v", 5)
+    broken = {law.law: law for law in book.run(10)}
+    said = {
+        "no collision": r"collision at 3.\d\d s: a\d-\d\d and w(\d+) on cell \1",
+        "no lethal entry": r"lethal entry at 3.\d\d s: a\d-\d\d on cell \d+",
+        "acknowledged marks stay": r"1 acknowledged sets are lost, such as \('nobody.a9.1', 0\)",
+        "no wait without a reason": "v waits 11.0 s on cell 5 without a reason, until 12.0 s",
+    }
+    assert broken.keys() == said.keys()
+    for law, sentence in said.items():
+        assert re.fullmatch(sentence, str(broken[law]))
+    assert broken["acknowledged marks stay"].at_s is None
+    assert broken["no wait without a reason"].at_s == 12.0
 
 
 def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
@@ -93,7 +99,7 @@ def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
     assert printed["failing"] == []
     assert printed["deliveries"] > 1000
     broken = Verdict(world="small", seed=3, seconds=30.0, broken=[BrokenLaw("a law", "it broke")])
-    monkeypatch.setattr("launch_scripts.simulation.campaign.try_seed", lambda *_: broken)
+    monkeypatch.setattr("launch_scripts.simulation.campaign.try_seed", lambda *_: (broken, {}))
     assert not simulate_seeds("small", "3:4", None, 1, as_json=False)
     out = capsys.readouterr().out
     assert "FAILED small seed 3" in out

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from support.class_world import captures_by_class, made
 from support.effort import few
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook, Laws
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial, nodes_of
 from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.keeper.zone_orders import zones_of
 from shared_map.terrain.terrain import build_truth
@@ -76,7 +76,7 @@ def grounds_of(simulation: Simulation) -> dict[str, ClassGround]:
 def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_own() -> None:
     scenario, terrain = made(_TEXT)
     simulation = Simulation(scenario, terrain=terrain)
-    trial, driven = Trial(simulation), Driven(simulation)
+    trial, driven = LawBook(simulation), Driven(simulation)
     assert trial.run(LONG_S) == []
     report = simulation.report(LONG_S)
     assert report["lethal_entries"] == report["collisions"] == 0

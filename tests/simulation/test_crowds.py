@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook, Laws
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial, nodes_of
 from launch_scripts.simulation.worlds import CROWDS, crowd, seeded
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.service import AgentService
@@ -24,7 +24,7 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
     plan = random_plan(1, nodes_of(scenario), SECONDS)
     assert plan.crashes and plan.partitions and plan.hangs  # noqa: PT018
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
-    assert Trial(simulation).run(SECONDS) == []
+    assert LawBook(simulation).run(SECONDS) == []
     assert simulation.report(SECONDS)["captures"] > 5
 
 

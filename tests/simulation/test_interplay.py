@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from support.interplay import Interplay
 
-from launch_scripts.simulation.trial import ROUTED_WITHIN_S
+from launch_scripts.simulation.laws import ROUTED_WITHIN_S
 
 
 @pytest.mark.parametrize("seed", [4, pytest.param(9, marks=pytest.mark.thorough), 13])

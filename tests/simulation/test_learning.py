@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import seeded
 from shared_map.cost_map import CostMap
 from shared_map.learning.factors import name_of

@@ -5,10 +5,10 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import WIDE, seeded
 from vehicle_agent.service import AgentService
 

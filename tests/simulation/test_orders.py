@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook, Laws
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial, nodes_of
 from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.worlds import SMALL, seeded
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -221,7 +221,7 @@ def test_no_law_breaks_whatever_is_ordered_and_whatever_goes_wrong(seed: int, te
     quiet_s = plan.quiet_s or 18.0
     for at_s, order in random_orders(seed, terrain, quiet_s + 1.5):
         simulation.order(at_s, order)
-    trial = Trial(simulation)
+    trial = LawBook(simulation)
     assert trial.run(34.0) == []
     # The agents are dead by now; all others know the same orders, those of the keeper.
     services: list[Any] = [node.service for node in simulation.nodes.values() if node.service is not None]

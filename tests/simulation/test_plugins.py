@@ -11,8 +11,8 @@ import pytest
 from support.plugin_modules import forgotten_afterwards
 from support.plugin_pages import write_all_examples, write_example
 
+from launch_scripts.simulation.campaign import try_seed
 from launch_scripts.simulation.simulate import Simulation, simulate
-from launch_scripts.simulation.trial import try_seed
 from swarm.config.load import load_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS
 from swarm.wire.messages.processes import Note

@@ -6,8 +6,8 @@ import math
 
 import msgspec
 
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.load import parse_scenario
 from vehicle_agent.service import AgentService
@@ -55,7 +55,7 @@ def test_vehicles_drive_straight_and_capture_and_no_law_breaks() -> None:
     for routes in ("pulled", "grid"):
         planner = msgspec.structs.replace(_SCENARIO.planner, routes=routes)
         simulation = Simulation(msgspec.structs.replace(_SCENARIO, planner=planner), terrain=terrain)
-        trial, headings = Trial(simulation), Headings(simulation)
+        trial, headings = LawBook(simulation), Headings(simulation)
         assert trial.run(SECONDS) == []
         report = simulation.report(SECONDS)
         assert report["lethal_entries"] == report["collisions"] == 0

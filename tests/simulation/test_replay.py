@@ -9,15 +9,15 @@ import sys
 
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import simulate
-from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import SMALL, seeded
 
 RUN = """
 import json, sys
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.worlds import SMALL
 from launch_scripts.simulation.simulate import simulate
 with open(sys.argv[1], "w") as trace:

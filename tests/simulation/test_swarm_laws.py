@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from launch_scripts.simulation import simulate as simulate_module
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook, Laws
 from launch_scripts.simulation.simulate import Simulation, simulate
-from launch_scripts.simulation.trial import Trial, nodes_of
 from launch_scripts.simulation.worlds import SMALL, seeded
 from swarm.config.load import load_scenario
 from vehicle_agent.agent import Agent
@@ -30,7 +30,7 @@ def agent_of(simulation: Simulation, name: str) -> Agent:
 
 def check_all(simulation: Simulation) -> Laws:
     """Run to the end; every law holds."""
-    trial = Trial(simulation)
+    trial = LawBook(simulation)
     assert trial.run(SECONDS) == []
     planners: list[np.ndarray] = [
         simulation.nodes[name].service._cost_map.pace_s_per_m  # type: ignore[union-attr]

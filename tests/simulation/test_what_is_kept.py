@@ -11,10 +11,10 @@ from typing import Any
 import msgspec
 import pytest
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import SMALL, WIDE, crowd, seeded
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agents import agent_of

@@ -14,9 +14,9 @@ from typing import Any
 import msgspec
 
 from launch_scripts.launcher.options import find_scenario
+from launch_scripts.simulation.campaign import few_of_layer, nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import few_of_layer, nodes_of
 from launch_scripts.simulation.worlds import WORLDS, world
 
 SECONDS = 12.0

@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Partition, random_plan
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import Trial, nodes_of
 from launch_scripts.simulation.worlds import SMALL, crowd, seeded
 from shared_map.terrain.terrain import build_terrain
 from swarm.bus.bus import Event
@@ -195,7 +196,7 @@ class Interplay:
         self._seen: set[str] = set()
         self._towards: dict[str, int | None] = {}
         simulation.after_tick.append(self._forget_removed)
-        self.trial = Trial(simulation)
+        self.trial = LawBook(simulation)
         simulation.after_tick.append(self._look)
         self.robots = [Robot(self, f"robot-{n}", chance.choice(self.free)) for n in range(2)]
         self.walkers: list[Walker] = []
@@ -404,8 +405,7 @@ class Interplay:
         self._advance(self.seconds - 5.0)
         broken = self.broken
         broken += self._orders_obeyed()
-        result = self.trial.run(self.seconds)
-        for text in result:
+        for text in map(str, self.trial.run(self.seconds)):
             if "vehicles have no route any more" in text:
                 lost = [id for id in self.trial.routed.missing() if id not in self.removed]
                 if lost:
@@ -414,9 +414,7 @@ class Interplay:
             if text.startswith("driven into body"):
                 continue
             broken.append(text)
-        for when_s, vehicle, name, cell in self.trial.bodies.broken:
-            if not name.startswith("flood-"):
-                broken.append(f"driven into body {name} at {when_s:.2f}: {vehicle} on {cell}")
+        broken += [str(law) for law in self.trial.bodies.broken if "into body flood-" not in str(law)]
         routed = self.trial.routed
         if routed.whole_s is not None:
             late = max((at for id, at in routed._at_s.items() if id not in self.removed), default=0.0)

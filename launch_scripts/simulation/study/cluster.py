@@ -5,10 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
-import math
-import os
 import tempfile
-import time
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -24,8 +21,6 @@ AHEAD = 3
 MOST_DEATHS = 3
 """A trial whose worker has died more often than this is given up: it kills them itself."""
 _CONNECT_S = 10.0
-_WORKERS_COUNT_S = 2.0
-"""How often the workers are counted: others may join."""
 _SETTINGS: dict[str, Any] = {
     # A profiler, clocks that tick 50 times a second in each of five event loops, and watches on memory and the
     # interpreter take it from the simulation: together 7 % of a core with two workers, without them 1 %.
@@ -39,14 +34,6 @@ _SETTINGS: dict[str, Any] = {
     # A worker has the trial that it runs and no other: one that waits there would be blamed for a death, too.
     "distributed.scheduler.worker-saturation": 1.0,
 }
-
-
-def cores() -> int:
-    """Processors that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not Linux
-        return os.cpu_count() or 1
 
 
 # Dask runs this text in each worker. A Ctrl-C reaches the whole process group; the sweep alone acts upon it.
@@ -95,17 +82,12 @@ def run_trials(client: Client, trials: Iterable[Trial]) -> Iterator[tuple[Trial,
     given: dict[str, Trial] = {}
     done = as_completed(loop=client.loop)
 
-    room, asked_s = 0, -math.inf
-
     def fill() -> None:
-        nonlocal room, asked_s
-        if time.monotonic() - asked_s > _WORKERS_COUNT_S:
-            threads = sum(each["nthreads"] for each in client.scheduler_info()["workers"].values())
-            room, asked_s = AHEAD * max(1, threads), time.monotonic()
+        workers = client.scheduler_info()["workers"].values()  # others may join
+        room = AHEAD * max(1, sum(each["nthreads"] for each in workers))
         for trial in itertools.islice(rest, max(0, room - len(given))):
-            future = client.submit(run_trial, trial, key=trial.key, retries=0)
             given[trial.key] = trial
-            done.add(future)
+            done.add(client.submit(run_trial, trial, key=trial.key, retries=0))
 
     fill()
     while given:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,9 +22,8 @@ from msgspec import Meta
 
 from launch_scripts.deploy.host_scenario import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
-from launch_scripts.simulation.campaign import MIX, parse_seeds, world_of
+from launch_scripts.simulation.campaign import MIX, SECONDS, parse_seeds, world_of
 from launch_scripts.simulation.study.trials import Trial, code_version
-from launch_scripts.simulation.trial import SECONDS
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
@@ -36,6 +36,8 @@ MOST_TRIALS = 1_000_000
 _LONGEST = 200
 """Letters of a name: pictures are called by it."""
 _LONGEST_PATH = 4096
+SMALL_WORLDS = (MIX, *WORLDS)
+_hash = partial(hashlib.blake2b, digest_size=12)
 STUDIES = Path(__file__).parents[2] / "studies"
 """The project's own."""
 
@@ -65,10 +67,6 @@ class Study(Section, frozen=True, kw_only=True):
     parameters: Options = msgspec.field(default_factory=dict)
     variants: dict[str, Options] = msgspec.field(default_factory=dict)
 
-    @property
-    def seed_range(self) -> range:
-        return parse_seeds(self.seeds, "seeds")
-
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
     """A scenario with settings, of which each seed is a trial.
@@ -77,12 +75,23 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     variant   its name; empty if the study has none
     label     what tables call it: the variant and the parameters
     settings  dotted key -> value, of both
+    path      of the scenario's file as the study names it, or its built-in name; that of a small world
+    given     the scenario that it means; None: that of a small world
+    trials    planned of it
     """
 
     scenario: str
     variant: str
     label: str
     settings: dict[str, Any]
+    path: str = ""
+    given: Scenario | None = None
+    trials: tuple[Trial, ...] = ()
+
+    @property
+    def is_own(self) -> bool:
+        """Whether no file says what the case is: its scenario is changed."""
+        return self.given is not None and bool(self.settings)
 
 
 def study_path(name: str) -> Path:
@@ -102,13 +111,9 @@ def study_names() -> list[str]:
 
 
 def load_study(path: Path) -> Study:
-    """Read and check a study. Raises ConfigError that names the file and the key."""
-    return parse_study(read_text(path, FileKind.STUDY), str(path), _name_of(path))
-
-
-def _name_of(path: Path) -> str:
-    """A name as studies have them, from that of a file."""
-    return re.sub("[^A-Za-z0-9_.-]+", "-", path.stem).lstrip(".-")[:41] or "study"
+    """Reads and checks a study. Raises ConfigError that names the file and the key."""
+    name = re.sub("[^A-Za-z0-9_.-]+", "-", path.stem).lstrip(".-")[:41]
+    return parse_study(read_text(path, FileKind.STUDY), str(path), name or "study")
 
 
 def is_file(path: Path) -> bool:
@@ -129,10 +134,9 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
     except msgspec.ValidationError as error:
         said = explain(str(error), raw, Study).replace("scenario: missing", "study: missing")
         raise ConfigError(f"{source}: {said}") from error
-    try:
-        _check(study)
-    except ConfigError as error:
-        raise ConfigError(f"{source}: {error}") from error
+    seeds = parse_seeds(study.seeds, f"{source}: seeds")
+    if fault := next(_faults(study, len(seeds)), None):
+        raise ConfigError(f"{source}: {fault}")
     return study
 
 
@@ -155,58 +159,42 @@ def cases_of(study: Study) -> list[Case]:
     ]
 
 
-def _check(study: Study) -> None:
-    """What the types do not say. Raises ConfigError."""
-    count = len(study.seed_range) * len(study.scenarios) * max(1, len(study.variants))
-    for key, values in flat(study.parameters):
+def _faults(study: Study, seeds: int) -> Iterator[str]:
+    """What is wrong with a study beyond what its types say, the most important first."""
+    varied = dict(flat(study.parameters))
+    settings = [(name, key) for name, of in study.variants.items() for key, _ in flat(of)]
+    for key, values in varied.items():
         if not isinstance(values, list) or not values:
-            raise ConfigError(f"parameters.{key}: found {quoted(values)}, expected a list of values")
-        if (twice := _twice(values)) is not None:
-            raise ConfigError(f"parameters.{key}: found {quoted(twice[0])} twice")
-        count *= len(values)
-    if count > MOST_TRIALS:
-        raise ConfigError(f"it has {count:,} trials, expected at most {MOST_TRIALS:,}")
-    for what, given in (("scenarios", study.scenarios), ("outcomes", study.outcomes)):
-        if (same := _twice(given)) is not None:
-            raise ConfigError(f"{what}: found {quoted(same[0])} twice")
-    for what, names in (("scenarios", study.scenarios), ("outcomes", study.outcomes), ("variants", study.variants)):
+            yield f"parameters.{key}: found {quoted(values)}, expected a list of values"
+    lists = {"scenarios": study.scenarios, "outcomes": study.outcomes}
+    for what, given in (lists | {f"parameters.{key}": values for key, values in varied.items()}).items():
+        # 1, 1.0 and true are three values in TOML, as they are written.
+        for text, many in Counter(map(repr, given)).items():
+            if many > 1:
+                yield f"{what}: found {quoted(next(each for each in given if repr(each) == text))} twice"
+    cases = math.prod(map(len, varied.values())) * len(study.scenarios) * max(1, len(study.variants))
+    if cases * seeds > MOST_TRIALS:
+        yield f"it has {cases * seeds:,} trials, expected at most {MOST_TRIALS:,}"
+    for what, names in (lists | {"variants": tuple(study.variants)}).items():
         longest = _LONGEST_PATH if what == "scenarios" else _LONGEST
         for name in names:
             if not name.isprintable() or not 0 < len(name) <= longest:
-                raise ConfigError(f"{what}: found {quoted(name)}, expected 1 to {longest} characters that print")
+                yield f"{what}: found {quoted(name)}, expected 1 to {longest} characters that print"
     if not study.about.replace("\n", "").isprintable():
-        raise ConfigError(f"about: found {quoted(study.about)}, expected printable text")
-    varied = dict(flat(study.parameters))
-    for name, settings in study.variants.items():
-        for key, _ in flat(settings):
-            if key in varied:
-                raise ConfigError(f"variants.{name}.{key}: it is one of the parameters, too")
-    for name in _worlds(study):
-        if not study.faults:
-            raise ConfigError(f"scenarios: {name!r} is a small world, which goes with faults = true")
-        if varied or any(study.variants.values()):
-            raise ConfigError(f"scenarios: {name!r} is a small world, which takes no parameters and no variants")
-    settled = {key for settings in study.variants.values() for key, _ in flat(settings)} | varied.keys()
+        yield f"about: found {quoted(study.about)}, expected printable text"
+    for name, key in settings:
+        if key in varied:
+            yield f"variants.{name}.{key}: it is one of the parameters, too"
+    for name in study.scenarios:
+        if name in SMALL_WORLDS and not study.faults:
+            yield f"scenarios: {name!r} is a small world, which goes with faults = true"
+        if name in SMALL_WORLDS and (varied or settings):
+            yield f"scenarios: {name!r} is a small world, which takes no parameters and no variants"
+    settled = {key for _, key in settings} | varied.keys()
     if "seed" in settled:
-        raise ConfigError("seed: it is no setting of a study, whose `seeds` are those of each case")
+        yield "seed: it is no setting of a study, whose `seeds` are those of each case"
     if "seconds" in settled and (study.faults or study.seconds is not None):
-        raise ConfigError(
-            "seconds: it does nothing where `faults` or `seconds` of the study say how long trials are"
-        )
-
-
-def _worlds(study: Study) -> Iterator[str]:
-    return (name for name in study.scenarios if name in (MIX, *WORLDS))
-
-
-def _twice(values: Iterable[Any]) -> tuple[Any] | None:
-    """A value that is there twice. 1, 1.0 and true are three in TOML, as they are written."""
-    seen: set[str] = set()
-    for value in values:
-        if (written := repr(value)) in seen:
-            return (value,)
-        seen.add(written)
-    return None
+        yield "seconds: it does nothing where `faults` or `seconds` of the study say how long trials are"
 
 
 def _short_names(keys: Iterable[str]) -> dict[str, str]:
@@ -224,24 +212,9 @@ def _label(variant: str, varied: Mapping[str, Any]) -> str:
     return ", ".join(parts) or "as it is"
 
 
-_BYTES = 12
-
-
-class PlannedCase(msgspec.Struct, frozen=True, kw_only=True):
-    """A case, the scenario that it means, and its trials.
-
-    path      of the scenario's file as the study names it, or its built-in name; that of a small world
-    scenario  None: of a small world
-    """
-
-    case: Case
-    path: str
-    scenario: Scenario | None
-    trials: list[Trial]
-
-
-def plan(study: Study, base: Path, source: str) -> list[PlannedCase]:
-    """The trials of a study. Raises ConfigError on a scenario that cannot be read, or not with these settings.
+def plan(study: Study, base: Path, source: str) -> list[Case]:
+    """The cases of a study, with their trials. Raises ConfigError on a scenario that cannot be read, or not with
+    these settings.
 
     base    folder of the study, beside which its scenarios lie
     source  what errors call the study
@@ -249,27 +222,17 @@ def plan(study: Study, base: Path, source: str) -> list[PlannedCase]:
     return [_planned(study, case, base, source) for case in cases_of(study)]
 
 
-def _planned(study: Study, case: Case, base: Path, source: str) -> PlannedCase:
-    path, scenario = (case.scenario, None) if case.scenario in (MIX, *WORLDS) else _scenario(case, base, source)
-    seconds = study.seconds or (SECONDS if study.faults or scenario is None else scenario.seconds)
+def _planned(study: Study, case: Case, base: Path, source: str) -> Case:
+    path, given = (case.scenario, None) if case.scenario in SMALL_WORLDS else _scenario(case, base, source)
+    seconds = study.seconds or (SECONDS if study.faults or given is None else given.seconds)
     version = code_version()
-    settled = "" if scenario is None else _digest(_settings(scenario))
+    settled = "" if given is None else _digest(_settings(given))
     trials = []
-    for seed in study.seed_range:
-        world = world_of(case.scenario, seed) if scenario is None else scenario.name
+    for seed in parse_seeds(study.seeds, "seeds"):
+        world = world_of(case.scenario, seed) if given is None else given.name
         key = _digest([version, world, settled, seed, seconds, study.faults])
-        trials.append(
-            Trial(
-                key=key,
-                world=world,
-                scenario=scenario,
-                seed=seed,
-                seconds=seconds,
-                faults=study.faults,
-                version=version,
-            )
-        )
-    return PlannedCase(case=case, path=path, scenario=scenario, trials=trials)
+        trials.append(Trial(key, world, given, seed, seconds, study.faults, version))
+    return msgspec.structs.replace(case, path=path, given=given, trials=tuple(trials))
 
 
 def _scenario(case: Case, base: Path, source: str) -> tuple[str, Scenario]:
@@ -287,7 +250,7 @@ def _settings(scenario: Scenario) -> Any:
     instead of its place."""
     settings = msgspec.to_builtins(scenario)
     del settings["seed"], settings["seconds"]
-    settings["plugin_folder"] = _plugins(scenario)
+    settings["plugin_folder"] = {place: _file_digest(path) for place, path in plugin_files(scenario).items()}
     return _with_content(settings)
 
 
@@ -298,30 +261,18 @@ def _with_content(value: Any) -> Any:
         case list() | tuple():
             return [_with_content(each) for each in value]
         case str() if value.startswith("/") and Path(value).is_file():
-            return {"file": [_file_digest(str(path)) for path in (Path(value), *parts_of(Path(value)))]}
+            return {"file": [_file_digest(path) for path in (Path(value), *parts_of(Path(value)))]}
     return value
 
 
-def _plugins(scenario: Scenario) -> dict[str, str]:
-    return {place: _file_digest(str(path)) for place, path in plugin_files(scenario).items()}
-
-
 @cache
-def _file_digest(path: str) -> str:
-    digest = hashlib.blake2b(digest_size=_BYTES)
+def _file_digest(path: Path) -> str:
     try:
-        with Path(path).open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, _hash).hexdigest()
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror or error}") from error
-    return digest.hexdigest()
 
 
 def _digest(value: Any) -> str:
-    encoded = msgspec.json.encode(value, order="deterministic")
-    return hashlib.blake2b(encoded, digest_size=_BYTES).hexdigest()
-
-
-def trials_of(planned: list[PlannedCase]) -> Iterator[Trial]:
-    return (trial for each in planned for trial in each.trials)
+    return _hash(msgspec.json.encode(value, order="deterministic")).hexdigest()

@@ -7,15 +7,14 @@ import math
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import msgspec
 import numpy as np
 from scipy import stats
 
-from launch_scripts.simulation.study.study import PlannedCase, Study
+from launch_scripts.simulation.campaign import SECONDS, replay_of
+from launch_scripts.simulation.study.study import Case, Study
 from launch_scripts.simulation.study.trials import Result, Trial
-from launch_scripts.simulation.trial import SECONDS
 
 LEVEL = 0.95
 MOST_BOOTSTRAPPED = 1000
@@ -51,15 +50,9 @@ def mean(values: Sequence[float]) -> Estimate:
         return Estimate(middle, float(low), float(high))
     # Of values at the limits of floats there is no interval.
     with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore", category=stats.DegenerateDataWarning):
-        found = stats.bootstrap(
-            (data,),
-            np.mean,
-            n_resamples=_RESAMPLES,
-            confidence_level=LEVEL,
-            rng=np.random.default_rng(0),
-            batch=1000,
-        ).confidence_interval
-    low, high = float(found.low), float(found.high)
+        chance = np.random.default_rng(0)
+        found = stats.bootstrap((data,), np.mean, n_resamples=_RESAMPLES, rng=chance, batch=1000)
+    low, high = map(float, found.confidence_interval)
     return Estimate(middle, low, high) if math.isfinite(low) and math.isfinite(high) else Estimate(middle)
 
 
@@ -136,37 +129,39 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(
-    study: Study, planned: Sequence[PlannedCase], results: Mapping[str, Result], files: Mapping[int, str]
+    study: Study, cases: Sequence[Case], results: Mapping[str, Result], files: Mapping[int, str]
 ) -> Summary:
     """The summary of all results that are there.
 
     results  key of a trial -> result
     files    number of a case -> what `swarm simulate` is to run instead of the scenario that the study names
     """
-    names = study.outcomes or OUTCOMES[study.faults]
-    cases, failing = [], []
+    told: list[CaseSummary] = []
+    failing: list[Failure] = []
     first: dict[str, dict[str, dict[int, float]]] = {}
-    for number, each in enumerate(planned):
-        pairs = [(trial, results[trial.key]) for trial in each.trials if trial.key in results]
-        values = {name: values_of(name, pairs) for name in names}
-        base = first.setdefault(each.case.scenario, values)
-        failures = [
-            _failure(each, trial, result, files.get(number, each.path)) for trial, result in pairs if result.broken
-        ]
-        cases.append(
+    for number, case in enumerate(cases):
+        pairs = [(trial, results[trial.key]) for trial in case.trials if trial.key in results]
+        values = {
+            name: {trial.seed: result.figures[name] for trial, result in pairs if name in result.figures}
+            for name in study.outcomes or OUTCOMES[study.faults]
+        }
+        base = first.setdefault(case.scenario, values)
+        runs = files.get(number, case.path)
+        failures = [_failure(case, trial, result, runs) for trial, result in pairs if result.broken]
+        failing += failures
+        told.append(
             CaseSummary(
-                scenario=each.case.scenario,
-                label=each.case.label,
+                scenario=case.scenario,
+                label=case.label,
                 trials=len(pairs),
                 broken=len(failures),
                 share_broken=share(len(failures), len(pairs)) if pairs else None,
                 outcomes={
-                    name: _outcome(found, None if base is values else base[name]) for name, found in values.items()
+                    name: _outcome(found, {} if base is values else base[name]) for name, found in values.items()
                 },
             )
         )
-        failing += failures
-    every = [trial for each in planned for trial in each.trials]
+    every = [trial for case in cases for trial in case.trials]
     there = [trial for trial in every if trial.key in results]
     return Summary(
         study=study.name,
@@ -175,19 +170,14 @@ def summarise(
         missing=len(every) - len(there),
         simulated_s=sum(trial.seconds for trial in there),
         cpu_s=sum(results[trial.key].cpu_s for trial in there),
-        cases=cases,
+        cases=told,
         failing=failing,
     )
 
 
-def values_of(name: str, pairs: Sequence[tuple[Trial, Result]]) -> dict[int, float]:
-    """Seed -> a figure, of the trials that have it."""
-    return {trial.seed: result.figures[name] for trial, result in pairs if name in result.figures}
-
-
-def _outcome(values: dict[int, float], base: Mapping[int, float] | None) -> Outcome:
+def _outcome(values: dict[int, float], base: Mapping[int, float]) -> Outcome:
     numbers = list(values.values())
-    differences = [] if base is None else [value - base[seed] for seed, value in values.items() if seed in base]
+    differences = [value - base[seed] for seed, value in values.items() if seed in base]
     return Outcome(
         values=values,
         mean=mean(numbers) if numbers else None,
@@ -196,21 +186,14 @@ def _outcome(values: dict[int, float], base: Mapping[int, float] | None) -> Outc
     )
 
 
-def _failure(each: PlannedCase, trial: Trial, result: Result, runs: str) -> Failure:
-    name = trial.world if each.scenario is None else shlex.quote(runs)
-    usual_s = SECONDS if trial.faults or each.scenario is None else each.scenario.seconds
-    seed = f"--seeds {trial.seed}:{trial.seed + 1}" if trial.faults else f"--seed {trial.seed}"
-    seconds = "" if trial.seconds == usual_s else f" --seconds {trial.seconds:g}"
+def _failure(case: Case, trial: Trial, result: Result, runs: str) -> Failure:
+    name = trial.world if case.given is None else shlex.quote(runs)
+    usual_s = SECONDS if trial.faults or case.given is None else case.given.seconds
     return Failure(
-        scenario=each.case.scenario if each.scenario is not None else trial.world,
-        label=each.case.label,
+        scenario=trial.world if case.given is None else case.scenario,
+        label=case.label,
         seed=trial.seed,
         laws=list(dict.fromkeys(law.law for law in result.broken)),
         sentences=[law.sentence for law in result.broken],
-        replay=f"swarm simulate {name} {seed}{seconds}",
+        replay=replay_of(name, trial.seed, trial.seconds, usual_s, "seeds" if trial.faults else "seed"),
     )
-
-
-def as_json(summary: Summary) -> dict[str, Any]:
-    told: dict[str, Any] = msgspec.to_builtins(summary, str_keys=True)
-    return told

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 from launch_scripts.observe.run_folder import write_file
 from launch_scripts.simulation.study import summary_page as page
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
-from launch_scripts.simulation.study.study import PlannedCase, Study, load_study, plan, trials_of
-from launch_scripts.simulation.study.summary import Summary, as_json, summarise
+from launch_scripts.simulation.study.study import Case, load_study, plan
+from launch_scripts.simulation.study.summary import Summary, summarise
 from launch_scripts.simulation.study.trials import Result, Trial
 from swarm.config.explain import nearest
 from swarm.config.write import scenario_text
@@ -66,17 +66,6 @@ class ResultStore:
             raise StoreError(f"cannot write results to {self.path}: {error.strerror or error}") from error
 
 
-def write_table(path: Path, rows: Iterable[Mapping[str, Any]], schema: Mapping[str, pa.DataType]) -> None:
-    """Write rows as Parquet; columns that the schema lacks are figures. Raises OSError."""
-    rows = list(rows)
-    figures = sorted({name for row in rows for name in row if name not in schema})
-    columns = {**schema, **dict.fromkeys(figures, pa.float64())}
-    table = pa.table({name: pa.array([row.get(name) for row in rows], kind) for name, kind in columns.items()})
-    content = io.BytesIO()
-    pq.write_table(table, content, compression="zstd")
-    write_file(path, content.getvalue())
-
-
 RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"
 SETTING = "set."
 """Begins the name of a column that holds a setting of a case."""
@@ -100,18 +89,18 @@ _SCHEMA = {
 class Sweep:
     """A study and the folder of its results.
 
-    planned  its cases, with their trials
+    cases    of it, with their trials
     missing  the trials that have no result yet
     warned   what a person should know about it
     """
 
     def __init__(self, path: Path, out: Path | None) -> None:
         """Reads the study, its scenarios, and the results that are there. Raises ConfigError or StoreError."""
-        self.study: Study = load_study(path)
-        self.planned = plan(self.study, path.absolute().parent, str(path))
+        self.study = load_study(path)
+        self.cases = plan(self.study, path.absolute().parent, str(path))
         self.folder = out or Path("sweeps") / self.study.name
         self.store = ResultStore(self.folder)
-        unique = {trial.key: trial for trial in trials_of(self.planned)}
+        unique = {trial.key: trial for case in self.cases for trial in case.trials}
         self.trials = len(unique)
         self.missing = [trial for key, trial in unique.items() if key not in self.store.results]
         self.warned: list[str] = []
@@ -133,34 +122,35 @@ class Sweep:
                 told(trial, result)
 
     def finish(self) -> Summary:
-        """Write the results, scenarios and summary. Raises StoreError."""
-        files = {n: str(self._scenario_file(n)) for n, each in enumerate(self.planned) if _needs_file(each)}
-        summary = summarise(self.study, self.planned, self.store.results, files)
+        """Writes the results, scenarios and summary. Raises StoreError."""
+        files = {number: self._scenario_file(number) for number, case in enumerate(self.cases) if case.is_own}
+        runs = {number: str(path) for number, path in files.items()}
+        summary = summarise(self.study, self.cases, self.store.results, runs)
         try:
             (self.folder / SCENARIOS).mkdir(exist_ok=True)
-            for number in files:
-                scenario = self.planned[number].scenario
-                assert scenario is not None
-                text = f"# {self.planned[number].case.label}\n{scenario_text(scenario, Path.cwd())}"
-                write_file(self._scenario_file(number), text.encode())
-            write_table(self.folder / RESULTS, self._rows(), {**_SCHEMA, **_setting_types(self.planned)})
-            pictures = {name: page.file_name(name) for name in page.drawn(summary)}
+            for number, path in files.items():
+                case = self.cases[number]
+                assert case.given is not None
+                write_file(path, f"# {case.label}\n{scenario_text(case.given, Path.cwd())}".encode())
+            write_file(self.folder / RESULTS, self._table())
+            pictures = page.pictures_of(summary)
             for name, file in pictures.items():
                 from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
 
                 write_file(self.folder / file, draw_outcome(summary.cases, name))
             write_file(self.folder / PAGE, page.document(summary, pictures).encode())
-            write_file(self.folder / NUMBERS, (json.dumps(as_json(summary), indent=1) + "\n").encode())
+            numbers = msgspec.to_builtins(summary, str_keys=True)
+            write_file(self.folder / NUMBERS, (json.dumps(numbers, indent=1) + "\n").encode())
         except OSError as error:
             raise StoreError(f"cannot write to {self.folder}: {error.strerror or error}") from error
         return summary
 
     def _scenario_file(self, number: int) -> Path:
-        label = re.sub("[^A-Za-z0-9_.]+", "-", self.planned[number].case.label)[:60]
+        label = re.sub("[^A-Za-z0-9_.]+", "-", self.cases[number].label)[:60]
         return self.folder / SCENARIOS / f"{number}-{label}.toml"
 
     def _look(self, result: Result) -> None:
-        """Warn of outcomes that the first report does not have."""
+        """Warns of outcomes that the first report does not have."""
         if self._looked or not result.figures:
             return
         self._looked, names = True, sorted(result.figures)
@@ -168,37 +158,37 @@ class Sweep:
             if name not in result.figures:
                 self.warned.append(f"outcomes: no figure {name!r} in the first report{nearest(name, names)}")
 
-    def _rows(self) -> Iterator[dict[str, Any]]:
-        for each in self.planned:
-            settings = {f"{SETTING}{key}": json.dumps(value) for key, value in each.case.settings.items()}
-            for trial in each.trials:
-                result = self.store.results.get(trial.key)
-                if result is None:
-                    continue
-                first = result.broken[0] if result.broken else None
-                yield {
-                    "scenario": trial.world if each.scenario is None else each.case.scenario,
-                    "variant": each.case.variant or None,
-                    "seed": trial.seed,
-                    "seconds": trial.seconds,
-                    "faults": trial.faults,
-                    "law": first and first.law,
-                    "law_at_s": first and first.at_s,
-                    "sentence": first and first.sentence,
-                    "broken": len(result.broken),
-                    "wall_s": result.wall_s,
-                    "cpu_s": result.cpu_s,
-                    "version": trial.version,
-                    "key": trial.key,
-                    **settings,
-                    **{f"{FIGURE}{name}": value for name, value in result.figures.items()},
-                }
+    def _table(self) -> bytes:
+        """A row for each trial that has a result, as Parquet."""
+        rows = [
+            self._row(case, trial, self.store.results[trial.key])
+            for case in self.cases
+            for trial in case.trials
+            if trial.key in self.store.results
+        ]
+        settings = (f"{SETTING}{key}" for case in self.cases for key in case.settings)
+        figures = sorted({name for row in rows for name in row if name.startswith(FIGURE)})
+        schema = _SCHEMA | dict.fromkeys(settings, pa.string()) | dict.fromkeys(figures, pa.float64())
+        content = io.BytesIO()
+        pq.write_table(pa.Table.from_pylist(rows, pa.schema(schema.items())), content, compression="zstd")
+        return content.getvalue()
 
-
-def _needs_file(each: PlannedCase) -> bool:
-    """Whether no file says what the case is: its scenario is changed."""
-    return each.scenario is not None and bool(each.case.settings)
-
-
-def _setting_types(planned: Sequence[PlannedCase]) -> dict[str, pa.DataType]:
-    return {f"{SETTING}{key}": pa.string() for each in planned for key in each.case.settings}
+    def _row(self, case: Case, trial: Trial, result: Result) -> dict[str, Any]:
+        first = result.broken[0] if result.broken else None
+        return {
+            "scenario": trial.world if case.given is None else case.scenario,
+            "variant": case.variant or None,
+            "seed": trial.seed,
+            "seconds": trial.seconds,
+            "faults": trial.faults,
+            "law": first and first.law,
+            "law_at_s": first and first.at_s,
+            "sentence": first and first.sentence,
+            "broken": len(result.broken),
+            "wall_s": result.wall_s,
+            "cpu_s": result.cpu_s,
+            "version": trial.version,
+            "key": trial.key,
+            **{f"{SETTING}{key}": json.dumps(value) for key, value in case.settings.items()},
+            **{f"{FIGURE}{name}": value for name, value in result.figures.items()},
+        }

@@ -14,7 +14,9 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.simulation.trial import BrokenLaw, raised
+from launch_scripts.simulation import simulate
+from launch_scripts.simulation.campaign import raised, try_seed
+from launch_scripts.simulation.laws import BrokenLaw
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError
 
@@ -37,7 +39,7 @@ def code_version() -> str:
     digest = hashlib.blake2b(digest_size=_VERSION_BYTES)
     for name in _PACKAGES:
         folder = Path(importlib.import_module(name).__path__[0])
-        for path in sorted(folder.rglob("*.py")):
+        for path in sorted((*folder.rglob("*.py"), *folder.rglob("*.toml"))):
             digest.update(f"{name}/{path.relative_to(folder).as_posix()}\0".encode())
             digest.update(hashlib.blake2b(path.read_bytes()).digest())
     versions = [platform.python_version(), *map(importlib.metadata.version, _LIBRARIES)]
@@ -54,7 +56,7 @@ LAWS = {
 _LEFT_OUT = ("by_vehicle", "seed")
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True):
+class Trial(msgspec.Struct, frozen=True):
     """What a worker is asked for.
 
     key       digest of all that decides the result, the version of the code included
@@ -122,33 +124,21 @@ def numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
     """As `swarm simulate SCENARIO --seed N`."""
-    from launch_scripts.simulation.simulate import simulate
-
     assert trial.scenario is not None
-    reached_s = 0.0
-
-    def progress(now_s: float) -> None:
-        nonlocal reached_s
-        reached_s = now_s
-
+    reached_s = [0.0]
     try:
-        report = simulate(trial.scenario, trial.seed, trial.seconds, progress=progress).report
+        report = simulate.simulate(trial.scenario, trial.seed, trial.seconds, progress=reached_s.append).report
     except SwarmError:
         raise
     except Exception as error:
-        return {}, [raised(error, reached_s)]
-    broken = [
-        BrokenLaw(law, f"{report[name]} {name.replace('_', ' ')}") for name, law in LAWS.items() if report.get(name)
-    ]
-    return report, broken
+        return {}, [raised(error, reached_s[-1])]
+    broken = {name: law for name, law in LAWS.items() if report.get(name)}
+    return report, [BrokenLaw(law, f"{report[name]} {name.replace('_', ' ')}") for name, law in broken.items()]
 
 
 def _with_faults(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
     """As `swarm simulate SCENARIO --seeds N:N+1`."""
-    from launch_scripts.simulation.trial import try_simulation
-
-    verdict, report = try_simulation(trial.world, trial.seed, trial.seconds, trial.scenario)
+    verdict, report = try_seed(trial.world, trial.seed, trial.seconds, trial.scenario)
     told: dict[str, Any] = msgspec.to_builtins(verdict)
-    for name in ("broken", "wall_s"):
-        del told[name]
-    return {**report, **told}, verdict.broken
+    del told["broken"], told["wall_s"]
+    return report | told, verdict.broken

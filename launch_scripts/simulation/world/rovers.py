@@ -121,11 +121,10 @@ class Rovers:
             return
         rover.turns = False
         far_m = self._speed(rover) * seconds
-        x_m, y_m = self._ahead(rover, far_m)
         if not self._free(rover, far_m):
             self._turn(rover)
             return
-        rover.x_m, rover.y_m = x_m, y_m
+        rover.x_m, rover.y_m = self._ahead(rover, far_m)
         if rover.chance.random() < _LEGS_PER_S * seconds:
             if rover.chance.random() < 0.5:
                 self._turn(rover)
@@ -151,7 +150,5 @@ class Rovers:
         return all(self._passable(*self._ahead(rover, step_m * step)) for step in range(1, steps + 1))
 
     def _passable(self, x_m: float, y_m: float) -> bool:
-        grid = self._terrain.grid
-        col = math.floor((x_m - grid.west_m) / grid.resolution_m)
-        row = math.floor((grid.north_m - y_m) / grid.resolution_m)
-        return grid.inside(row, col) and not self._terrain.lethal(row * grid.cols + col)
+        cell = self._terrain.grid.cell_at(x_m, y_m)
+        return cell >= 0 and not self._terrain.lethal(cell)

@@ -10,7 +10,7 @@ import math
 import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,10 +75,8 @@ class TrueTerrain:
 
     def nearest(self, cell: int) -> int:
         """The passable cell nearest to a cell, which may be itself."""
-        if not self.lethal(cell):
-            return cell
-        rows, cols = np.nonzero(np.isfinite(self.pace_s_per_m))
         row, col = divmod(cell, self.grid.cols)
+        rows, cols = np.nonzero(np.isfinite(self.pace_s_per_m))
         best = int(((rows - row) ** 2 + (cols - col) ** 2).argmin())
         return int(rows[best]) * self.grid.cols + int(cols[best])
 
@@ -88,19 +86,17 @@ class TrueTerrain:
     def step(self, cell: int, direction: int) -> int | None:
         """The cell that a step leads to; None where the step is not possible."""
         row, col = divmod(cell, self.grid.cols)
-        d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
-        to_row, to_col = row + d_row, col + d_col
+        to_row, to_col = row + STEP_ROW[direction], col + STEP_COL[direction]
         if not self.grid.inside(to_row, to_col) or not self._passable(to_row, to_col):
             return None
-        if d_row and d_col and not (self._passable(row, to_col) and self._passable(to_row, col)):
+        if direction & 1 and not (self._passable(row, to_col) and self._passable(to_row, col)):
             return None
         to = to_row * self.grid.cols + to_col
         return to if self.climb is None or self.climb.allows(cell, to) else None
 
     def steps(self, cell: int) -> list[tuple[int, int]]:
         """(direction, cell) of every possible step."""
-        found = ((direction, self.step(cell, direction)) for direction in range(8))
-        return [(direction, to) for direction, to in found if to is not None]
+        return [(way, to) for way in range(8) if (to := self.step(cell, way)) is not None]
 
     def length_m(self, cell: int, to: int) -> float:
         straight = abs(cell - to) in (1, self.grid.cols)
@@ -118,62 +114,43 @@ class TrueTerrain:
         from scipy.sparse.csgraph import dijkstra
 
         window = self.grid.around(start, WAY_HALF_CELLS)
-        rows, cols = window.row1 - window.row0, window.col1 - window.col0
-        graph = self._steps_graph(window)
-        row, col = self.grid.row_col(start)
-        here = (row - window.row0) * cols + col - window.col0
-        cost, before = dijkstra(graph, directed=True, indices=np.asarray(here), return_predecessors=True)
+        cells, graph = self._steps_graph(window)
+        here = int(np.searchsorted(cells, start))
+        cost, before = dijkstra(graph, directed=True, indices=here, return_predecessors=True)
         reached = np.isfinite(cost)
         reached[here] = False
-        r, c = np.divmod(np.arange(rows * cols), cols)
-        far = np.maximum(abs(r - (row - window.row0)), abs(c - (col - window.col0))) >= WAY_HALF_CELLS // 3
-        places = np.flatnonzero(reached & far)
-        if not len(places):
-            places = np.flatnonzero(reached)
-        if not len(places):
-            return []
+        rows, cols = np.divmod(cells, self.grid.cols)
+        row, col = self.grid.row_col(start)
+        far = reached & (np.maximum(abs(rows - row), abs(cols - col)) >= WAY_HALF_CELLS // 3)
+        places = np.flatnonzero(far if far.any() else reached)
         way: list[int] = []
-        at = int(places[chance.randrange(len(places))])
+        at = int(places[chance.randrange(len(places))]) if len(places) else here
         while at != here:
-            way.append((at // cols + window.row0) * self.grid.cols + at % cols + window.col0)
+            way.append(int(cells[at]))
             at = int(before[at])
-        way.reverse()
-        return way
+        return way[::-1]
 
-    def _steps_graph(self, window: Window) -> csr_array[np.float64]:
-        """Graph of all possible steps inside a window; an edge costs what the step does, in cells."""
+    def _steps_graph(self, window: Window) -> tuple[NDArray[np.int64], csr_array[np.float64]]:
+        """The cells of a window, int64 (n,), and the graph of all possible steps between them (n, n): an edge costs
+        what the step does, in cells."""
         from scipy.sparse import csr_array
 
         pace = self.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1]
-        rows, cols = pace.shape
-        padded = np.full((rows + 2, cols + 2), np.inf)
-        padded[1:-1, 1:-1] = pace
-        open_ = np.isfinite(padded)
-        cells = np.arange(rows * cols).reshape(rows, cols)
-        on_map = cells // cols * self.grid.cols + cells % cols + window.row0 * self.grid.cols + window.col0
-        starts: list[NDArray[np.int64]] = []
-        ends: list[NDArray[np.int64]] = []
-        costs: list[NDArray[np.float64]] = []
-
-        def shifted(array: NDArray[Any], d_row: int, d_col: int) -> NDArray[Any]:
-            return array[1 + d_row : 1 + d_row + rows, 1 + d_col : 1 + d_col + cols]
-
-        for direction in range(8):
-            d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
-            possible = open_[1:-1, 1:-1] & shifted(open_, d_row, d_col)
-            if d_row and d_col:
-                possible &= shifted(open_, d_row, 0) & shifted(open_, 0, d_col)
-            start = cells[possible]
-            cost = shifted(padded, d_row, d_col)[possible] * math.hypot(d_row, d_col)
-            if self.climb is not None:
-                tails = on_map[possible]
-                cost *= self.climb.along(tails, tails + d_row * self.grid.cols + d_col)
-                start, cost = start[cost < np.inf], cost[cost < np.inf]
-            starts.append(start)
-            ends.append(start + d_row * cols + d_col)
-            costs.append(cost)
-        edges = (np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends)))
-        return csr_array(edges, shape=(rows * cols, rows * cols))
+        padded = np.pad(pace.astype(np.float64), 1, constant_values=np.inf)
+        row, col = np.divmod(np.arange(pace.size), pace.shape[1])
+        cells = (row + window.row0) * self.grid.cols + col + window.col0
+        d_row, d_col = np.array(STEP_ROW)[:, None], np.array(STEP_COL)[:, None]
+        ahead = padded[row + 1 + d_row, col + 1 + d_col]
+        # What is beside a step's corner is, of a straight step, the two cells between which it leads.
+        beside = np.maximum(padded[row + 1 + d_row, col + 1], padded[row + 1, col + 1 + d_col])
+        own = padded[row + 1, col + 1]
+        way, tail = np.nonzero(np.isfinite(np.maximum(np.maximum(ahead, beside), own)))
+        head = tail + np.array(STEP_ROW)[way] * pace.shape[1] + np.array(STEP_COL)[way]
+        cost = ahead[way, tail] * np.hypot(STEP_ROW, STEP_COL)[way]
+        if self.climb is not None:
+            cost *= self.climb.along(cells[tail], cells[head])
+            tail, head, cost = (each[np.isfinite(cost)] for each in (tail, head, cost))
+        return cells, csr_array((cost, (tail, head)), shape=(pace.size, pace.size))
 
 
 @dataclass

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 
+from launch_scripts.simulation.campaign import few_of_layer, nodes_of
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
-from launch_scripts.simulation.trial import few_of_layer, nodes_of
 from shared_map.replication.marks import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import signal
 import statistics as plain
 from collections.abc import Callable
@@ -19,6 +20,8 @@ from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
+from launch_scripts.simulation.campaign import try_seed
+from launch_scripts.simulation.laws import BrokenLaw
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.study import summary as statistics
 from launch_scripts.simulation.study.study import (
@@ -33,7 +36,6 @@ from launch_scripts.simulation.study.study import (
 from launch_scripts.simulation.study.summary import Summary
 from launch_scripts.simulation.study.sweep import ResultStore, Sweep
 from launch_scripts.simulation.study.trials import Result, Trial, numbers, run_trial
-from launch_scripts.simulation.trial import BrokenLaw, try_seed
 from swarm.config.load import load_scenario
 from swarm.errors import ConfigError, StoreError
 
@@ -45,7 +47,7 @@ def result_of(trial: Trial, broken: tuple[BrokenLaw, ...] = (), **figures: float
 def finished(path: Path, out: Path, captures: dict[int, float]) -> tuple[Sweep, Summary]:
     """A sweep with results that were made up: captures of each seed, and as many more as the case's number."""
     sweep = Sweep(path, out)
-    for number, each in enumerate(sweep.planned):
+    for number, each in enumerate(sweep.cases):
         for trial in each.trials:
             sweep.store.add(result_of(trial, captures=captures[trial.seed] + number, marks=5.0))
     return sweep, sweep.finish()
@@ -89,31 +91,20 @@ vehicles.per_agent = 3
         ('scenarios = ["a"]\nseeds = "0:1000001"', "it has 1,000,001 trials, expected at most 1,000,000"),
         ('scenarios = ["doors"]', "'doors' is a small world, which goes with faults = true"),
         ('scenarios = ["mix"]\nfaults = true\n[parameters]\nseconds = [3]', "takes no parameters"),
+        ('scenarios = ["a"]\noutcomes = ["a", "a"]', "outcomes: found 'a' twice"),
+        ('scenarios = ["a"]\noutcomes = [""]', "outcomes: found ''"),
+        (f'scenarios = ["a"]\noutcomes = ["{"x" * 300}"]', "expected 1 to 200 characters that print"),
+        ('scenarios = ["a"]\nabout = "\\u001b[31mred"', "about: found"),
+        ('scenarios = ["a"]\n[variants."\\u001b[31mred"]', "variants: found"),
+        ('scenarios = ["a"]\n[parameters]\nseed = [1, 2]', "seed: it is no setting of a study"),
+        ('scenarios = ["a"]\nseconds = 3\n[parameters]\nseconds = [1, 2]', "seconds: it does nothing where"),
+        ('scenarios = ["a"]\nfaults = true\n[variants.a]\nseconds = 2', "seconds: it does nothing where"),
     ],
 )
 def test_a_study_that_cannot_be_is_refused_with_the_key_and_what_was_expected(text, said):
     with pytest.raises(ConfigError) as error:
         parse_study(text, "s.toml")
     assert str(error.value).startswith("s.toml: ")
-    assert said in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('outcomes = ["a", "a"]', "outcomes: found 'a' twice"),
-        ('outcomes = [""]', "outcomes: found ''"),
-        (f'outcomes = ["{"x" * 300}"]', "expected 1 to 200 characters that print"),
-        ('about = "\\u001b[31mred"', "about: found"),
-        ('[variants."\\u001b[31mred"]', "variants: found"),
-        ("[parameters]\nseed = [1, 2]", "seed: it is no setting of a study"),
-        ("seconds = 3\n[parameters]\nseconds = [1, 2]", "seconds: it does nothing where"),
-        ("faults = true\n[variants.a]\nseconds = 2", "seconds: it does nothing where"),
-    ],
-)
-def test_names_that_do_not_print_and_settings_that_do_nothing_are_refused(text, said):
-    with pytest.raises(ConfigError) as error:
-        parse_study(f'scenarios = ["a"]\n{text}', "s.toml")
     assert said in str(error.value)
 
 
@@ -219,7 +210,7 @@ def test_a_trial_is_the_simulation_of_its_seed_and_every_number_of_its_report(tm
     [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
     trial = case.trials[1]
     result = run_trial(trial)
-    report = simulate(case.scenario, 1, 3.0).report
+    report = simulate(case.given, 1, 3.0).report
     assert result.key == trial.key
     assert result.figures["marks"] == report["marks"]
     assert result.figures["by_group.all.distance_m"] == report["by_group"]["all"]["distance_m"]
@@ -234,7 +225,7 @@ def test_a_trial_is_the_simulation_of_its_seed_and_every_number_of_its_report(tm
 def test_a_trial_with_faults_is_that_of_swarm_simulate_seeds():
     [trial] = plan(Study(scenarios=("small",), seeds="3:4", seconds=6.0, faults=True), Path(), "x")[0].trials
     result = run_trial(trial)
-    verdict = try_seed("small", 3, 6.0)
+    verdict, _ = try_seed("small", 3, 6.0)
     assert result.broken == verdict.broken
     assert result.figures["longest_wait_s"] == verdict.longest_wait_s
     assert result.figures["faults.crashes"] == verdict.faults["crashes"]
@@ -345,7 +336,7 @@ def test_the_folder_of_a_study_holds_its_results_its_summary_and_its_pictures(tm
     assert first.outcomes["captures"].difference is None
     assert second.outcomes["captures"].difference == statistics.Estimate(1.0, 1.0, 1.0)
     page = (out / "summary.md").read_text(encoding="utf-8")
-    assert "| hill.toml | sense_range_m = 120 | 3 | 4 | " in page
+    assert re.search(r"\| hill.toml \| sense_range_m = 120 \| 3 +\| 4 +\|", page)
     assert "![captures](captures.png)" in page
     assert (out / "captures.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["trials"] == 6
@@ -369,15 +360,15 @@ def test_a_trial_that_broke_a_law_is_told_with_the_command_that_runs_it_again(tm
     out = tmp_path / "out"
     path = write_study(tmp_path)
     sweep = Sweep(path, out)
-    trial = sweep.planned[1].trials[2]
+    trial = sweep.cases[1].trials[2]
     sweep.store.add(result_of(trial, (BrokenLaw("no collision", "2 | collisions", 1.5),), captures=1.0))
     summary = sweep.finish()
     [failure] = summary.failing
     assert summary.missing == 5
     [_, _, scenario, *options] = failure.replay.split()
     assert options == ["--seed", "2"]
-    assert load_scenario(Path(scenario)) == sweep.planned[1].scenario
-    assert "| 2 \\| collisions |" in (out / "summary.md").read_text(encoding="utf-8")
+    assert load_scenario(Path(scenario)) == sweep.cases[1].given
+    assert "| 2 \\| collisions " in (out / "summary.md").read_text(encoding="utf-8")
     [row] = pq.read_table(out / "results.parquet").to_pylist()
     assert (row["law"], row["law_at_s"], row["sentence"]) == ("no collision", 1.5, "2 | collisions")
 
@@ -397,7 +388,7 @@ def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws
     assert sweep_study(str(path), None, 1, out, as_json=True)
     told = json.loads(capsys.readouterr().out)
     assert told["cases"][0]["outcomes"]["captures"]["values"] == {"0": 1.0, "1": 2.0, "2": 6.0}
-    sweep.store.add(result_of(sweep.planned[0].trials[1], (BrokenLaw("l", "it broke", 1.0),), captures=2.0))
+    sweep.store.add(result_of(sweep.cases[0].trials[1], (BrokenLaw("l", "it broke", 1.0),), captures=2.0))
     assert not sweep_study(str(path), None, 1, out, as_json=False)
     shown = capsys.readouterr()
     assert "6 of 6 trials are kept from before" in shown.err

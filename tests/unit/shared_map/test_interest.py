@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import WIDE_TERRAIN, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
