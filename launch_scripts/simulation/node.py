@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
 
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
-from planner_service.prepared_costs import PREPARED_COSTS
+from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
+from shared_map.arrays import Floats
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
+from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Bus, Event, Post, Worker
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
+from swarm.errors import StoreError
 from swarm.recording.boundary import Boundary
 from swarm.recording.recording import Recording
 from swarm.runtime.process import Service
@@ -30,6 +34,41 @@ if TYPE_CHECKING:
 
 EPOCH_NS = 1_800_000_000 * NS_PER_S
 """Start of every simulation: a date, so that times look as in a real run."""
+
+
+@dataclass(frozen=True)
+class Outside:
+    """What services have outside of them; None where there is none, as of a replay, which says what was read."""
+
+    bus: Bus
+    worker: Worker
+    store: KeeperStore | None = None
+    promises: PromiseStore | None = None
+    prepared: PreparedCosts | None = None
+
+
+def built(
+    setup: RoleSetup, terrain: Terrain, truth: Floats, boundary: Boundary, outside: Outside, post: Post
+) -> Service:
+    """The service of a process that is simulated or replayed. Raises StoreError on a role that has none."""
+    bus = boundary.bus(outside.bus)
+    match setup.role:
+        case "keeper":
+            store = boundary.external(cast(KeeperStore, outside.store), KEEPER_STORE)
+            return KeeperService(setup, terrain, bus, post, store)
+        case "planner":
+            stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
+            kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
+            of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
+            prepared = boundary.external(outside.prepared, PREPARED_COSTS)
+            worker = boundary.worker(outside.worker)
+            return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
+        case "targets":
+            return TargetsService(setup, terrain, truth, bus, post)
+        case "agent":
+            promises = boundary.external(cast(PromiseStore, outside.promises), PROMISE_STORE)
+            return AgentService(setup, terrain, truth, bus, post, promises)
+    raise StoreError(f"no process of role {setup.role!r} is simulated or replayed")
 
 
 class Node:
@@ -120,32 +159,23 @@ class Node:
         boundary = Boundary()
         if simulation.record_to is not None:
             boundary = self._recording = Recording(setup, simulation.terrain.digest, simulation.record_to)
-        self.service = self._build(setup, boundary, boundary.bus(bus), post, boundary.worker(worker))
+        if self.spec.role == "keeper":
+            self.store = self.store or KeeperStore(":memory:")
+        if self.spec.role == "agent":
+            self.promises = self.promises or PromiseStore(self._phase_ns + self._life)
+        self.service = built(
+            setup,
+            simulation.terrain,
+            simulation.truth,
+            boundary,
+            Outside(bus=bus, worker=worker, store=self.store, promises=self.promises),
+            post,
+        )
         self._shell = boundary.service(self.service)
         self._shell.start(self.now_ns())
         for look in simulation.after_boot:
             look(self)
         simulation.scheduler.after(self._phase_ns, lambda: self._tick(bus))
-
-    def _build(self, setup: RoleSetup, boundary: Boundary, bus: Bus, post: Post, worker: Worker) -> Service:
-        terrain, truth = self._simulation.terrain, self._simulation.truth
-        match self.spec.role:
-            case "keeper":
-                self.store = self.store or KeeperStore(":memory:")
-                return KeeperService(setup, terrain, bus, post, boundary.external(self.store, KEEPER_STORE))
-            case "planner":
-                stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
-                kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
-                of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
-                prepared = boundary.external(None, PREPARED_COSTS)
-                return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, prepared)
-            case "targets":
-                return TargetsService(setup, terrain, truth, bus, post)
-            case "agent":
-                self.promises = self.promises or PromiseStore(self._phase_ns + setup.incarnation)
-                promises = boundary.external(self.promises, PROMISE_STORE)
-                return AgentService(setup, terrain, truth, bus, post, promises)
-        raise ValueError(f"no simulation of role {self.spec.role}")
 
     def _tick(self, bus: MemoryBus) -> None:
         if self.bus is not bus or self._shell is None:

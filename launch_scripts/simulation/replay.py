@@ -4,26 +4,23 @@ fed, and compared with what it did; a part of a recording is copied for a test."
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 
 from launch_scripts.observe.run_folder import SCENARIO_FILE
 from launch_scripts.process_table import SIMULATED_ROLES
-from launch_scripts.simulation.world.service import TargetsService
-from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
-from planner_service.service import PlannerService
+from launch_scripts.simulation.node import Outside, built
+from planner_service.prepared_costs import PreparedCosts
 from shared_map.arrays import Floats
 from shared_map.class_grounds import load_classes
-from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
-from shared_map.keeper.service import KeeperService
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Bus, Event, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -35,47 +32,31 @@ from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.wire.codec import decode
 from swarm.wire.messages.processes import Stats
-from vehicle_agent.promise_store import PROMISE_STORE, PromiseStore
-from vehicle_agent.service import AgentService
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """The terrain that a service is given, and what it truly is."""
+class _Grounds:
+    """Terrain and truth of recordings, built once for all that have the same.
 
-    terrain: Terrain
-    truth: Floats
-
-
-class Grounds:
-    """The terrain of recordings, built once for all that have the same.
-
-    folder  a run's: what is prepared there is taken, if it is of the same scenario
-    given   in place of the scenario's own, where that says nothing of it
+    What is prepared in a run's folder is taken, if it is of the same scenario.
     """
 
-    def __init__(self, folder: Path, given: Ground | None = None) -> None:
-        self._folder = folder
-        self._given = given
-        self._built: dict[bytes, Ground] = {}
+    def __init__(self) -> None:
+        self._built: dict[bytes, tuple[Terrain, Floats]] = {}
 
-    def of(self, setup: RoleSetup, digest: str) -> Ground:
+    def of(self, setup: RoleSetup, digest: str) -> tuple[Terrain, Floats]:
         """Raises TerrainError where this build makes another of the same scenario."""
-        if self._given is not None:
-            return self._given
         scenario = setup.scenario
         key = msgspec.msgpack.encode((scenario.terrain, scenario.cost, scenario.classes, scenario.seed))
-        ground = self._built.get(key)
-        if ground is None:
+        if key not in self._built:
             terrain = load_terrain(setup)
             load_classes(setup, terrain)
-            ground = self._built[key] = Ground(terrain, load_truth(setup, terrain))
-        if ground.terrain.digest != digest:
+            self._built[key] = terrain, load_truth(setup, terrain)
+        if (here := self._built[key][0].digest) != digest:
             raise TerrainError(
                 f"{setup.role} {setup.id} was recorded on terrain {digest}, but its scenario makes terrain "
-                f"{ground.terrain.digest} here: terrain files or the rules of cost have changed"
+                f"{here} here: terrain files or the rules of cost have changed"
             )
-        return ground
+        return self._built[key]
 
 
 def setup_of(head: Head, folder: Path) -> RoleSetup:
@@ -94,32 +75,6 @@ def setup_of(head: Head, folder: Path) -> RoleSetup:
         before=decode(head.before, Stats) if head.before else None,
         anew=head.anew,
     )
-
-
-def rebuilt(setup: RoleSetup, ground: Ground, boundary: Replaying) -> Service:
-    """The service of a recorded process. Raises StoreError on a role that has none."""
-
-    def post(event: Event) -> None:
-        """What a service tells itself is in the recording, too."""
-
-    terrain, truth, bus = ground.terrain, ground.truth, boundary.bus(cast(Bus, boundary.nobody))
-    match setup.role:
-        case "keeper":
-            store = boundary.external(cast(KeeperStore, None), KEEPER_STORE)
-            return KeeperService(setup, terrain, bus, post, store)
-        case "planner":
-            stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
-            kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
-            of_classes: Callable[[], bool] | None = boundary.function("kernels of classes", None, bool)
-            shelf = boundary.external(cast(PreparedCosts, _Costs(terrain, setup.scenario)), PREPARED_COSTS)
-            worker = boundary.worker(cast(Worker, boundary.nobody))
-            return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, of_classes, shelf)
-        case "targets":
-            return TargetsService(setup, terrain, truth, bus, post)
-        case "agent":
-            promises = boundary.external(cast(PromiseStore, None), PROMISE_STORE)
-            return AgentService(setup, terrain, truth, bus, post, promises)
-    raise StoreError(f"no process of role {setup.role!r} is replayed")
 
 
 class _Costs:
@@ -178,16 +133,18 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
             f"{folder} holds no recorded inputs: `swarm up` and `swarm demo` record them with --record-inputs, "
             "`swarm simulate` always does"
         )
-    order = {role: n for n, role in enumerate(SIMULATED_ROLES)}
-    # t2 before t10.
-    found.sort(
-        key=lambda each: (order.get(each[0].role, len(order)), len(each[0].id), each[0].id, each[0].incarnation)
-    )
-    lives: dict[str, int] = {}
+
+    def order(each: tuple[Head, Path]) -> tuple[int, int, str, int]:
+        head = each[0]
+        roles = (*SIMULATED_ROLES, head.role)  # one that this build does not know is last
+        return roles.index(head.role), len(head.id), head.id, head.incarnation  # t2 before t10
+
+    found.sort(key=order)
+    lives: Counter[str] = Counter()
     recorded: list[Recorded] = []
     for head, path in found:
         name = f"{head.role}-{head.id}"
-        lives[name] = lives.get(name, 0) + 1
+        lives[name] += 1
         if process in (None, name):
             size = path.stat().st_size
             recorded.append(Recorded(path=path, process=name, life=lives[name], head=head, bytes=size))
@@ -219,15 +176,13 @@ def replay_run(
     folder: Path,
     process: str | None = None,
     until_s: float | None = None,
-    ground: Ground | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Replayed]:
     """Feed the recordings of a run to the services of this build, one after the other. Raises as `recordings_of`.
 
-    ground    of a run whose scenario does not say what it is on
     progress  takes the share of all bytes that is replayed
     """
-    grounds = Grounds(folder, ground)
+    grounds = _Grounds()
     recordings = recordings_of(folder, process)
     whole, before = sum(each.bytes for each in recordings), 0
     for recorded in recordings:
@@ -236,15 +191,23 @@ def replay_run(
             progress((before + read) / whole)
 
         before += recorded.bytes
+        outcome, why = None, None
         try:
             with RecordReader(recorded.path) as reader:
                 setup = setup_of(reader.head, folder)
-                make = partial(rebuilt, setup, grounds.of(setup, reader.head.terrain))
+                make = partial(_rebuilt, setup, grounds.of(setup, reader.head.terrain))
                 outcome = replay(reader, make, setup.scenario.network.namespace, until_s, share)
         except SwarmError as error:
-            yield Replayed(recorded=recorded, outcome=None, why=str(error))
-        else:
-            yield Replayed(recorded=recorded, outcome=outcome)
+            why = str(error)
+        yield Replayed(recorded=recorded, outcome=outcome, why=why)
+
+
+def _rebuilt(setup: RoleSetup, ground: tuple[Terrain, Floats], boundary: Replaying) -> Service:
+    """The service of a recorded process. What it tells itself is in the recording, too."""
+    nobody: Any = boundary.nobody
+    prepared = cast(PreparedCosts, _Costs(ground[0], setup.scenario))
+    outside = Outside(bus=nobody, worker=nobody, prepared=prepared)
+    return built(setup, *ground, boundary, outside, lambda event: None)
 
 
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:

@@ -7,6 +7,9 @@ cell, pillars.
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,62 +20,16 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import RoverConfig, Scenario
 
 CROWDS = ("open", "doors", "corridor", "maze")
-SMALL = parse_scenario("""
-name = "small"
-time_scale = 10
-[terrain]
-source = "synthetic"
-rows = 48
-cols = 64
-resolution_m = 30
-relief_m = 200
-roads = 3
-[terrain.hidden]
-closed_roads = 2
-rubble_fields = 4
-flooded_share = 0.02
-[cost]
-max_slope_deg = 25
-[[targets]]
-count = 2
-speed_m_per_s = 3
-[[groups]]
-vehicles = 10
-[vehicles]
-per_agent = 4
-sense_range_m = 120
-capture_range_m = 60
-""")
-"""Three agents on a hill with hidden obstacles: marks are made all the time."""
-WIDE_TERRAIN = """
-time_scale = 40
-[terrain]
-source = "synthetic"
-rows = 280
-cols = 800
-resolution_m = 30
-relief_m = 200
-"""
-"""Begins a scenario with eight regions, in which vehicles drive ten cells a second and cross borders."""
-WIDE = parse_scenario(f"""
-name = "wide"
-{WIDE_TERRAIN}
-[terrain.hidden]
-rubble_fields = 6
-[cost]
-max_slope_deg = 25
-[[targets]]
-count = 3
-speed_m_per_s = 3
-[[groups]]
-vehicles = 24
-[vehicles]
-per_agent = 3
-sense_range_m = 120
-capture_range_m = 60
-reassign_s = 2
-""")
-"""Eight agents, whose vehicles cross borders of plots and regions all the time."""
+
+
+def of_file(name: str, settings: Mapping[str, Any] | None = None) -> Scenario:
+    """A scenario in the folder `small_worlds`, with other values at dotted keys."""
+    text = (Path(__file__).with_name("small_worlds") / f"{name}.toml").read_text(encoding="utf-8")
+    return parse_scenario(text, settings=settings or {})
+
+
+SMALL = of_file("small")
+WIDE = of_file("wide")
 ROVERS = "rovers"
 """A crowd among which 20 rovers drive that look out for nobody."""
 MIXED = ("small", "wide", *CROWDS)
@@ -83,26 +40,6 @@ _ROVERS = (
     RoverConfig(name="wide", count=2, speed_m_per_s=1.0, radius_m=12.0),
     RoverConfig(name="still", count=2, speed_m_per_s=0.0, radius_m=3.0),
 )
-_CROWD = """
-name = "crowd"
-time_scale = 10
-seed = {seed}
-[terrain]
-source = "synthetic"
-rows = {side}
-cols = {side}
-resolution_m = 10
-[[targets]]
-count = 4
-speed_m_per_s = 2
-walk = "random"
-[[groups]]
-vehicles = {vehicles}
-[vehicles]
-per_agent = {per_agent}
-sense_range_m = 40
-capture_range_m = 15
-"""
 
 
 def crowd(kind: str, seed: int, vehicles: int, per_agent: int, side: int = 40) -> tuple[Scenario, Terrain]:
@@ -118,8 +55,9 @@ def crowd(kind: str, seed: int, vehicles: int, per_agent: int, side: int = 40) -
     elif kind == "maze":
         for _ in range(side * side // 5):
             pace[chance.randrange(side), chance.randrange(side)] = np.inf
-    text = _CROWD.format(seed=seed, side=side, vehicles=vehicles, per_agent=per_agent)
-    return parse_scenario(text), terrain_of_pace(pace, 10.0)
+    settings = {"terrain.rows": side, "terrain.cols": side, "seed": seed}
+    settings |= {"groups.0.vehicles": vehicles, "vehicles.per_agent": per_agent}
+    return of_file("crowd", settings), terrain_of_pace(pace, 10.0)
 
 
 def _rooms(pace: NDArray[np.float32], chance: random.Random) -> None:

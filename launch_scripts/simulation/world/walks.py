@@ -116,7 +116,7 @@ class TrueTerrain:
         window = self.grid.around(start, WAY_HALF_CELLS)
         cells, graph = self._steps_graph(window)
         here = int(np.searchsorted(cells, start))
-        cost, before = dijkstra(graph, directed=True, indices=here, return_predecessors=True)
+        cost, before = dijkstra(graph, directed=True, indices=np.asarray(here), return_predecessors=True)
         reached = np.isfinite(cost)
         reached[here] = False
         rows, cols = np.divmod(cells, self.grid.cols)

@@ -13,15 +13,14 @@ from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import WIDE_TERRAIN, seeded
+from launch_scripts.simulation.worlds import of_file, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.classes import MOST_CLASSES
-from swarm.config.load import parse_scenario
-from swarm.config.scenario import MapConfig, Scenario
+from swarm.config.scenario import MapConfig
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import MarkKind, MarksRequest
@@ -74,28 +73,17 @@ def test_within_its_regions_it_equals_one_that_holds_all(
     assert near.missing(everything.held.ledger.held()) == []
 
 
-NEAR: Scenario = parse_scenario(f"""
-name = "near"
-{WIDE_TERRAIN}
-[terrain.hidden]
-rubble_fields = 12
-flooded_share = 0.02
-[cost]
-max_slope_deg = 25
-[map]
-interest = "near"
-interest_m = 1200
-[[targets]]
-count = 3
-speed_m_per_s = 3
-[[groups]]
-vehicles = 12
-[vehicles]
-per_agent = 2
-sense_range_m = 240
-capture_range_m = 60
-reassign_s = 2
-""")
+NEAR = of_file(
+    "wide",
+    {
+        "name": "near",
+        "terrain.hidden": {"rubble_fields": 12, "flooded_share": 0.02},
+        "map": {"interest": "near", "interest_m": 1200},
+        "groups.0.vehicles": 12,
+        "vehicles.per_agent": 2,
+        "vehicles.sense_range_m": 240,
+    },
+)
 
 
 def test_one_that_enters_a_whole_large_map_asks_for_every_tile_of_every_class_in_messages_that_can_be_read() -> (
