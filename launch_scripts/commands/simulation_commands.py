@@ -111,20 +111,22 @@ def _simulate_once(
         for sentence in begin_run(folder, scenario, folder.name):
             terminal.say(sentence, "yellow")
         result = run_simulation(scenario, trace=log, record_to=folder)
+    done = result.simulation
     if as_json:
         numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
         typer.echo(json.dumps(numbers, indent=2))
     else:
         terminal.report(result.report)
-    report = with_series({**result.report, "run_id": folder.name}, result.recorder, result.terrain)
-    write_report(folder, report, result.recorder, result.terrain, truth=result.truth)
+    report = with_series({**result.report, "run_id": folder.name}, done.recorder, done.terrain)
+    write_report(folder, report, done.recorder, done.terrain, truth=done.truth)
+    log_told = "" if trace is None else f"; event log in {trace}"
     terminal.say(
-        f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
-        f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
+        f"{scenario.seconds:g} simulated seconds in {result.wall_s:.1f} s: "
+        f"{scenario.seconds / result.wall_s:.1f} times real time, {done.log.deliveries:,} deliveries{log_told}"
     )
     terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
-    if result.trace_cut is not None:
-        raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")
+    if done.log.cut is not None:
+        raise StoreError(f"the event log {trace} has no end: {done.log.cut}")
 
 
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: int, as_json: bool) -> bool:

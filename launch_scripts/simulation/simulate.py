@@ -11,6 +11,7 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from hashlib import blake2s
 from pathlib import Path
 from typing import Any, TextIO
@@ -19,10 +20,16 @@ import msgspec
 
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED, RunObserver
-from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, planner_spec, processes_of, spec_of
+from launch_scripts.process_table import (
+    SIMULATED_ROLES,
+    STOP_ORDER,
+    ProcessSpec,
+    planner_spec,
+    processes_of,
+    spec_of,
+)
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
-from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.bus.memory_bus import MemoryNetwork
@@ -59,11 +66,11 @@ class EventLog:
         self.deliveries += 1
         if self._out is not None:
             digest = blake2s(payload, digest_size=4).hexdigest()
-            self._write(f"{self._seconds(now_ns)} {source} > {destination} {topic} {digest}\n")
+            self.event(now_ns, f"{source} >", f"{destination} {topic} {digest}")
 
     def event(self, now_ns: int, what: str, whom: str) -> None:
-        if self._out is not None:
-            self._write(f"{self._seconds(now_ns)} {what} {whom}\n")
+        whole, rest = divmod(now_ns - self._began_ns, NS_PER_S)
+        self._write(f"{whole}.{rest:09d} {what} {whom}\n")
 
     def flush(self) -> None:
         """Write what waits."""
@@ -82,10 +89,6 @@ class EventLog:
             with contextlib.suppress(OSError):  # with what it could not write
                 out.close()
 
-    def _seconds(self, now_ns: int) -> str:
-        whole, rest = divmod(now_ns - self._began_ns, NS_PER_S)
-        return f"{whole}.{rest:09d}"
-
 
 BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5
@@ -97,28 +100,14 @@ _STOP_S = 0.1
 class SimulationResult:
     """Outcome of a simulation.
 
+    simulation  at its end; its scenario has the seed and the seconds that it ran with
     report      the numbers of report.json; the same for the same seed
-    scenario    with the seed and the seconds that it ran with
-    truth       pace of every cell as it truly is
-    deliveries  number of messages that arrived
     wall_s      seconds that it took on this machine
-    trace_cut   why the event log has no end; None if it is whole or was not asked for
     """
 
+    simulation: Simulation
     report: dict[str, Any]
-    recorder: Recorder
-    terrain: Terrain
-    seconds: float
-    scenario: Scenario
-    truth: Floats
-    deliveries: int
     wall_s: float
-    trace_cut: str | None = None
-
-    @property
-    def speed(self) -> float:
-        """Simulated seconds per second."""
-        return self.seconds / self.wall_s
 
 
 class Simulation:
@@ -156,17 +145,19 @@ class Simulation:
         self.nodes: dict[str, Node] = {}
         self.after_tick: list[Callable[[Node], None]] = []
         self.after_boot: list[Callable[[Node], None]] = []
-        self._phases = phases = random.Random(f"phases/{scenario.seed}")
+        self._phases = random.Random(f"phases/{scenario.seed}")
         for spec in processes_of(scenario, SIMULATED_ROLES):
             skew_ns = int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6)
-            node = Node(self, spec, phases.randrange(NS_PER_S), skew_ns)
-            self.nodes[node.name] = node
-            self.scheduler.at(EPOCH_NS + int(phases.random() * BOOT_SPREAD_S * NS_PER_S), node.boot)
+            node = self._node(spec, skew_ns)
+            self.scheduler.at(EPOCH_NS + int(self._phases.random() * BOOT_SPREAD_S * NS_PER_S), node.boot)
         self.book = OrderBook()
         self.refused: list[tuple[float, Message, str | None]] = []
         self._operator = self.network.bus(OBSERVER, scenario.network.namespace)
         self._orders_given = 0
-        self._watch()
+        bus = self.network.bus(OBSERVER, scenario.network.namespace, self.authenticator)
+        clock = self.scheduler.clock
+        observer = RunObserver(bus, lambda event: observer.take(event, clock.now_ns()), self.recorder, RECORDED)
+        observer.subscribe()
         self._plan_faults()
 
     @property
@@ -183,17 +174,21 @@ class Simulation:
         if node is None or node.bus is None:
             return
         node.crash()
-        if for_good:
-            return
-        backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
-        self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
+        if not for_good:
+            backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
+            self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
 
     def add(self, added: AddedAgent) -> Node:
         """Let an agent join that is not in the scenario."""
-        spec = spec_of("agent", added.plan.id)
-        node = Node(self, spec, self._phases.randrange(NS_PER_S), 0, added=added)
-        self.nodes[node.name] = node
+        node = self._node(spec_of("agent", added.plan.id), added=added)
         node.boot()
+        return node
+
+    def _node(
+        self, spec: ProcessSpec, skew_ns: int = 0, name: str | None = None, added: AddedAgent | None = None
+    ) -> Node:
+        node = Node(self, spec, self._phases.randrange(NS_PER_S), skew_ns, name, added)
+        self.nodes[node.name] = node
         return node
 
     def disturbed(self) -> bool:
@@ -221,12 +216,12 @@ class Simulation:
 
     def order(self, at_s: float, order: GiveOrder | ZoneOrder) -> None:
         """An operator gives an order then. A target that is added gets a planner, as a launcher would start it."""
-        self._at(at_s, lambda: self._give(order))
+        self._at(at_s, partial(self._give, order))
 
     def _give(self, order: GiveOrder | ZoneOrder) -> None:
         topic = ZONES if isinstance(order, ZoneOrder) else GIVE_ORDER
         self._orders_given += 1
-        self.log.event(self.scheduler.clock.now_ns(), "order", str(self._orders_given))
+        self._note("order", str(self._orders_given))
 
         def post(event: Event) -> None:
             match event:
@@ -245,61 +240,49 @@ class Simulation:
         wanted = {ranked_id(id, rank) for id in targets for rank in range(standbys + 1)}
         there = {node.spec.id: node for node in self.nodes.values() if node.spec.role == "planner"}
         for id in sorted(wanted - there.keys()):
-            node = Node(self, planner_spec(id), self._phases.randrange(NS_PER_S), 0)
-            self.nodes[node.name] = node
-            self.scheduler.after(NS_PER_S // 2, node.boot)
+            self.scheduler.after(NS_PER_S // 2, self._node(planner_spec(id)).boot)
         for id in sorted(there.keys() - wanted):
             node = self.nodes.pop(there[id].name)
             node.crash()
             node.retired = True
 
-    def _watch(self) -> None:
-        """Subscribes the recorder to its topics."""
-        bus = self.network.bus(OBSERVER, self.scenario.network.namespace, self.authenticator)
-        clock = self.scheduler.clock
-        observer = RunObserver(bus, lambda event: observer.take(event, clock.now_ns()), self.recorder, RECORDED)
-        observer.subscribe()
-
     def twin(self, name: str) -> None:
         """Starts a second life of an agent now, on another machine: with another file, and a clock of its own."""
         first = self.nodes[name]
         others = sum(node.spec == first.spec for node in self.nodes.values())
-        node = Node(self, first.spec, self._phases.randrange(NS_PER_S), -first.skew_ns, f"{name}.{others + 1}")
-        self.nodes[node.name] = node
-        node.boot()
+        self._node(first.spec, -first.skew_ns, f"{name}.{others + 1}").boot()
 
     def step_clock(self, name: str, by_s: float) -> None:
         """Sets the clock of a node's machine; the process that runs there has read it already."""
-        self._note("clock", (name,))
+        self._note("clock", name)
         if name in self.nodes:  # the planner of a removed target is not there any more
             self.nodes[name].skew_ns += int(by_s * NS_PER_S)
 
     def _plan_faults(self) -> None:
         plan = self.faults
         for crash in plan.crashes:
-            self._at(crash.at_s, lambda each=crash: self.crash(each.node, for_good=each.for_good))  # type: ignore[misc]
+            self._at(crash.at_s, partial(self.crash, crash.node, for_good=crash.for_good))
         for hang in plan.hangs:
             self._at(hang.from_s, self.nodes[hang.node].hang)
             self._at(hang.until_s, self.nodes[hang.node].wake)
         for step in plan.clock_steps:
-            self._at(step.at_s, lambda step=step: self.step_clock(step.node, step.by_s))  # type: ignore[misc]
+            self._at(step.at_s, partial(self.step_clock, step.node, step.by_s))
         for twin in plan.twins:
-            self._at(twin.at_s, lambda name=twin.node: self.twin(name))  # type: ignore[misc]
+            self._at(twin.at_s, partial(self.twin, twin.node))
         for partition in plan.partitions:
-            nodes = partition.nodes
-            self._at(partition.from_s, lambda nodes=nodes: self._note("cut", nodes))  # type: ignore[misc]
-            self._at(partition.until_s, lambda nodes=nodes: self._note("heal", nodes))  # type: ignore[misc]
+            self._at(partition.from_s, partial(self._note, "cut", *partition.nodes))
+            self._at(partition.until_s, partial(self._note, "heal", *partition.nodes))
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
-                self._at(lost_s, lambda nodes=nodes: self.network.relink(nodes, False))  # type: ignore[misc]
+                self._at(lost_s, partial(self.network.relink, partition.nodes, False))
                 # A microsecond late: rounding must not put it before the heal, when the links are still cut.
                 found_s = partition.until_s + RELINK_S + 1e-6
-                self._at(found_s, lambda nodes=nodes: self.network.relink(nodes, True))  # type: ignore[misc]
+                self._at(found_s, partial(self.network.relink, partition.nodes, True))
 
     def _at(self, seconds: float, action: Callable[[], None]) -> None:
         self.scheduler.at(EPOCH_NS + int(seconds * NS_PER_S), action)
 
-    def _note(self, what: str, nodes: tuple[str, ...]) -> None:
+    def _note(self, what: str, *nodes: str) -> None:
         self.log.event(self.scheduler.clock.now_ns(), what, ",".join(nodes))
 
 
@@ -332,14 +315,5 @@ def simulate(
                 progress(simulation.now_s)
         simulation.finish()
     simulation.log.flush()
-    return SimulationResult(
-        report=simulation.report(seconds),
-        recorder=simulation.recorder,
-        terrain=simulation.terrain,
-        seconds=seconds,
-        scenario=scenario,
-        truth=simulation.truth,
-        deliveries=simulation.log.deliveries,
-        wall_s=time.perf_counter() - began_s,
-        trace_cut=simulation.log.cut,
-    )
+    wall_s = time.perf_counter() - began_s
+    return SimulationResult(simulation, simulation.report(seconds), wall_s)
