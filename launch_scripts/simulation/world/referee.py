@@ -9,10 +9,10 @@ not count."""
 
 from __future__ import annotations
 
-import heapq
 import math
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body, Fleet
 from vehicle_agent.bodies import MOST_BODIES, REACTION_S, capsule_of
 
+On = TypeVar("On")
 _SKEW_NS = NS_PER_S // 200
 """Shorter overlaps are no collision: the clocks of two processes may differ by as much."""
 _REMEMBER_NS = 5 * NS_PER_S
@@ -92,13 +93,29 @@ class Stay:
 
 @dataclass(slots=True)
 class _Vehicle:
-    """row  in the column of all cells"""
-
     stay: Stay
     author: str
     seq: int
     stamp_ns: int
-    row: int
+
+
+Encounters = dict[tuple[str, str], int]
+"""Pair -> the last time at which both are known to have been on one cell."""
+
+
+def _is_new(encounters: Encounters, pair: tuple[str, str], until_ns: int) -> bool:
+    """Notes that two were on one cell. True unless they were so a moment ago already."""
+    last_ns = encounters.get(pair)
+    encounters[pair] = until_ns if last_ns is None else max(until_ns, last_ns)
+    return last_ns is None or until_ns - last_ns > _APART_NS
+
+
+def _forget(at: dict[int, list[On]], is_over: Callable[[On], bool]) -> None:
+    """Drops what is over from the lists of all cells, and cells without any."""
+    for cell in list(at):
+        at[cell] = [each for each in at[cell] if not is_over(each)]
+        if not at[cell]:
+            del at[cell]
 
 
 class Referee:
@@ -116,20 +133,15 @@ class Referee:
         self._truths = {name: truth.reshape(-1) for name, truth in truths.items()}
         self._cells = grid.cells
         self._vehicles: dict[str, _Vehicle] = {}
-        self._at: NDArray[np.int64] = np.empty(64, np.int64)
-        """Last known cell of each vehicle, in the order in which they were first heard of; behind them room."""
         self._stays: dict[int, list[Stay]] = {}
-        self._left: list[tuple[int, int, Stay]] = []
-        """Heap of (when it ended, number, stay) of those which their vehicles have left."""
-        self._encounters: dict[tuple[str, str], int] = {}
-        self._entered = 0
+        self._encounters: Encounters = {}
         self._swept_ns = 0
         self._bodies = BodyReferee(grid)
 
     @property
     def cells(self) -> NDArray[np.int64]:
         """Last known cell of every vehicle."""
-        own = self._at[: len(self._vehicles)].copy()
+        own = np.array([each.stay.cell for each in self._vehicles.values()], np.int64)
         return own if self._air is None else np.concatenate((own, self._air.cells))
 
     def hear_body(self, body: Body, now_ns: int) -> None:
@@ -174,17 +186,9 @@ class Referee:
         """A vehicle comes onto a cell."""
         self._stays.setdefault(entered.cell, []).append(entered)
         if known is None:
-            row = len(self._vehicles)
-            if row == len(self._at):
-                self._at = np.concatenate((self._at, self._at))
-            known = self._vehicles[entered.vehicle] = _Vehicle(
-                entered, fleet.author, fleet.seq, fleet.stamp_ns, row
-            )
+            self._vehicles[entered.vehicle] = _Vehicle(entered, fleet.author, fleet.seq, fleet.stamp_ns)
         else:
-            self._entered += 1
-            heapq.heappush(self._left, (known.stay.end_ns, self._entered, known.stay))
             known.stay = entered
-        self._at[known.row] = entered.cell
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
         if not truth.item(entered.cell) < math.inf:
             broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns))
@@ -196,21 +200,18 @@ class Referee:
             if other.vehicle == stay.vehicle or overlap_ns <= _SKEW_NS:
                 continue
             first, second = sorted((stay.vehicle, other.vehicle))
-            last_ns = self._encounters.get((first, second))
             until_ns = min(stay.end_ns, other.end_ns)
-            self._encounters[first, second] = max(until_ns, last_ns or 0)
-            if last_ns is None or until_ns - last_ns > _APART_NS:
+            if _is_new(self._encounters, (first, second), until_ns):
                 yield Collision(first, second, stay.cell, until_ns)
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
         self._swept_ns = now_ns
-        while self._left and now_ns - self._left[0][0] > _REMEMBER_NS:
-            stay = heapq.heappop(self._left)[2]
-            here = self._stays[stay.cell]
-            here.remove(stay)
-            if not here:
-                del self._stays[stay.cell]
+        vehicles = self._vehicles
+        _forget(
+            self._stays,
+            lambda stay: now_ns - stay.end_ns > _REMEMBER_NS and vehicles[stay.vehicle].stay is not stay,
+        )
 
 
 IN_TIME_NS = NS_PER_S // 5
@@ -221,13 +222,16 @@ _LATE_NS = 3 * NS_PER_S // 20
 
 @dataclass(slots=True, eq=False)
 class _Cover:
-    """A body on a cell. `closed_ns` is since when it has closed the cell, `end_ns` None while it is there."""
+    """A body on a cell.
+
+    closed_ns  since when it has closed the cell
+    end_ns     while it is there the end of its lease
+    """
 
     body: str
     begin_ns: int
     closed_ns: int
-    until_ns: int
-    end_ns: int | None = None
+    end_ns: int
 
 
 @dataclass(slots=True, eq=False)
@@ -246,7 +250,7 @@ class BodyReferee:
         self._grid = grid
         self._records: dict[tuple[str, int], _Record] = {}
         self._covers: dict[int, list[_Cover]] = {}
-        self._met: dict[tuple[str, str], int] = {}
+        self._met: Encounters = {}
         self._swept_ns = 0
 
     def hear(self, body: Body, now_ns: int) -> None:
@@ -275,7 +279,7 @@ class BodyReferee:
             if cover is None:
                 cover = _Cover(body.id, now_ns, record.closed_ns.get(cell, now_ns), 0)
                 self._covers.setdefault(cell, []).append(cover)
-            cover.until_ns = record.until_ns
+            cover.end_ns = record.until_ns
             record.covers[cell] = cover
         for cell, cover in ended.items():
             if record.covers.get(cell) is not cover:
@@ -291,12 +295,10 @@ class BodyReferee:
     def check(self, stay: Stay) -> Iterator[BodyHit]:
         """What a vehicle's stay on a cell proves."""
         for cover in self._covers.get(stay.cell, ()):
-            end_ns = min(stay.end_ns, cover.until_ns if cover.end_ns is None else cover.end_ns)
+            end_ns = min(stay.end_ns, cover.end_ns)
             if end_ns - max(stay.begin_ns, cover.begin_ns) <= _LATE_NS:
                 continue
-            met_ns = self._met.get((stay.vehicle, cover.body))
-            self._met[stay.vehicle, cover.body] = end_ns
-            if met_ns is None or end_ns - met_ns > _APART_NS:
+            if _is_new(self._met, (stay.vehicle, cover.body), end_ns):
                 said_ns = stay.since_ns - cover.closed_ns
                 yield BodyHit(
                     stay.vehicle, cover.body, stay.cell, end_ns, said_ns >= IN_TIME_NS, said_ns / NS_PER_S
@@ -305,16 +307,7 @@ class BodyReferee:
     def _sweep(self, now_ns: int) -> None:
         """Forget what ended long ago."""
         self._swept_ns = now_ns
-        for cell in list(self._covers):
-            kept = [
-                cover
-                for cover in self._covers[cell]
-                if now_ns - (cover.until_ns if cover.end_ns is None else cover.end_ns) <= _REMEMBER_NS
-            ]
-            if kept:
-                self._covers[cell] = kept
-            else:
-                del self._covers[cell]
+        _forget(self._covers, lambda cover: now_ns - cover.end_ns > _REMEMBER_NS)
         for key in [key for key, record in self._records.items() if now_ns - record.until_ns > _REMEMBER_NS]:
             del self._records[key]
         for pair in [pair for pair, met_ns in self._met.items() if now_ns - met_ns > 2 * _REMEMBER_NS]:

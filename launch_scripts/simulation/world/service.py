@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry
 from launch_scripts.simulation.world.rovers import Rovers
-from launch_scripts.simulation.world.targets import Action, Captured, Publish, TargetWorld
+from launch_scripts.simulation.world.targets import Action, Captured, TargetWorld
 from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
@@ -143,8 +143,6 @@ class TargetsService:
                 self._world.planner_up(job_of(peer.id), job_of(peer.id) in left)
             case Heard(message=TargetPose() as pose):
                 self._world.hear_pose(pose, now_ns)
-            case _:
-                pass
 
     def tick(self, now_ns: int) -> None:
         leads = self._candidacy.tick(self._world.ready, now_ns)
@@ -186,9 +184,9 @@ class TargetsService:
     def _perform(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
             match action:
-                case Publish(pose) if self._throttle.is_news(pose):
+                case TargetPose(target=target) if self._throttle.is_news(action):
                     self.counters.count("poses")
-                    self._bus.publish(self._topic(pose.target), pose, target=pose.target)
+                    self._bus.publish(self._topic(target), action, target=target)
                 case Captured(target, vehicle, cell):
                     self.counters.count("captures")
                     self.counters.count_by(CAPTURES_OF, target)

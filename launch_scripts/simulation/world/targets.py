@@ -58,18 +58,13 @@ _MOST_COUNTED = 1 << 32
 
 
 @dataclass(frozen=True, slots=True)
-class Publish:
-    pose: TargetPose
-
-
-@dataclass(frozen=True, slots=True)
 class Captured:
     target: str
     vehicle: str
     cell: int
 
 
-Action = Publish | Captured | Collision | LethalEntry | BodyHit | Body
+Action = TargetPose | Captured | Collision | LethalEntry | BodyHit | Body
 
 
 @dataclass(eq=False)
@@ -87,6 +82,14 @@ class _Target:
     jumps: int = 0
     calm_until_ns: int = 0
     ordered_ns: int = 0
+
+    @property
+    def jumps_when_caught(self) -> bool:
+        return self.config.caught == "jump" and self.config.is_simulated
+
+    def calm_down(self, now_ns: int) -> None:
+        """A capture counts once: the next one counts after a cool-down."""
+        self.calm_until_ns = now_ns + (JUMP_COOL_DOWN_NS if self.jumps_when_caught else STAY_COOL_DOWN_NS)
 
 
 class TargetWorld:
@@ -186,7 +189,7 @@ class TargetWorld:
                 target.placed = True
                 target.jumps += 1
                 if self.leads:
-                    actions.append(Publish(self._pose(id, target, now_ns)))
+                    actions.append(self._pose(id, target, now_ns))
         return actions
 
     def lead(self, leads: bool) -> None:
@@ -236,16 +239,15 @@ class TargetWorld:
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
-        counts = self._trackings.on_pose(pose, now_ns)
-        if counts is None:
+        if (counted := self._trackings.on_pose(pose, now_ns)) is None:
             return
-        pose = counts
+        pose = counted
         if target.config.is_simulated:
             if self._terrain.lethal(pose.cell):
                 return
             self._others_incarnation = max(self._others_incarnation, pose.incarnation)
             if pose.captures > target.captures:
-                target.calm_until_ns = now_ns + _cool_down_ns(target)
+                target.calm_down(now_ns)
             if max(pose.captures, pose.jumps) < _MOST_COUNTED:
                 target.captures, target.jumps = pose.captures, pose.jumps
         if pose.cell != target.walker.cell or not target.config.is_simulated:
@@ -262,13 +264,12 @@ class TargetWorld:
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
         seen = self._referee.hear(fleet)
-        if not self.leads or self.paused:
-            return list(seen) if self.leads else []
         actions: list[Action] = []
-        for index, vehicle in self._catchers(fleet, now_ns):
-            id = fleet.target_ids[index]
-            actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
-        return [*actions, *seen]
+        if self.leads and not self.paused:
+            for index, vehicle in self._catchers(fleet, now_ns):
+                id = fleet.target_ids[index]
+                actions += self._reached(id, self._targets[id], vehicle, now_ns)
+        return [*actions, *seen] if self.leads else []
 
     def tick(self, now_ns: int) -> list[Action]:
         """Moves all targets and returns their poses."""
@@ -276,14 +277,13 @@ class TargetWorld:
             return []
         if self._started_ns is None:
             self._started_ns = self._ticked_ns = now_ns
-        elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
-        if self.paused:
-            elapsed_s = 0.0
+        time_scale = 0.0 if self.paused else self._time_scale
+        elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * time_scale
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
         self._budget.ways = _WAYS_PER_TICK
-        actions: list[Action] = [*self.rovers.tick(0.0 if self.paused else self._time_scale, now_ns)]
+        actions: list[Action] = [*self.rovers.tick(time_scale, now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
@@ -293,7 +293,7 @@ class TargetWorld:
             target.placed = True
             pose = self._pose(id, target, now_ns)
             self._refer(pose, now_ns)
-            actions.append(Publish(pose))
+            actions.append(pose)
         return actions
 
     def _refer(self, pose: TargetPose, now_ns: int) -> None:
@@ -328,10 +328,7 @@ class TargetWorld:
         if not len(chasing):
             return []
         chased = chased[chasing]
-        # inf for targets of others, those which are not placed yet and lost ones: no vehicle is near.
-        known = [None if self._lost(id, now_ns) else self._targets.get(id) for id in fleet.target_ids]
-        places = [(t.x_m, t.y_m) if t is not None and t.placed else (math.inf, math.inf) for t in known]
-        x_m, y_m = np.array(places).T
+        x_m, y_m = np.array([self._place_of(id, now_ns) for id in fleet.target_ids]).T
         east_m = column(fleet.east_m, "<f4")[chasing] - (x_m[chased] - self._grid.west_m)
         south_m = column(fleet.south_m, "<f4")[chasing] - (self._grid.north_m - y_m[chased])
         arrived = np.frombuffer(fleet.states, np.uint8)[chasing] == VehicleState.ARRIVED
@@ -343,32 +340,27 @@ class TargetWorld:
             caught.setdefault(index, fleet.ids[vehicle])
         return list(caught.items())
 
-    def _lost(self, id: str, now_ns: int) -> bool:
+    def _place_of(self, id: str, now_ns: int) -> tuple[float, float]:
+        """(x_m, y_m) of a target; infinite for those of others, those which are not placed yet, and lost ones."""
         target, tracking = self._targets.get(id), self._trackings.of(id)
-        simulated = target is not None and target.config.is_simulated
-        return not simulated and tracking is not None and tracking.lost(now_ns)
+        if target is None or not target.placed:
+            return math.inf, math.inf
+        if not target.config.is_simulated and tracking is not None and tracking.lost(now_ns):
+            return math.inf, math.inf
+        return target.x_m, target.y_m
 
     def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
         calm = now_ns >= target.calm_until_ns
-        jumps = _jumps(target)
-        if calm or not jumps:
-            target.calm_until_ns = now_ns + _cool_down_ns(target)
+        if calm or not target.jumps_when_caught:
+            target.calm_down(now_ns)
         if not calm:
             return []
         target.captures += 1
-        captured = Captured(id, vehicle, target.walker.cell)
-        if not jumps:
-            return [captured]
-        target.jumps += 1
-        clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
-        walker = target.walker
-        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
-        return [captured, Publish(self._pose(id, target, now_ns))]
-
-
-def _jumps(target: _Target) -> bool:
-    return target.config.caught == "jump" and target.config.is_simulated
-
-
-def _cool_down_ns(target: _Target) -> int:
-    return JUMP_COOL_DOWN_NS if _jumps(target) else STAY_COOL_DOWN_NS
+        actions: list[Action] = [Captured(id, vehicle, target.walker.cell)]
+        if target.jumps_when_caught:
+            target.jumps += 1
+            clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
+            walker = target.walker
+            walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
+            actions.append(self._pose(id, target, now_ns))
+        return actions

@@ -19,7 +19,6 @@ from launch_scripts.simulation.world.targets import (
     STAY_COOL_DOWN_NS,
     Action,
     Captured,
-    Publish,
     TargetWorld,
 )
 from launch_scripts.simulation.world.walks import Walk
@@ -69,7 +68,7 @@ class World:
 
     def poses(self, actions: list[Action] | None = None) -> dict[str, TargetPose]:
         actions = self.tick() if actions is None else actions
-        return {action.pose.target: action.pose for action in actions if isinstance(action, Publish)}
+        return {action.target: action for action in actions if isinstance(action, TargetPose)}
 
     def hear(self, cell: int, target: str = "t", state: VehicleState = VehicleState.FOLLOWING) -> list[Action]:
         """A vehicle reports from the middle of a cell."""
@@ -128,9 +127,9 @@ def test_a_captured_target_turns_up_far_away() -> None:
     before = world.poses(world.settle())["t"]
     captured, publish = world.hear(world.grid.cell(20, 27))
     assert captured == Captured("t", "v", before.cell)
-    assert isinstance(publish, Publish)
-    assert (publish.pose.captures, publish.pose.jumps) == (1, 1)
-    assert world.grid.distance_cells(publish.pose.cell, before.cell) >= 11
+    assert isinstance(publish, TargetPose)
+    assert (publish.captures, publish.jumps) == (1, 1)
+    assert world.grid.distance_cells(publish.cell, before.cell) >= 11
 
 
 def test_a_vehicle_out_of_range_captures_nothing() -> None:
@@ -221,7 +220,7 @@ def test_where_targets_may_start_is_the_same_whoever_found_it() -> None:
     for homes in (None, found, ~found & np.isfinite(pace)):
         world = TargetWorld(plan, terrain, pace, 1, homes=homes)
         world.begin_anew()
-        poses.append([action.pose.cell for action in world.tick(0) if isinstance(action, Publish)])
+        poses.append([action.cell for action in world.tick(0) if isinstance(action, TargetPose)])
     assert len(poses[0]) == 9
     assert poses[0] == poses[1] != poses[2]
 
