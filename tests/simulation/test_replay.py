@@ -66,4 +66,4 @@ def test_watching_a_run_does_not_change_it():
     assert one.report == other.report
     assert told == [1.0, 2.0, 3.0, 4.0]
     assert trace.getvalue().splitlines()[0].startswith("0.")
-    assert one.deliveries == sum(" > " in line for line in trace.getvalue().splitlines())
+    assert one.simulation.log.deliveries == sum(" > " in line for line in trace.getvalue().splitlines())
