@@ -2,8 +2,9 @@
 
 Each mutant is one change of one place by an operator of cosmic-ray: a comparison, a number, a branch. It is made in
 a copy of the tree (`.mutants/`, where compiled kernels stay from run to run), and the tests that import its module
-run against it, without network, until the first one fails. What survives is either a rule that no test holds or a
-change without effect; both are listed with file, line and difference, and the exit code is 1.
+run against it, without network, until the first one fails. That test is then run once without the mutant, and must
+pass: a suite that is broken kills nothing. What survives is either a rule that no test holds or a change without
+effect; both are listed with file, line and difference, and the exit code is 1.
 
 cosmic-ray's own runner wants a database and one command for all modules. Its operators, called as a library, let
 each mutant meet only the tests that can see it, which is what makes a sample of 200 affordable.
@@ -22,7 +23,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,8 +45,8 @@ OPERATORS = (
     "core/ReplaceAndWithOr", "core/ReplaceOrWithAnd", "core/NumberReplacer", "core/ReplaceBreakWithContinue",
     "core/ReplaceContinueWithBreak", "core/ZeroIterationForLoop",
 )  # fmt: skip
-LEAST_S, TIMES = 20.0, 4.0
-"""A mutant may take so many times as long as the unchanged module; one that takes longer counts as killed."""
+KILLER = re.compile(r"^(?:FAILED|ERROR) ([^\[\s]+)", re.MULTILINE)
+"""The test that failed, in the last lines of pytest, without its parameters."""
 
 
 class Mutant(NamedTuple):
@@ -109,7 +109,7 @@ class Suite:
             path: {name for each in own & support.keys() for name in support[each]}
             for path, own in self._direct.items()
         }
-        self._seconds: dict[str, float | None] = {}
+        self._passes: dict[tuple[str, ...], bool] = {}
 
     def of(self, file: str) -> list[str]:
         """Test files for a file of the product, those that name it first; none if nobody imports it."""
@@ -118,33 +118,34 @@ class Suite:
         by_support = [path for path, names in self._by_support.items() if module in names and path not in direct]
         return [path.relative_to(ROOT).as_posix() for path in (*direct, *by_support)]
 
-    def seconds(self, file: str) -> float | None:
-        """How long the tests of a file take while nothing is broken; None if they fail or there are none."""
-        if file not in self._seconds:
-            began_s = time.monotonic()
-            passed = bool(self.of(file)) and run_tests(self.of(file), 900) == 0
-            self._seconds[file] = time.monotonic() - began_s if passed else None
-        return self._seconds[file]
+    def passes(self, tests: list[str], limit_s: float) -> bool:
+        """True if these tests pass in time while nothing is broken."""
+        key = tuple(tests)
+        if key not in self._passes:
+            self._passes[key] = run_tests(tests, limit_s)[0] == 0
+        return self._passes[key]
 
 
-def run_tests(files: list[str], limit_s: float) -> int | None:
-    """Exit code of pytest in the copy; None if it took too long."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "--network", "none", "-p", "no:cacheprovider", *files]
+def run_tests(tests: list[str], limit_s: float) -> tuple[int | None, str]:
+    """Exit code of pytest in the copy, None if it took too long, and what it said."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "--tb=no", "--network", "none", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": f"{COPY}:{COPY / 'tests'}"}
     with subprocess.Popen(
-        command,
+        [*command, *tests],
         cwd=COPY,
         env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
         start_new_session=True,
     ) as process:
         try:
-            return process.wait(limit_s)
+            said, _ = process.communicate(timeout=limit_s)
+            return process.returncode, said
         except BaseException as error:
             os.killpg(process.pid, signal.SIGKILL)
             if isinstance(error, subprocess.TimeoutExpired):
-                return None
+                return None, ""
             raise
 
 
@@ -164,23 +165,28 @@ def refresh_copy() -> None:
                 shutil.copy2(ROOT / name, target)
 
 
-def tried(mutant: Mutant, suite: Suite) -> dict[str, Any]:
-    """What became of a mutant: killed, survived, or untested where no test sees its module."""
-    path = COPY / mutant.file
+def tried(mutant: Mutant, suite: Suite, limit_s: float) -> dict[str, Any]:
+    """What became of a mutant: killed, survived, or untested where no test sees its module in time."""
+    path, tests = COPY / mutant.file, suite.of(mutant.file)
     source = path.read_text(encoding="utf-8")
-    seconds = suite.seconds(mutant.file)
     mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
     assert mutated is not None, mutant
     diff = list(difflib.unified_diff(source.splitlines(), mutated.splitlines(), lineterm="", n=0))[3:]
-    outcome = "untested"
-    if seconds is not None:
+    code, said = 5, ""
+    if tests:
         try:
             path.write_text(mutated, encoding="utf-8")
-            code = run_tests(suite.of(mutant.file), max(LEAST_S, TIMES * seconds))
+            code, said = run_tests(tests, limit_s)
         finally:
             path.write_text(source, encoding="utf-8")
-        outcome = "survived" if code == 0 else "killed"
-    return {**mutant._asdict(), "outcome": outcome, "diff": diff}
+    killer = KILLER.findall(said)[:1]
+    if code == 0:
+        outcome = "survived"
+    elif code == 5:  # pytest's word for no test
+        outcome = "untested"
+    else:  # one that hangs is killed if all tests pass in that time without it
+        outcome = "killed" if suite.passes(killer or tests, limit_s) else "untested"
+    return {**mutant._asdict(), "outcome": outcome, "killed_by": killer, "diff": diff}
 
 
 def main() -> int:
@@ -192,6 +198,7 @@ def main() -> int:
     parser.add_argument("--all", action="store_true", help="all lines, whatever has changed")
     parser.add_argument("--most", type=int, default=50, help="a sample of so many mutants at most (50)")
     parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
+    parser.add_argument("--seconds", type=float, default=300.0, help="for the tests of each mutant at most (300)")
     parser.add_argument("--json", type=Path, help="write every mutant and its outcome here")
     chosen = parser.parse_args()
     since = chosen.since or (None if chosen.files or chosen.all else "HEAD~1")
@@ -202,10 +209,14 @@ def main() -> int:
     print(f"{len(sample)} of {len(found)} mutants", file=sys.stderr)
     refresh_copy()
     suite, results = Suite(), []
-    for number, mutant in enumerate(sorted(sample), 1):
-        result = tried(mutant, suite)
+    for number, mutant in enumerate(sample, 1):  # stopped early, it was a smaller sample
+        result = tried(mutant, suite, chosen.seconds)
         results.append(result)
-        print(f"{number}/{len(sample)} {result['outcome']:8} {mutant.file}:{mutant.line}", file=sys.stderr)
+        print(
+            f"{number}/{len(sample)} {result['outcome']:8} {mutant.file}:{mutant.line}",
+            *result["killed_by"],
+            file=sys.stderr,
+        )
         if result["outcome"] != "killed":
             print("\n".join(f"    {line}" for line in result["diff"]), file=sys.stderr)
     if chosen.json:

@@ -1,0 +1,92 @@
+"""What a launcher starts, in which order, and how long it waits before it starts something again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from launch_scripts.launcher.local_swarm import Backoff
+from launch_scripts.launcher.options import UpOptions, chosen_processes
+from launch_scripts.launcher.up import run_swarm
+from launch_scripts.process_table import ROLES, STOP_ORDER, TABLE, processes_of
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
+from swarm.errors import ConfigError
+
+
+def test_the_table_has_a_process_for_each_target_and_each_25_vehicles() -> None:
+    scenario = Scenario(targets=(TargetConfig(count=3),), groups=(GroupConfig(vehicles=60),))
+    names = [spec.name for spec in processes_of(scenario)]
+    assert names == [
+        *("router-0", "keeper-0", "monitor-0", "planner-t0", "planner-t1", "planner-t2"),
+        *("targets-0", "agent-a0", "agent-a1", "agent-a2"),
+    ]
+    assert [spec.name for spec in processes_of(scenario, ("router", "agent"))][:2] == ["router-0", "agent-a0"]
+
+
+def test_the_table_says_of_every_role_how_urgent_it_is_and_none_before_those_that_drive() -> None:
+    assert (
+        TABLE["agent"].niceness == TABLE["targets"].niceness == min(role.niceness for role in TABLE.values()) == 0
+    )
+
+
+def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_rank() -> None:
+    scenario = Scenario(targets=(TargetConfig(count=2),), standbys=StandbyConfig(planner=2, targets=1))
+    roles = ("planner", "targets", "agent")
+
+    def names(rank: int | None) -> list[str]:
+        return [spec.name for spec in processes_of(scenario, roles, rank) if spec.role != "agent"]
+
+    assert names(None) == [
+        *("planner-t0", "planner-t1", "planner-t0.r1", "planner-t1.r1", "planner-t0.r2", "planner-t1.r2"),
+        *("targets-0", "targets-0.r1"),
+    ]
+    assert names(0) == ["planner-t0", "planner-t1", "targets-0"]
+    assert names(1) == ["planner-t0.r1", "planner-t1.r1", "targets-0.r1"]
+    assert names(2) == ["planner-t0.r2", "planner-t1.r2"]
+    assert names(3) == []
+    assert len([spec for spec in processes_of(scenario, rank=1) if spec.role == "agent"]) == 4
+
+
+def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    options = UpOptions(Scenario(name="x"), tmp_path, roles=("planner",), rank=1)
+    with pytest.raises(ConfigError, match="scenario x has no planner of rank 1; see standbys"):
+        run_swarm(options)
+
+
+def test_processes_are_chosen_by_role_and_id_and_start_in_order() -> None:
+    scenario = parse_scenario('name = "x"\n[[targets]]\ncount = 2\n[standbys]\nplanner = 1')
+    chosen = chosen_processes(scenario, ["agent", "planner.t1.r1", "router.3", "planner.t0", "planner.t0"], None)
+    names = ["router-3", "planner-t1.r1", "planner-t0", "agent-a0", "agent-a1", "agent-a2", "agent-a3"]
+    assert [spec.name for spec in chosen] == names
+
+
+@pytest.mark.parametrize(
+    ("word", "answer"),
+    [
+        ("planner.t9", "no planner 't9' in scenario x; it has t"),
+        ("agnet.a0", "did you mean 'agent'"),
+        ("keeper.a/b", "--only 'a/b' is not 1 to 64 of letters"),
+    ],
+)
+def test_a_process_that_there_is_not_is_refused_in_a_sentence(word: str, answer: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        chosen_processes(Scenario(name="x"), [word], None)
+    assert answer in str(raised.value)
+
+
+def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:
+    scenario = Scenario(targets=(TargetConfig(walk="external"),))
+    assert "targets-0" in [spec.name for spec in processes_of(scenario)]
+
+
+def test_the_router_starts_first_and_ends_last() -> None:
+    assert ROLES[0] == STOP_ORDER[-1] == "router"
+    assert sorted(ROLES) == sorted(STOP_ORDER)
+
+
+def test_the_wait_before_a_restart_doubles_to_five_seconds_and_is_short_again_after_a_good_run() -> None:
+    backoff = Backoff()
+    assert [backoff.crashed(ran_s=0.0) for _ in range(7)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+    assert backoff.crashed(ran_s=60.0) == 0.2
