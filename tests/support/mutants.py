@@ -98,12 +98,19 @@ def _imports(path: Path) -> set[str]:
 
 
 class Suite:
-    """Which test files see a module: those that import it, themselves or by a module of `tests/support`."""
+    """Which test files see a module: those that import it, themselves or by a module of `tests/support`.
 
-    def __init__(self) -> None:
+    near  only the unit tests that import it themselves
+    """
+
+    def __init__(self, near: bool = False) -> None:
         folder = ROOT / "tests"
         support = {f"support.{path.stem}": _imports(path) for path in (folder / "support").glob("*.py")}
-        files = [*sorted((folder / "unit").rglob("test_*.py")), *sorted((folder / "laws").glob("test_*.py"))]
+        files = sorted((folder / "unit").rglob("test_*.py"))
+        if near:
+            support = {}
+        else:
+            files += sorted((folder / "laws").glob("test_*.py"))
         self._direct = {path: _imports(path) for path in files}
         self._by_support = {
             path: {name for each in own & support.keys() for name in support[each]}
@@ -199,6 +206,7 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=50, help="a sample of so many mutants at most (50)")
     parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
     parser.add_argument("--seconds", type=float, default=300.0, help="for the tests of each mutant at most (300)")
+    parser.add_argument("--near", action="store_true", help="only unit tests that import the module themselves")
     parser.add_argument("--json", type=Path, help="write every mutant and its outcome here")
     chosen = parser.parse_args()
     since = chosen.since or (None if chosen.files or chosen.all else "HEAD~1")
@@ -208,7 +216,7 @@ def main() -> int:
     sample = random.Random(chosen.seed).sample(found, min(chosen.most, len(found)))
     print(f"{len(sample)} of {len(found)} mutants", file=sys.stderr)
     refresh_copy()
-    suite, results = Suite(), []
+    suite, results = Suite(chosen.near), []
     for number, mutant in enumerate(sample, 1):  # stopped early, it was a smaller sample
         result = tried(mutant, suite, chosen.seconds)
         results.append(result)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import os
+import contextlib
 import time
 from collections.abc import Callable
-from pathlib import Path
+
+import psutil
+from support.process_usage import in_session
 
 
 def session_of(leader: int) -> list[str]:
-    """Command lines of the live processes of a session."""
+    """Command lines of the living processes of a session."""
     lines = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdecimal():
-            continue
-        try:
-            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-            if os.getsid(int(entry.name)) == leader and state != "Z":
-                lines.append((entry / "cmdline").read_text().replace("\0", " "))
-        except OSError:  # ended while we looked
-            continue
+    for pid in in_session(leader):
+        with contextlib.suppress(psutil.Error):  # ended while we looked
+            lines.append(" ".join(psutil.Process(pid).cmdline()))
     return lines
 
 
