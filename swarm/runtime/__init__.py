@@ -1,1 +1,14 @@
-"""The loop of a process, its membership in a run, and what it counts about itself."""
+"""The runtime of a process: its loop, its membership in a run, and what it tells of itself.
+
+One thread owns the state of a service (`process`); all others post to its `inbox`, which is bounded, fair by topic
+and answers in time under overload. What every role shares:
+
+`membership`     Shows that the process is alive, compares runs with others, publishes counters (`stats`) and alarms.
+`election`       Decides which of several processes with one job leads: by rank, beats and a lease.
+`order_book`     Holds what operators have ordered. `order_client` is the side of those who obey, `operator` that of
+                 those who order.
+`tracking`       Decides which of several trackers owns a target.
+`health`         Tells whether the loop turns, to other threads and processes and to systemd.
+`role`           The setup that a process is started with. `run_secret` is what processes of one user share.
+`job_slots`      Lets long jobs of one machine run as many at once as it has processors.
+"""
