@@ -3,7 +3,7 @@
 One thread owns the state of a service (`process`); all others post to its `inbox`, which is bounded, fair by topic
 and answers in time under overload. What every role shares:
 
-`membership`     Shows that the process is alive, compares runs with others, publishes counters (`stats`) and alarms.
+`membership`     Shows that the process is alive, compares runs, publishes counters (`stats`) and alarms.
 `election`       Decides which of several processes with one job leads: by rank, beats and a lease.
 `order_book`     Holds what operators have ordered. `order_client` is the side of those who obey, `operator` that of
                  those who order.
