@@ -169,12 +169,12 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     assert "calm.1" in listener.replica.held.ledger.held()
     assert keeper.counters.gauges[THROTTLED + "loud"] == 1
     assert notes == ["author loud exceeds its quota; its marks are delayed"]
-    assert [(each.kind, each.about, each.over_ns) for each in keeper._member.alarms.told()] == [
+    assert [(each.kind, each.about, each.over_ns) for each in keeper._member.alarms.current()] == [
         ("quota", "loud", None)
     ]
     swarm.run(400)
     assert listener.sync.throttled == []
-    assert [each.over_ns is None for each in keeper._member.alarms.told()] == [False]
+    assert [each.over_ns is None for each in keeper._member.alarms.current()] == [False]
     assert THROTTLED + "loud" not in keeper.counters.gauges
     assert (
         listener.replica.held.fingerprint() == loud.replica.held.fingerprint() == keeper.replica.held.fingerprint()
