@@ -89,9 +89,11 @@ class DigestInterest:
 
     name       of the listener: those with different names do not all listen to everybody at the same time
     period_ns  of whole digests
+    near       only a part of the map is held; else everybody is listened to
     """
 
-    def __init__(self, name: str, period_ns: int) -> None:
+    def __init__(self, name: str, period_ns: int, *, near: bool = True) -> None:
+        self._near = near
         self._period_ns = period_ns
         self._phase_ns = _ALL_EVERY * period_ns * zlib.crc32(name.encode()) >> 32
         self._keepers: dict[str, int] = {}  # keeper -> until when it counts as heard
@@ -126,7 +128,7 @@ class DigestInterest:
         if now_ns >= self._all_due_ns:
             self._all_due_ns = now_ns + _ALL_EVERY * self._period_ns
             self.listen_to_all(now_ns)
-        if not self._keepers or now_ns < self._all_until_ns:
+        if not self._near or not self._keepers or now_ns < self._all_until_ns:
             if self._all_since_ns is None:
                 self._all_since_ns = now_ns
             return None

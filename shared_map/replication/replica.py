@@ -178,21 +178,18 @@ class MapReplica:
     def _settle(self, before: Mapping[int, Sequence[MarkSet]], before_ns: int, measured: bool) -> list[int]:
         """Bring the cost map from the winners of these sets (by tile) at `before_ns` to those of what is held now.
         Returns how many winners changed in each tile."""
-        changes = [TileChange(tile, sets, self.held.of_tile(tile)) for tile, sets in before.items()]
-        beyond = beyond_tile(self.grid)
-        if beyond in before:
-            # Nothing there is about a cell, so no set of it has winners.
-            changes = [TileChange(c.tile, [], []) if c.tile == beyond else c for c in changes]
-            self._learn()
-        numbers = [change.tile // (self.grid.tiles + 1) for change in changes]
-        if not any(numbers):
-            return self._apply(changes, 0, before_ns, measured)
-        counts: dict[int, int] = {}
-        for number in sorted(set(numbers)):
-            of_class = [change for change, own in zip(changes, numbers, strict=True) if own == number]
-            changed = self._apply(of_class, number, before_ns, measured)
-            counts |= zip([change.tile for change in of_class], changed, strict=True)
-        return [counts[change.tile] for change in changes]
+        counts = dict.fromkeys(before, 0)
+        by_class: dict[int, list[TileChange]] = {}
+        for tile, sets in before.items():
+            if tile == beyond_tile(self.grid):
+                self._learn()  # nothing there is about a cell, so no set of it has winners
+            else:
+                change = TileChange(tile, sets, self.held.of_tile(tile))
+                by_class.setdefault(tile // (self.grid.tiles + 1), []).append(change)
+        for number, changes in sorted(by_class.items()):
+            changed = self._apply(changes, number, before_ns, measured)
+            counts |= zip([change.tile for change in changes], changed, strict=True)
+        return list(counts.values())
 
     def _apply(self, changes: list[TileChange], class_number: int, before_ns: int, measured: bool) -> list[int]:
         """`_settle` of tiles which are all for the same vehicles."""

@@ -105,21 +105,18 @@ class MapSync:
         self._changed: dict[int, int | None] = {}
         self._digests = PendingDigests()
         # Whose digests are of interest, and to whom we listen: None for everybody.
-        self._digest_interest = DigestInterest(self._name or "", self._digest_ns) if near else None
+        self._digest_interest = DigestInterest(self._name or "", self._digest_ns, near=near)
         self._listened_to: frozenset[str] | None = None
         self._asked_ns: dict[str, int] = {}  # author -> when its missing sets were asked for, until the ask ends
         self._heard_ns: dict[str, int] = {}  # sender -> when its last digest came
-        self._started_ns = 0
 
     def start(self, now_ns: int) -> None:
         """Subscribe, serve, and ask for all that was stated before."""
-        self._started_ns = now_ns
         if self._regions is None:
             self._listen()
             self._join()
         self._bus.collect(DIGEST)
-        if self._digest_interest is not None:
-            self._digest_interest.start(now_ns)
+        self._digest_interest.start(now_ns)
         if self._serves_all:
             self._bus.serve(MARKS, self._post)
         elif self.replica.author is not None:
@@ -173,8 +170,7 @@ class MapSync:
             case LinkChanged(up=True):
                 self._digest_due_ns = now_ns  # what the others missed; theirs come within digest_s
                 self._digests.hasten(now_ns)
-                if self._digest_interest is not None:
-                    self._digest_interest.listen_to_all(now_ns)
+                self._digest_interest.listen_to_all(now_ns)
                 return False
             case _:
                 return False
@@ -271,9 +267,8 @@ class MapSync:
     def _merge_charged(self, sets: Sequence[MarkSet], authors: Iterable[str], now_ns: int) -> None:
         costs = dict.fromkeys(authors, 0)
         merged = self._merge(sets, measured=True)
-        if self._digest_interest is not None:
-            for author in {each.author for each in merged.sets} - {self.replica.author}:
-                self._digest_interest.author_is_near(author, now_ns)
+        for author in {each.author for each in merged.sets} - {self.replica.author}:
+            self._digest_interest.author_is_near(author, now_ns)
         for each, changed in zip(merged.sets, merged.changed, strict=True):
             costs[each.author] += changed
         for author, cost in costs.items():
@@ -339,13 +334,11 @@ class MapSync:
             return
         if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:
             self._heard_ns[digest.author] = now_ns
-        if self._digest_interest is not None and digest.role == "keeper" and digest.whole:
+        if digest.role == "keeper" and digest.whole:
             self._digest_interest.keeper_spoke(digest.author, now_ns)
 
     def _choose_digests(self, now_ns: int) -> None:
         """Listen to digests of those who may state something about what we hold."""
-        if self._digest_interest is None:
-            return
         before, chosen = self._listened_to, self._digest_interest.update(now_ns)
         if chosen == before:
             return
@@ -414,8 +407,7 @@ class MapSync:
             log.info("gave the keeper %d sets of authors that are gone", min(len(lost), _OFFERS_AT_ONCE))
 
     def _silent(self, author: str, now_ns: int) -> bool:
-        interest = self._digest_interest
-        since_ns = self._started_ns if interest is None else interest.since_ns(author)
+        since_ns = self._digest_interest.since_ns(author)
         if since_ns is None:
             return False  # it may speak, we do not listen
         heard_ns = max(self._heard_ns.get(author, since_ns), since_ns)
