@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from support.command import Swarm
-from support.fake_run import played
+from support.fake_run import BEGAN_NS, played
 
 from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
 from launch_scripts.report.mcap_export import export_mcap
@@ -33,7 +33,6 @@ from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.processes import Note
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
-BEGAN_NS = 1_700_000_000 * NS_PER_S
 TOPICS = {"/map", "/marks", "/rosout", "/swarm/markers", "/swarm/poses", "/targets", "/tf", "/tf_static"}
 
 
@@ -43,14 +42,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "r1"
     folder.mkdir()
     scenario = parse_scenario(
-        'name = "little"\nseed = 3\nseconds = 20.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 4\n'
+        'name = "little"\nseed = 3\nseconds = 20.0\ntime_scale = 10\n[[targets]]\nname = "t"\ncount = 2\n'
+        "[[groups]]\nvehicles = 4\n"
     )
     pace = np.full((48, 64), 0.1, np.float32)
     pace[:10, :10], pace[30:, 20:40], pace[40:, 60:] = 0.2, 0.4, np.inf
     terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
     truth = np.array(pace)
     truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    recorder = played(terrain, truth, scenario, BEGAN_NS)
+    recorder = played(terrain, truth, scenario)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text="a wall that was not there", cell=None)
     recorder.heard(note, BEGAN_NS + 3 * NS_PER_S)
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's

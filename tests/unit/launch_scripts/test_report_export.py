@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rasterio.features import rasterize
 from rasterio.transform import from_origin
 from support.command import Swarm
-from support.fake_run import played
+from support.fake_run import BEGAN_NS, played
 from support.map_strategies import set_of
 
 from launch_scripts.observe.history import BegunRoute
@@ -37,7 +37,6 @@ from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import MarkKind
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
-BEGAN_NS = 1_700_000_000 * NS_PER_S
 LETHAL_CELLS = {(3, 4), (3, 5), (4, 5), (9, 9)}
 
 
@@ -49,7 +48,7 @@ def recorder() -> Recorder:
     terrain = dataclasses.replace(terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0), grid=GRID)
     truth = np.array(terrain.pace_s_per_m)
     truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    return played(terrain, truth, scenario, BEGAN_NS)
+    return played(terrain, truth, scenario)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "r1"
     folder.mkdir()
     scenario = parse_scenario(
-        'name = "little"\nseed = 3\nseconds = 6.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 4\n'
+        'name = "little"\nseed = 3\nseconds = 6.0\ntime_scale = 20\n[[targets]]\nname = "t"\ncount = 2\n'
+        "[[groups]]\nvehicles = 4\n"
         "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[100, 100], [400, 100], [400, 300], [100, 300]]\n"
     )
     pace = np.full((24, 32), 0.1, np.float32)
