@@ -77,9 +77,9 @@ def for_class(
     own_kinds, own_paces  what is said for the class alone; CLEAR where nothing is
     """
     closed = (own_kinds == MarkKind.PACE) & np.isinf(own.ground_s_per_m.reshape(-1)[cells])
-    told = (own_kinds != MarkKind.CLEAR) & (kinds != MarkKind.LETHAL) & ~closed
+    stated = (own_kinds != MarkKind.CLEAR) & (kinds != MarkKind.LETHAL) & ~closed
     bounded = np.maximum(own_paces, np.float32(own.least_s_per_m))
-    return np.where(told, own_kinds, kinds).astype(np.uint8), np.where(told, bounded, paces).astype(np.float32)
+    return np.where(stated, own_kinds, kinds).astype(np.uint8), np.where(stated, bounded, paces).astype(np.float32)
 
 
 class ClassMaps:
@@ -125,7 +125,7 @@ class ClassMaps:
             self._kinds[cells] = kinds
             for number, cost_map in self._by_number.items():
                 read = read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces)
-                cost_map.apply(cells, *self._told(number, cells, *read))
+                cost_map.apply(cells, *self._holding(number, cells, *read))
         elif (own := self._own.get(class_number)) is not None:
             for cell, kind, pace in zip(cells.tolist(), kinds.tolist(), paces.tolist(), strict=True):
                 if kind == MarkKind.CLEAR:
@@ -135,18 +135,18 @@ class ClassMaps:
             cost_map = self._by_number[class_number]
             ground = self.common.ground_s_per_m.reshape(-1)[cells]
             read = read_marks(cost_map.terrain, self.common.terrain, cells, self._kinds[cells], ground)
-            cost_map.apply(cells, *self._told(class_number, cells, *read))
+            cost_map.apply(cells, *self._holding(class_number, cells, *read))
 
-    def _told(
+    def _holding(
         self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats
     ) -> tuple[NDArray[np.uint8], Floats]:
         """What holds for a class, where this is what is said for all."""
         own = self._own[number]
         if not own:
             return kinds, paces
-        said = [own.get(cell, _NOTHING) for cell in cells.tolist()]
-        own_kinds = np.array([kind for kind, _ in said], np.uint8)
-        own_paces = np.array([pace for _, pace in said], np.float32)
+        stated = [own.get(cell, _NOTHING) for cell in cells.tolist()]
+        own_kinds = np.array([kind for kind, _ in stated], np.uint8)
+        own_paces = np.array([pace for _, pace in stated], np.float32)
         terrain = self._by_number[number].terrain
         return for_class(terrain, np.asarray(cells, np.int64), kinds, paces, own_kinds, own_paces)
 

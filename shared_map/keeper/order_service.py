@@ -19,9 +19,10 @@ from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Order, Orders
 from swarm.wire.topics import GIVE_ORDER, ORDERS
 
-_TELL_NS = NS_PER_S
+_PUBLISH_NS = NS_PER_S
 _TAG = "orders"
 _MOST_ADDED = 4096
+"""Agents beyond the scenario: whoever holds a certificate may raise tokens of any number."""
 
 
 class KeptOrders:
@@ -42,7 +43,7 @@ class KeptOrders:
         self._post = post
         self._added: set[str] = set()
         """Agents that have appeared and are not in the scenario: how many vehicles they have is theirs to know."""
-        self._tell_due_ns = 0
+        self._publish_due_ns = 0
         self._unsaved: list[Order] = []
         """Orders heard of another keeper that are not on our disk yet."""
 
@@ -88,9 +89,9 @@ class KeptOrders:
                 return False
 
     def tick(self, now_ns: int) -> None:
-        if now_ns < self._tell_due_ns:
+        if now_ns < self._publish_due_ns:
             return
-        self._tell_due_ns = now_ns + _TELL_NS
+        self._publish_due_ns = now_ns + _PUBLISH_NS
         try:
             self._store.save_orders(self._unsaved)
             self._unsaved = []

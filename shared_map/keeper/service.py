@@ -38,8 +38,10 @@ THROTTLED = "throttled."
 """Prefix of the gauge of an author that exceeds its quota; the gauge is there only while it does."""
 
 _RETRY_NS = NS_PER_S
+"""A disk that refused is tried again after this."""
 _NOTE_AGAIN_NS = 60 * NS_PER_S
 _NAME_AT_MOST = 16
+"""Authors that are named in gauges and notes: each gauge is a line for whoever collects them."""
 _COMPACT_EVERY_NS = NS_PER_S
 _COMPACT_TILES = 16
 """Compacted at once: what sets that arrive wait for is bounded."""
@@ -198,7 +200,6 @@ class KeeperService:
             self.counters.gauges.pop(THROTTLED + author, None)
         for author in throttled[:_NAME_AT_MOST]:
             self.counters.gauge(THROTTLED + author, 1.0)
-        for author in throttled[:_NAME_AT_MOST]:
             if author not in self._named:
                 self._named.append(author)
                 text = f"author {author} exceeds its quota; its marks are delayed"

@@ -31,11 +31,16 @@ _RESYNC = "map-resync:"
 _JOIN_TIMEOUT_S = 5.0
 _JOIN_TRIES = 5
 _JOIN_RETRY_NS = NS_PER_S // 2
+"""After the first try, and twice as long after each: 7.5 s in all, in which the others of a swarm have started."""
 _ASK_AGAIN_NS = NS_PER_S * 15 // 100
+"""A question whose answer is lost on a network that loses 30 % is repeated so soon (decision 18)."""
 _MAX_ASKS = 16
+"""Authors who are asked for at once: what a digest that lies about thousands can start."""
 _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
+"""A set that was put is named in digests of changes so often and for so long: of some four, one arrives."""
 _OFFERS_AT_ONCE = 256
+"""Sets given to a keeper for one digest; the next digest shows what it still lacks."""
 _TILES_AT_ONCE = 1 << 16
 """Named in one question: the tiles of all classes on a large map are more than a message has room for."""
 _QUANTUM = 16_384
@@ -43,6 +48,7 @@ _QUANTUM = 16_384
 _MANY = "-"
 """In place of region and tile in the key of a reply that carries many sets of an author."""
 _MAX_NAMES = 4096
+"""Authors of whom is remembered when they spoke or were warned of: names cost a sender nothing."""
 _WARN_AGAIN_NS = 60 * NS_PER_S
 
 
