@@ -123,15 +123,6 @@ class BegunRoute(NamedTuple):
     route: Followed
 
 
-_ROUTE_BYTES = 8_000_000
-"""Of all routes that are kept, about."""
-
-
-def begun_routes(limit: int = _ROUTE_BYTES) -> Thinned[BegunRoute]:
-    """Routes over the whole run, which together take `limit` bytes at most."""
-    return Thinned(limit, lambda begun: len(begun.route.directions) + 64)  # beside its steps a route takes 64 bytes
-
-
 TrackKey = tuple[str, int]
 """Id, and piece of its track: a target which jumps begins a new piece."""
 _Sampling = tuple[int, tuple[TrackKey, ...], NDArray[np.float32]]

@@ -127,9 +127,10 @@ class VehicleColumns:
             ids, self.east_m[kept], self.south_m[kept], self.states[kept], self.targets[kept], self.target_ids
         )
 
-    def count_states(self) -> tuple[int, ...]:
-        """Number of vehicles in each VehicleState, in its order."""
-        return tuple(np.bincount(self.states, minlength=len(VehicleState)).tolist())
+    def count_states(self) -> dict[str, int]:
+        """Number of vehicles in each VehicleState, by its name."""
+        counts = np.bincount(self.states, minlength=len(VehicleState)).tolist()
+        return {state.name.lower(): n for state, n in zip(VehicleState, counts, strict=True)}
 
 
 def gathered(fleets: Iterable[Fleet]) -> VehicleColumns:
@@ -183,7 +184,8 @@ class LatestState(Counts):
         self.grid = grid
         self.book = OrderBook()
         self.first_ns: int | None = None
-        """When the first message was heard; None before."""
+        self.last_ns: int | None = None
+        """When the first and the last message were heard; None before."""
         self.moved_ns = 0
         """When a vehicle or a target was last heard of. What comes later are the words of a run that ends."""
         self.status: dict[str, PlannerStatus] = {}
@@ -206,7 +208,7 @@ class LatestState(Counts):
 
     def heard(self, message: Message, now_ns: int) -> Message | None:
         """Takes in a message; returns it, a pose with its cell, and None for a pose that does not count."""
-        self._touch(now_ns)
+        self.touch(now_ns)
         match message:
             case Stats():
                 self.count(message)
@@ -244,7 +246,7 @@ class LatestState(Counts):
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
-        self._touch(now_ns)
+        self.touch(now_ns)
         key = (peer.role, peer.id)
         if up:
             self._alive.setdefault(key, set()).add(peer.incarnation)
@@ -252,9 +254,10 @@ class LatestState(Counts):
         elif key in self._alive:
             self._alive[key].discard(peer.incarnation)
 
-    def _touch(self, now_ns: int) -> None:
-        if self.first_ns is None:
-            self.first_ns = now_ns
+    def touch(self, now_ns: int) -> None:
+        """Something of the run came at a time, or its end."""
+        self.first_ns = now_ns if self.first_ns is None else self.first_ns
+        self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
 
     @property
     def began_ns(self) -> int | None:

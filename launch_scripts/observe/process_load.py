@@ -14,44 +14,44 @@ _LEAST_NS = NS_PER_S // 2
 """Over a shorter time no rate is measured."""
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessLoad:
-    """One process, over its last second or so; None where it does not say.
+@dataclass(frozen=True, kw_only=True)
+class _Load:
+    """What is said of processes and of roles, over the last second or so; None where it is not known.
 
     cpu_percent  100 is one core
     late_per_s   ticks that came later than half a period, or not at all
     """
 
     role: str
-    id: str
-    alive: bool
-    up_s: float
     cpu_percent: float | None
     rss_bytes: float | None
     late_per_s: float | None
     messages_per_s: float | None
     restarts: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessLoad(_Load):
+    """One process."""
+
+    id: str
+    alive: bool
+    up_s: float
 
     @property
     def name(self) -> str:
         return f"{self.role}-{self.id}"
 
 
-@dataclass(frozen=True, slots=True)
-class RoleLoad:
+@dataclass(frozen=True, kw_only=True)
+class RoleLoad(_Load):
     """All processes of a role: sums, and the worst of lateness.
 
     busiest  the one that takes most CPU; None if none says
     """
 
-    role: str
     alive: int
     known: int
-    cpu_percent: float | None
-    rss_bytes: float | None
-    late_per_s: float | None
-    messages_per_s: float | None
-    restarts: int
     busiest: ProcessLoad | None
 
 

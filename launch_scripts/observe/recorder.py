@@ -65,6 +65,7 @@ class RunFigures:
 
     def finish(self, now_ns: int) -> None:
         """The run is over: its last sample is of its end."""
+        self.observed.touch(now_ns)
         self._add_sample(now_ns)
 
     def summary(self, now_ns: int) -> RunState:
@@ -109,6 +110,8 @@ class RunFigures:
 
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _NOTES_KEPT = 1000
+_ROUTE_BYTES = 8_000_000
+"""Of all routes that are kept, about: beside its steps a route takes 64 bytes."""
 _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
 
@@ -130,25 +133,20 @@ class Recorder(RunFigures):
 
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
         super().__init__(scenario, grid, started_ns)
-        self.last_ns: int | None = None
         self.ready_ns: int | None = None
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Where and when targets were captured; how often, `Observed` counts."""
-        self.routes = history.begun_routes()
+        self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + 64)
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
         self.target_tracks = Tracks(_TRACK_NS)
         self.routed: set[str] = set()
-        self._track_ids: list[str] = []
-        self._track_keys: list[TrackKey] = []
-        """Of the vehicles heard of last."""
         self._gap_max: float | None = None
 
     def heard(self, message: Message, now_ns: int) -> None:
         """Records one message."""
-        self._touch(now_ns)
         if self.observed.heard(message, now_ns) is None:
             return
         match message:
@@ -162,20 +160,9 @@ class Recorder(RunFigures):
                 self.notes.append((self.seconds(now_ns), message))
         self._look(now_ns)
 
-    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        self._touch(now_ns)
-        super().alive(peer, up, now_ns)
-
-    def finish(self, now_ns: int) -> None:
-        self._touch(now_ns)
-        super().finish(now_ns)
-
     def seconds(self, now_ns: int) -> float:
         """Time of the run."""
         return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
-
-    def _touch(self, now_ns: int) -> None:
-        self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
 
     def _capture(self, note: Note, now_ns: int) -> None:
         """Of targets that nobody tracks, too: the process that moves them tells of each capture."""
@@ -198,10 +185,9 @@ class Recorder(RunFigures):
         moving = np.isin(vehicles.states, _ON_THE_WAY)
         if len(self.routed) < self.scenario.vehicle_count:
             self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
-        if self._track_ids != vehicles.ids:
-            self._track_ids, self._track_keys = vehicles.ids, [(id, 0) for id in vehicles.ids]
         self.driven.add(now_ns, vehicles, self.observed.groups)
-        self.vehicle_tracks.add(now_ns, self._track_keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
+        keys: list[TrackKey] = [(id, 0) for id in vehicles.ids]
+        self.vehicle_tracks.add(now_ns, keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
         poses = sorted(self.observed.poses.items())
         pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
         places = [self.observed.place_m(pose) for _, pose in poses]
@@ -219,11 +205,11 @@ class Recorder(RunFigures):
         startup_s: float | None = None,
     ) -> dict[str, Any]:
         """The numbers of the run, None where not measured. The caller gives what it knows better."""
-        if seconds is None and self.observed.first_ns is not None and self.last_ns is not None:
-            seconds = (self.last_ns - self.observed.first_ns) / NS_PER_S
         observed = self.observed
+        if seconds is None and observed.first_ns is not None and observed.last_ns is not None:
+            seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
         # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
-        state = self.summary(self.observed.moved_ns or self.last_ns or 0)
+        state = self.summary(observed.moved_ns or observed.last_ns or 0)
         rates = [sample.messages_per_s for sample in self.samples.all() if sample.messages_per_s is not None]
         fields = {
             "scenario": self.scenario.name,

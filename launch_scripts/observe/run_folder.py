@@ -41,7 +41,15 @@ def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool =
         "seed": scenario.seed,
         "began": began,
         "recorded": recorded,
-        **made_with(),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(package) for name, package in _PACKAGES.items()},
+        },
+        "machine": {
+            "system": f"{platform.system()} {platform.release()}",
+            "processor": processor(),
+            "cores": os.cpu_count(),
+        },
     }
     texts = {
         SCENARIO_FILE: head + scenario_text(scenario, Path.cwd()),
@@ -55,21 +63,6 @@ def begin_run(folder: Path, scenario: Scenario, run_id: str, *, recorded: bool =
             said.append(f"cannot write {folder / name}: {error.strerror or error}")
     sentence = point_last(folder)
     return said if sentence is None else [*said, sentence]
-
-
-def made_with() -> dict[str, Any]:
-    """Versions and machine."""
-    return {
-        "versions": {
-            "python": platform.python_version(),
-            **{name: _version(package) for name, package in _PACKAGES.items()},
-        },
-        "machine": {
-            "system": f"{platform.system()} {platform.release()}",
-            "processor": processor(),
-            "cores": os.cpu_count(),
-        },
-    }
 
 
 def ended(folder: Path) -> dict[str, Any]:

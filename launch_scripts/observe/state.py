@@ -16,7 +16,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND
 from swarm.grid import GridSpec
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
-from swarm.wire.messages.vehicles import VehicleState
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +135,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
     return RunState(
         elapsed_s=0.0 if began_ns is None else max(now_ns - began_ns, 0) / NS_PER_S,
         targets=_lines(latest, targets, vehicles, now_ns),
-        states=by_state(vehicles.count_states()),
+        states=vehicles.count_states(),
         classes=_by_class(vehicles.ids, latest.classes()),
         vehicles=len(vehicles),
         vehicles_planned=latest.plan.vehicles,
@@ -154,11 +153,6 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         grid=latest.grid,
         **{name: latest.total(name) for name in _TOTALS},
     )
-
-
-def by_state(counts: Sequence[int]) -> dict[str, int]:
-    """Number of vehicles per state, by the state's name."""
-    return {state.name.lower(): n for state, n in zip(VehicleState, counts, strict=True)}
 
 
 def _lines(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import datetime
 import io
 import re
 from collections.abc import Callable, Mapping
@@ -101,15 +100,8 @@ def environment_of_pages() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(percent=percent, count=count, when=_when)
+    environment.filters.update(percent=percent, count=count)
     return environment
-
-
-def _when(text: str) -> str:
-    try:
-        return f"{datetime.datetime.fromisoformat(text):%Y-%m-%d %H:%M} UTC"
-    except ValueError:
-        return text
 
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:

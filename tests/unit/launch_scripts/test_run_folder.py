@@ -202,7 +202,7 @@ def test_results_per_target_group_and_vehicle_add_up_to_those_of_the_run(left: t
         assert group["distance_m"] == pytest.approx(sum(row["distance_m"] for row in own), rel=1e-4)
     assert {name: group["vehicles"] for name, group in report["by_group"].items()} == {"north": 6, "south": 3}
     assert report["made"]["began"] <= report["made"]["ended"]
-    summary = recorder.summary(recorder.last_ns or 0)
+    summary = recorder.summary(recorder.observed.last_ns or 0)
     assert {line.id: line.captures for line in summary.targets} == {
         id: row["captures"] for id, row in report["by_target"].items()
     }

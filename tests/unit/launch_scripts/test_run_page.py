@@ -40,7 +40,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     truth[14:20, 4:30] = np.inf
     recorder = played(terrain, truth, scenario)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
-    recorder.heard(note, recorder.last_ns or 0)
+    recorder.heard(note, recorder.observed.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
     with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
         patched.setattr("launch_scripts.report.picture.save_picture", lambda half, *_: half.touch())
