@@ -141,17 +141,17 @@ def alarms_of(latest: LatestState, plan: RunPlan, targets: Iterable[str], now_ns
         *_lost(latest, wanted, now_ns),
         *_told(latest),
     ]
-    alarms = [_in_run(each, known, began_ns) for each, known in found]
+    alarms = [_in_run(each, began_ns) for each in found]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))
     return (*lasting, *over)
 
 
-Found = tuple[Told, bool]
-"""An alarm, and whether it is known when it began."""
+_UNKNOWN_NS = -1
+"""When an alarm began whose beginning nobody knows. No message can say so."""
 
 
-def _in_run(told: Told, known: bool, began_ns: int) -> Alarm:
+def _in_run(told: Told, began_ns: int) -> Alarm:
     def seconds(stamp_ns: int) -> float:
         return max(stamp_ns - began_ns, 0) / NS_PER_S
 
@@ -159,19 +159,19 @@ def _in_run(told: Told, known: bool, began_ns: int) -> Alarm:
         plain(told.kind),
         plain(told.about),
         plain(told.text),
-        seconds(told.since_ns) if known else None,
+        None if told.since_ns == _UNKNOWN_NS else seconds(told.since_ns),
         None if told.over_ns is None else seconds(told.over_ns),
         told.cell,
         told.target,
     )
 
 
-def _told(latest: LatestState) -> Iterator[Found]:
+def _told(latest: LatestState) -> Iterator[Told]:
     """What processes say. What lasted when one went is not said any more."""
     for (role, id), stats in latest.newest().items():
         for alarm in stats.alarms:
             if alarm.over_ns is not None or latest.is_well(role, id):
-                yield alarm, True
+                yield alarm
 
 
 def starts(latest: LatestState, plan: RunPlan, role: str, id: str, now_ns: int) -> bool:
@@ -180,7 +180,7 @@ def starts(latest: LatestState, plan: RunPlan, role: str, id: str, now_ns: int) 
     return began and not latest.knows(role, id)
 
 
-def _missing(latest: LatestState, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Found]:
+def _missing(latest: LatestState, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Told]:
     for role, id in plan.crew_now(targets):
         if latest.fills(role, id) or starts(latest, plan, role, id, now_ns):
             continue
@@ -189,31 +189,27 @@ def _missing(latest: LatestState, plan: RunPlan, targets: list[str], now_ns: int
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
         text = f"{role}-{id} is gone{instead}"
         target = job_of(id) if role == "planner" else None
-        since_ns = 0 if stats is None else stats.stamp_ns
-        yield (
-            Told(kind="down", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target),
-            stats is not None,
-        )
+        since_ns = _UNKNOWN_NS if stats is None else stats.stamp_ns
+        yield Told(kind="down", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target)
 
 
-def _silent(latest: LatestState, now_ns: int) -> Iterator[Found]:
+def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
     for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
         text = f"{role}-{id} is there, but tells nothing"
         target = job_of(id) if role == "planner" else None
         stats = latest.newest_stats(role, id)
         since_ns = heard_ns if stats is None else stats.stamp_ns
-        yield Told(kind="silent", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target), True
+        yield Told(kind="silent", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target)
 
 
-def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Found]:
+def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Told]:
     for id in sorted(latest.lost(now_ns).intersection(targets)):
         status, pose = latest.told_by_planner(id), latest.poses.get(id)
-        since_ns, cell = None, None if pose is None else pose.cell
+        since_ns, cell = _UNKNOWN_NS, None if pose is None else pose.cell
         if status is not None and status.pose_age_s is not None:
             # When the planner heard the last pose: the same whenever it is asked.
             since_ns, cell = status.stamp_ns - int(status.pose_age_s * NS_PER_S), status.target_cell
         elif pose is not None:
             since_ns = pose.stamp_ns
         text = f"nobody knows where {id} is; routes lead to where it was"
-        told = Told(kind="target-lost", about=id, text=text, since_ns=since_ns or 0, cell=cell, target=id)
-        yield told, since_ns is not None
+        yield Told(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id)

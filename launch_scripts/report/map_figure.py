@@ -86,8 +86,7 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
     )  # fmt: skip
     axes.set(xlim=(0, width_km), ylim=(height_km, 0), aspect="equal")
     axes.grid(False)
-    draw_scale_bar(axes, width_km, height_km)
-    draw_north(axes)
+    _draw_scale(axes, width_km, height_km)
 
 
 def draw_border(axes: Axes, ground: GroundPicture, tracks: RunTracks) -> None:
@@ -163,20 +162,13 @@ def _label(axes: Axes, text: str, x: float, y: float, width_km: float) -> None:
     )  # fmt: skip
 
 
-def draw_scale_bar(axes: Axes, width: float, height: float, unit_m: float = 1000.0) -> None:
-    """A bar of a round length, about a fifth of the width, in the lower left corner of axes of this size."""
-    length, x0, y0 = round_length(width / 5), 0.03 * width, 0.965 * height
+def _draw_scale(axes: Axes, width_km: float, height_km: float) -> None:
+    """A bar of a round length, about a fifth of the width, in the lower left corner; an arrow to the north."""
+    length, x0, y0 = round_length(width_km / 5), 0.03 * width_km, 0.965 * height_km
     axes.plot([x0, x0 + length], [y0, y0], color=palette.INK, linewidth=3, path_effects=halo(), zorder=11)
-    axes.annotate(
-        said_length(length * unit_m), (x0, y0), xytext=(0, 5), textcoords="offset points", fontsize=9.5,
-        fontweight="bold", zorder=11, path_effects=halo(),
-    )  # fmt: skip
-
-
-def draw_north(axes: Axes) -> None:
-    """An arrow to the north in the upper right corner."""
-    axes.text(0.968, 0.985, "↑\nN", transform=axes.transAxes, ha="center", va="top", fontsize=12,
-              fontweight="bold", zorder=11, path_effects=halo())  # fmt: skip
+    look: dict[str, Any] = {"fontweight": "bold", "zorder": 11, "path_effects": halo()}
+    axes.annotate(said_length(length * 1000), (x0, y0), (0, 5), textcoords="offset points", fontsize=9.5, **look)
+    axes.text(0.968, 0.985, "↑\nN", transform=axes.transAxes, ha="center", va="top", fontsize=12, **look)
 
 
 def image_bytes(pixels: Pixels, format: str) -> bytes:

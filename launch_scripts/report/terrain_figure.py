@@ -17,7 +17,6 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import BLUE, RED, hillshade
-from launch_scripts.report.map_figure import draw_north, draw_scale_bar
 from launch_scripts.report.run_plots import saved
 from shared_map.arrays import Floats
 from shared_map.terrain.layers import TerrainClass
@@ -110,8 +109,6 @@ def draw_terrain(terrain: Terrain, path: Path, title: str) -> None:
         _elevation(elevation)
         photo.show(level.photo)
         size = (grid.cols * grid.resolution_m / photo.unit_m, grid.rows * grid.resolution_m / photo.unit_m)
-        draw_scale_bar(photo.axes, *size, photo.unit_m)
-        draw_north(photo.axes)
         _classes(classes)
         _cost(cost, terrain)
         facts = (
