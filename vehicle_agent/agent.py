@@ -121,7 +121,7 @@ class Agent:
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         assigner, stagger = assigner or Spread(), chance.random()
-        self.assignment = Assignment(self.targets, assigner, config.reassign_s, stagger, group)
+        self.assignment = Assignment(self.vehicles, self.targets, assigner, config.reassign_s, stagger, group)
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -138,7 +138,7 @@ class Agent:
         if list(targets) == self.targets:
             return
         self.targets = list(targets)
-        self.assignment.set_targets(self.targets)
+        self.assignment.targets = self.targets
         for vehicle in self.vehicles.values():
             if vehicle.target is not None and vehicle.target not in self.targets:
                 vehicle.release()
@@ -324,7 +324,7 @@ class Agent:
             self.assignment.ask_soon(now_ns)
         if self.vehicles and self.assignment.due(now_ns):
             self._requests += 1
-            actions.append(self.assignment.ask(self._requests, self.vehicles, now_ns))
+            actions.append(self.assignment.ask(self._requests, now_ns))
         return actions
 
     def _target_cell(self, target: str | None) -> int | None:
@@ -473,4 +473,4 @@ class Agent:
     def costs_ended(self, request: int, now_ns: int) -> SharedCosts | None:
         """No more answers to `AskCosts` will come; returns what to tell the other agents of the group."""
         standing = list(filter(self.stopped, self.vehicles))
-        return self.assignment.costs_ended(request, self.vehicles, self._planners, now_ns, self._empty.of, standing)
+        return self.assignment.costs_ended(request, self._planners, now_ns, self._empty.of, standing)

@@ -265,11 +265,7 @@ class ZonesAround:
             cells = self._cells_of(place, inner)
             spread, own_spread = dense(for_all), dense(own)
             kinds, paces = self._maps.read(
-                cells,
-                spread.kinds[inner],
-                spread.paces[inner],
-                own_spread.kinds[inner],
-                own_spread.paces[inner],
+                cells, spread.kinds[inner], spread.paces[inner], own_spread.kinds[inner], own_spread.paces[inner]
             )
             marked = kinds != MarkKind.CLEAR
             flat[cells[marked]] = np.where(kinds == MarkKind.LETHAL, np.inf, paces)[marked]

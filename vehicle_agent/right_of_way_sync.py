@@ -20,8 +20,6 @@ from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
-# The time that a process has lived through: what leases of right of way are counted by.
-
 
 class OwnTime:
     """A clock that counts of the time between two ticks one period at most.
@@ -58,12 +56,16 @@ _FIRST_ANSWERS_S = 0.3
 """A new life waits so long for the others' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
+"""Agents are asked anew what they know of us after a second, then after twice as long, at last so rarely."""
 _PROMISE_TIMEOUT_S = 5.0
 """A member that is late answers late, and its promise counts until we claim anew: by epoch, so it does no harm."""
 _MOST_REFUSALS_TOLD = 100
+"""Liars may say as many different things as they like."""
 _RESERVE_NS = NS_PER_S
+"""Space for promises is looked for so often: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
 _WAITING_AGAIN_NS = 10 * NS_PER_S
+"""What lasts is said again so often: somebody who begins to watch shall learn of it, and the log stay readable."""
 
 
 class RightOfWaySync:
@@ -164,9 +166,7 @@ class RightOfWaySync:
             assert isinstance(heard.message, Standing)
             self.core.hear_standing(heard.message, own_ns)
         self._perform(self.core.tick(wishes, own_ns))
-        self._tell_unled(self.core.host.unled(own_ns), now_ns)
-
-    def _tell_unled(self, unled: Mapping[int, str], now_ns: int) -> None:
+        unled = self.core.host.unled(own_ns)
         self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
         for plot, text in unled.items():
             if now_ns >= self._unled_due_ns[plot]:

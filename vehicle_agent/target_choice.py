@@ -171,7 +171,8 @@ def choose(
 class Assignment:
     """Asks all planners for the costs of all vehicles of an agent, and assigns each vehicle its target.
 
-    targets     those that the vehicles may go for
+    vehicles    those of the agent, which changes them in place
+    targets     those that the vehicles may go for; the agent sets others
     assigner    which of them each goes for
     stagger     share of the period by which the first request is followed early, so that agents ask one after the
                 other
@@ -180,13 +181,15 @@ class Assignment:
 
     def __init__(
         self,
+        vehicles: Mapping[str, Vehicle],
         targets: Sequence[str],
         assigner: Assigner,
         reassign_s: float,
         stagger: float,
         group: GroupCosts | None = None,
     ) -> None:
-        self._targets = targets
+        self.targets = targets
+        self._vehicles = vehicles
         self._group = group
         self._assigner = assigner
         self._reassign_ns = int(reassign_s * NS_PER_S)
@@ -198,10 +201,6 @@ class Assignment:
         self._costs_s: dict[str, NDArray[np.float32]] = {}
         """Target -> the costs that its planner answered to the open request."""
 
-    def set_targets(self, targets: Sequence[str]) -> None:
-        """Those that the vehicles may go for from now on."""
-        self._targets = targets
-
     def set_period(self, reassign_s: float) -> None:
         """How often vehicles ask from now on."""
         self._reassign_ns = int(reassign_s * NS_PER_S)
@@ -209,10 +208,12 @@ class Assignment:
     def due(self, now_ns: int) -> bool:
         return now_ns >= self._due_ns and self._open is None
 
-    def ask(self, request: int, vehicles: Mapping[str, Vehicle], now_ns: int) -> AskCosts:
+    def ask(self, request: int, now_ns: int) -> AskCosts:
         """The request to send now, under this number."""
         self._costs_s = {}
-        self._open = AskCosts(request, tuple(vehicles), tuple(vehicle.cell for vehicle in vehicles.values()))
+        self._open = AskCosts(
+            request, tuple(self._vehicles), tuple(vehicle.cell for vehicle in self._vehicles.values())
+        )
         first = self._due_ns == 0
         self._due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
         self._asked_ns = now_ns
@@ -224,7 +225,7 @@ class Assignment:
 
     def target_jumped(self, now_ns: int) -> None:
         """A target is elsewhere all at once, or known for the first time: its costs are not what they were."""
-        rested_ns = self._asked_ns + len(self._targets) * _JUMPS_APART_NS
+        rested_ns = self._asked_ns + len(self.targets) * _JUMPS_APART_NS
         self._due_ns = min(self._due_ns, max(now_ns + _RETRY_NS, rested_ns))
 
     def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:
@@ -236,7 +237,6 @@ class Assignment:
     def costs_ended(
         self,
         request: int,
-        vehicles: Mapping[str, Vehicle],
         planners: Mapping[str, int],
         now_ns: int,
         empty: Collection[str] = (),
@@ -244,6 +244,7 @@ class Assignment:
     ) -> SharedCosts | None:
         """All planners that will answer have: each vehicle takes its target. Returns what to tell the group.
 
+        planners  target -> incarnation of its planner, of those which live
         empty     targets that are not where their planners lead to: whoever has a way to another goes for that
         standing  vehicles that an operator lets stand: no target's pursuers where costs are shared
         """
@@ -254,14 +255,14 @@ class Assignment:
         stuck = not self._costs_s
         if self._group is not None:
             self._group.expire(now_ns - _LEASE_PERIODS * self._reassign_ns)
-        told = self._spread(asked, vehicles, empty, standing)
+        shares = self._share_out(asked, empty, standing)
         for index, id in enumerate(asked.vehicles):
-            vehicle = vehicles.get(id)
+            vehicle = self._vehicles.get(id)
             if vehicle is None:
                 continue
             costs_s = {target: float(column[index]) for target, column in self._costs_s.items()}
-            if id in told:
-                costs_s = {target: cost_s if target == told[id] else math.inf for target, cost_s in costs_s.items()}
+            if id in shares:
+                costs_s = {each: cost_s if each == shares[id] else math.inf for each, cost_s in costs_s.items()}
             there = {target: cost_s for target, cost_s in costs_s.items() if target not in empty}
             leaves = any(map(math.isfinite, there.values()))
             current = None if leaves and vehicle.target in empty else vehicle.target
@@ -270,39 +271,23 @@ class Assignment:
         if stuck:
             retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
-        return self._tell(asked, vehicles, empty, standing, now_ns)
-
-    def _tell(
-        self,
-        asked: AskCosts,
-        vehicles: Mapping[str, Vehicle],
-        empty: Collection[str],
-        standing: Collection[str],
-        now_ns: int,
-    ) -> SharedCosts | None:
-        """What the other agents of the group reckon with: the costs of those vehicles that may chase any target."""
         if self._group is None:
             return None
-        may = [n for n, id in enumerate(asked.vehicles) if id in vehicles and id not in standing]
-        costs_s = {
+        # What the others reckon with: the costs of those vehicles that may chase any target.
+        may = [n for n, id in enumerate(asked.vehicles) if id in self._vehicles and id not in standing]
+        told_s = {
             target: column[may]
             for target, column in self._costs_s.items()
-            if target in self._targets and target not in empty
+            if target in self.targets and target not in empty
         }
         ids = [asked.vehicles[n] for n in may]
-        return self._group.tell(ids, costs_s, [vehicles[id].target for id in ids], now_ns)
+        return self._group.tell(ids, told_s, [self._vehicles[id].target for id in ids], now_ns)
 
-    def _spread(
-        self,
-        asked: AskCosts,
-        vehicles: Mapping[str, Vehicle],
-        empty: Collection[str],
-        standing: Collection[str] = (),
-    ) -> dict[str, str]:
+    def _share_out(self, asked: AskCosts, empty: Collection[str], standing: Collection[str]) -> dict[str, str]:
         """The target of each vehicle that has a choice, so that not all go for the same."""
-        targets = [target for target in self._targets if target in self._costs_s and target not in empty]
+        targets = [target for target in self.targets if target in self._costs_s and target not in empty]
         # A vehicle whose planner is silent keeps to it, or is told that nothing is known.
-        held = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
+        held = {id: self._vehicles[id].target for id in asked.vehicles if id in self._vehicles}
         now = {id: None if target in empty else target for id, target in held.items()}
         free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
         if self._group is not None:
@@ -311,7 +296,7 @@ class Assignment:
             return {}
         others = None
         if self._group is not None:
-            targets = sorted({*targets, *self._group.targets.difference(empty).intersection(self._targets)})
+            targets = sorted({*targets, *self._group.targets.difference(empty).intersection(self.targets)})
             ids, table, theirs = self._group.rows(targets)
             others = CostTable(tuple(targets), ids, table, theirs)
         unknown = np.full(len(asked.vehicles), np.inf)
@@ -319,9 +304,7 @@ class Assignment:
         current = [-1 if (target := now[asked.vehicles[n]]) is None else targets.index(target) for n in free]
         names = tuple(asked.vehicles[n] for n in free)
         chosen = self._assigner.assign(CostTable(tuple(targets), names, costs_s, tuple(current), others))
-        return {
-            asked.vehicles[n]: targets[each] for n, each in zip(free, chosen.tolist(), strict=True) if each >= 0
-        }
+        return {id: targets[each] for id, each in zip(names, chosen.tolist(), strict=True) if each >= 0}
 
     def _assign(
         self,
@@ -333,7 +316,7 @@ class Assignment:
     ) -> None:
         given_up = vehicle.planner_gone and not vehicle.route.left
         given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-        choice = choose(costs_s, self._targets, planners, current, not given_up)
+        choice = choose(costs_s, self.targets, planners, current, not given_up)
         if choice.target is not None:
             vehicle.assign(choice.target, now_ns)
             if vehicle.target not in planners and not vehicle.planner_gone:

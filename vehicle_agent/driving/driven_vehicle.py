@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Sequence
-from itertools import chain
 
 import msgspec
 import numpy as np
@@ -299,9 +298,6 @@ class Vehicle:
             self.state = VehicleState.WAITING
 
 
-# Where the vehicles of an agent are, as columns.
-
-
 class Places:
     """Vehicles and their places at one instant, in one order.
 
@@ -315,16 +311,9 @@ class Places:
 
     def __init__(self, grid: GridSpec, vehicles: Iterable[Vehicle]) -> None:
         self.vehicles = list(vehicles)
-        rows: list[tuple[float, ...]] = []
-        for motion in [vehicle.motion for vehicle in self.vehicles]:
-            begin, end, share = motion.stretch()
-            rows.append((*begin, *end, share, motion.heading_rad, motion.cell))
-        numbers = np.fromiter(chain.from_iterable(rows), np.float64, 7 * len(rows)).reshape(-1, 7)
-        begins, ends, shares = numbers[:, :2], numbers[:, 2:4], numbers[:, 4:5]
-        self.south_m: NDArray[np.float64]
-        self.east_m: NDArray[np.float64]
-        self.south_m, self.east_m = (begins + shares * (ends - begins) + 0.5).T * grid.resolution_m
-        self.heading_rad: NDArray[np.float64] = numbers[:, 5]
-        self.cells: NDArray[np.int64] = numbers[:, 6].astype(np.int64)
+        rows = [(*each.motion.place_m(), each.motion.heading_rad, each.motion.cell) for each in self.vehicles]
+        columns: NDArray[np.float64] = np.array(rows, np.float64).reshape(-1, 4).T
+        self.east_m, self.south_m, self.heading_rad = columns[:3]
+        self.cells: NDArray[np.int64] = columns[3].astype(np.int64)
         row, col = np.divmod(self.cells, grid.cols)
         self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS

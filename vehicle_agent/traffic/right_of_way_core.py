@@ -174,11 +174,6 @@ class RightOfWay:
         lives.update(shut.life for table in self._stored().values() for shut in table.shut if shut.agent == agent)
         return sorted(lives)[-LIVES_KEPT:]
 
-    def leads(self, plot: int) -> bool:
-        """Whether we are the plot's warden, as far as we know."""
-        member = self._members.get(plot)
-        return member is not None and member.warden is not None
-
     # --- what is heard --------------------------------------------------------------------------------------
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:

@@ -198,20 +198,8 @@ class Steering:
         """The neighbours that the map allows to drive to."""
         if cell in self.ways_out:
             return self._out_of(cell)
-        around: list[int | None] = [None] * 8
-        for direction, neighbour in self._grid.neighbours(cell):
-            if not self.closed(neighbour):
-                around[direction] = neighbour
-        steps = []
-        for direction, found in enumerate(around):
-            if found is None:
-                continue
-            sides = around[direction - 1] is not None and around[(direction + 1) % 8] is not None
-            if direction % 2 == 0 or (self._diagonal and (sides or self._corner_cutting)):
-                steps.append(found)
-        if self._climb is None:
-            return steps
-        return [each for each in steps if self._climb.allows(cell, each)]
+        around = [each for direction, each in self._grid.neighbours(cell) if self._diagonal or direction % 2 == 0]
+        return [each for each in around if self.passable(cell, each)]
 
     def _is_one_way(self, tail: int, head: int) -> bool:
         """Whether a step between neighbours could not be taken back, as it is too steep the other way: it may lead

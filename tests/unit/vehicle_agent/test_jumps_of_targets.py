@@ -19,18 +19,18 @@ TICKS = 300
 def asks_of(targets: int, jumps: set[int]) -> list[int]:
     """The ticks in which an agent of one vehicle asks, if targets jump in these; all planners answer at once."""
     names = [f"t{n}" for n in range(targets)]
-    assignment = Assignment(names, Spread(), PERIOD_S, 1.0)
     vehicles = {"a0-00": Vehicle("a0-00", GridSpec(10, 10, 10.0), 5)}
+    assignment = Assignment(vehicles, names, Spread(), PERIOD_S, 1.0)
     asks = []
     for tick in range(TICKS):
         now_ns = round((1000 + tick * TICK_S) * NS_PER_S)
         if tick in jumps:
             assignment.target_jumped(now_ns)
         if assignment.due(now_ns):
-            assignment.ask(tick, vehicles, now_ns)
+            assignment.ask(tick, now_ns)
             for name in names:
                 assignment.costs_given(tick, name, np.array([3.0], np.float32))
-            assignment.costs_ended(tick, vehicles, dict.fromkeys(names, 1), now_ns)
+            assignment.costs_ended(tick, dict.fromkeys(names, 1), now_ns)
             asks.append(tick)
     return asks
 

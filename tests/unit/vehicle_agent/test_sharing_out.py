@@ -219,19 +219,21 @@ class Two:
         }
         self.costs = {agent: GroupCosts(f"all.{agent}.1", "all", agent) for agent in costs_s}
         self.agents = {
-            agent: Assignment(self.targets, Balanced(pursuers), PERIOD_S, 0.5, self.costs[agent])
+            agent: Assignment(
+                self.vehicles[agent], self.targets, Balanced(pursuers), PERIOD_S, 0.5, self.costs[agent]
+            )
             for agent in costs_s
         }
         self.requests = 0
 
     def reassign(self, agent: str, now_ns: int, standing: tuple[str, ...] = ()) -> None:
-        assignment, vehicles = self.agents[agent], self.vehicles[agent]
+        assignment = self.agents[agent]
         self.requests += 1
-        assignment.ask(self.requests, vehicles, now_ns)
+        assignment.ask(self.requests, now_ns)
         for target, row in zip(self.targets, self.costs_s[agent], strict=True):
             assignment.costs_given(self.requests, target, np.array(row, np.float32))
         alive = dict.fromkeys(self.targets, 1)
-        told = assignment.costs_ended(self.requests, vehicles, alive, now_ns, (), standing)
+        told = assignment.costs_ended(self.requests, alive, now_ns, (), standing)
         assert told is not None
         for other, costs in self.costs.items():
             if other != agent:
