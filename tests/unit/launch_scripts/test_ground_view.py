@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from support.map_strategies import set_of
 
 from launch_scripts.monitor.ground.ground_colours import (
     FAST_MARK,
@@ -58,7 +59,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
-from swarm.wire.fields import pack_column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import PlannerStatus
 
@@ -177,11 +177,7 @@ def test_zones_of_operators_are_those_that_stand() -> None:
     replica = MapReplica(grid)
 
     def order(name: str, tile: int, cells: list[int], kind: MarkKind, seq: int) -> MarkSet:
-        return MarkSet(
-            author=zone_author(name), group="operator", tile=tile, epoch=1, seq=seq,
-            cells=pack_column(cells, "<u2"), kinds=bytes([kind] * len(cells)),
-            paces=pack_column([0.5] * len(cells), "<f4"), stamps_ns=pack_column([1] * len(cells), "<i8"),
-        )  # fmt: skip
+        return set_of(zone_author(name), tile, seq, dict.fromkeys(cells, (kind, 0.5, 1)), group="operator")
 
     assert ordered_areas(replica, 10, []) == []
     replica.merge([order("z1", 0, [33, 34], MarkKind.LETHAL, 1), order("z2", 1, [0], MarkKind.PACE, 1)])
