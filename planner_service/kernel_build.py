@@ -40,7 +40,6 @@ from planner_service.kernels import (
     route_walk,
     stride_growth,
     stride_network,
-    tied_parents,
     wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
@@ -55,7 +54,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
     StepKernel(wide_buckets.grow_by_wide_buckets, None),
-    tied_parents.untie_parents,
+    parents.untie_parents,
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
     route_walk.drive_rests,

@@ -7,20 +7,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from planner_service.actions import Action, FindStrides, GrowTree, Refusal
-from planner_service.followers import Follower, Followers
-from planner_service.full_growth import GrownTree
+from planner_service.actions import Action, FindStrides, GrownTree, GrowTree, Refusal
+from planner_service.followers import LONGEST_WAIT_NS, Follower, Followers, MapIntake
 from planner_service.gaps import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.map_intake import LONGEST_WAIT_NS, MapIntake
 from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import Searcher
 from planner_service.search.target_search import TargetSearch, is_place
-from planner_service.target_tree import TargetTree
+from planner_service.target_tree import TargetTree, Update
 from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
-from planner_service.update import Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.classes import GROUND

@@ -9,9 +9,8 @@ from functools import partial
 
 import msgspec
 
-from planner_service.actions import Action, FindStrides, GrowTree, Refusal, Tell
+from planner_service.actions import Action, FindStrides, GrownTree, GrowTree, Refusal, Tell
 from planner_service.class_planners import ClassPlanners
-from planner_service.full_growth import GrownTree
 from planner_service.planner import Answer, Planner
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target

@@ -13,11 +13,13 @@ from enum import Enum
 from functools import partial
 from typing import Literal, Protocol
 
-from planner_service.tree.windows import AHEAD
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell
+
+AHEAD = 16
+"""A window reaches so many times as far as the target has come since one so wide was grown last."""
 
 
 class OnMove(Enum):

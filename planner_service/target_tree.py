@@ -8,30 +8,58 @@ the tree that `routes` reads has no cycle and crosses no lethal cell.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
-from planner_service.growth_times import GrowthTimes
+from planner_service.actions import GrownTree, can_be_root, growth_job, offered_gaps
+from planner_service.growth_times import GrowthTimes, WindowLimit, exact_half
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
-from planner_service.tree.bounds import LowerBounds
+from planner_service.tree.certificates import LowerBounds, read_routes
 from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.forms import AnyTree, empty_tree, in_cells, in_pieces
-from planner_service.tree.partitioned_tree import PieceTree
-from planner_service.tree.route_reading import read_routes
+from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
-from planner_service.tree.windows import exact_half
-from planner_service.update import Update
-from planner_service.windows_grown import Reach
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import NO_TARGET, RouteBatch
+
+_NO_WINDOW = Window(0, 0, 0, 0)
+Kind = Literal["none", "full", "exact", "window", "repair", "coarse", "forced"]
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What one call changed.
+
+    kind        the dearest thing that was done: nothing, the whole tree grown, the tree made exact by its parents,
+                a window, a repair after map changes, a window and strides beyond it, a window that was forced
+    window      the cells that may have a new cost or parent; empty if none
+    cells       how many cells the kernels visited
+    wants_full  please run `full_job` on a worker, and `adopt` what it returns
+    repair_ns   CPU time of the repair after map changes that came first, by the tree's stopwatch: of a move or a
+                growth it says nothing
+    """
+
+    kind: Kind
+    window: Window = _NO_WINDOW
+    cells: int = 0
+    wants_full: bool = False
+    repair_ns: int = 0
+
+    def after(self, repaired: Update) -> Update:
+        """This, and the repair before it."""
+        if self.kind == "none":
+            return replace(repaired, wants_full=self.wants_full)
+        if self.kind in ("full", "exact"):
+            return replace(self, repair_ns=repaired.repair_ns)
+        window, cells = self.window.union(repaired.window), self.cells + repaired.cells
+        return Update("window", window, cells, self.wants_full, repaired.repair_ns)
 
 
 class TargetTree:
@@ -83,7 +111,7 @@ class TargetTree:
         # The networks of strategies that thin far cells.
         self._strides = StrideUpkeep()
         self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
-        self._reach = Reach(grid, config, self.times)
+        self._windows = WindowLimit(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
         # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
@@ -125,7 +153,7 @@ class TargetTree:
         moved = target_cell != self._tree.root
         if self._stale:
             return self._grow_full(target_cell)
-        self._reach.moves += moved
+        self._windows.moves += moved
         row = self.strategy
         whole = row.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact)
         if whole and self.times.is_quick(self._grid.cells):
@@ -195,7 +223,7 @@ class TargetTree:
             return self._leave_to_worker() if target_cell != tree.root else repaired
         in_pieces = self._in_pieces or not self.times.is_quick(self._grid.cells)  # as it is, if that takes long
         tree = self._tree = grown.tree_on(self._costs, in_pieces)
-        self._reach.note_whole(grown.target_cell)
+        self._windows.note_whole(grown.target_cell)
         self._is_better_bound = grown.heuristic is None
         if grown.heuristic is None:
             self._bounds.forget()
@@ -306,7 +334,7 @@ class TargetTree:
             self._tree = empty_tree(self._costs, self._in_pieces)
         self._tree.grow(target_cell)
         self._stale = False
-        self._reach.note_whole(target_cell)
+        self._windows.note_whole(target_cell)
         self._bounds_are_old()
         return Update("full", self._grid.window, self._grid.cells)
 
@@ -350,7 +378,7 @@ class TargetTree:
             if not tree.fine or self.times.is_quick(self._grid.cells):
                 return self._grow_full(tree.root)
             return Update("window", self._grid.window, cells, wants_full=not self._job_out)
-        self._reach.note_whole(tree.root)
+        self._windows.note_whole(tree.root)
         self._bounds_are_old()
         return Update("exact", self._grid.window, cells)
 
@@ -393,12 +421,12 @@ class TargetTree:
             self._bounds.take(tree.cost.copy())
         self._is_better_bound = False
         network = self._strides.network
-        half, far = self._reach.after_move(self.strategy, tree.root, target_cell, network is not None)
+        half, far = self._windows.after_move(self.strategy, tree.root, target_cell, network is not None)
         window, cells = self._grow_window(target_cell, half)
         if window is None:
             return self._give_up(target_cell)
         if network is not None and far > half:
-            self._reach.note_window(target_cell, far)
+            self._windows.note_window(target_cell, far)
             cells += tree.grow_strides(window, network, far)
             return Update("coarse", self._grid.around(target_cell, far), cells)
         return Update("window", window, cells)
@@ -413,7 +441,7 @@ class TargetTree:
             connected = self._tree.move(target_cell, window)
             cells += window.cells
             if connected:
-                self._reach.note_window(target_cell, half)
+                self._windows.note_window(target_cell, half)
                 return window, cells
             half *= 2
             window = self._grid.around(target_cell, half)
@@ -428,7 +456,7 @@ class TargetTree:
         if done.kind in ("full", "exact") or done.wants_full or self._job_out:
             return False
         costs_ns = self.times.exact_ns if self._can_mend else self.times.full_ns
-        return self._reach.is_whole_due(self.strategy, costs_ns)
+        return self._windows.is_whole_due(self.strategy, costs_ns)
 
     def _inside(self, cells: Any) -> NDArray[np.int64]:
         asked = np.asarray(cells, np.int64).reshape(-1)

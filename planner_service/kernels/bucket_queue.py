@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL
-from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)

@@ -33,9 +33,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy, step_price
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
-from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
-from planner_service.kernels.compile import helper, step_kernel
+from planner_service.kernels.compile import helper, prefetch, step_kernel
 from planner_service.kernels.layout import (
     BUCKETS,
     GRID,
@@ -33,7 +33,6 @@ from planner_service.kernels.layout import (
     step_offsets,
 )
 from planner_service.kernels.parents import point_row_to_parents
-from planner_service.kernels.prefetch import prefetch
 from planner_service.kernels.repair import (
     FINE_ROW,
     SCRATCH,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, NONE, check_cells
 from planner_service.kernels.pieces import (
     BEFORE,
@@ -43,7 +43,6 @@ from planner_service.kernels.pieces import (
     where_to,
 )
 from planner_service.kernels.pieces_risen import find_risen, note_changes
-from planner_service.kernels.prefetch import prefetch
 
 
 @helper

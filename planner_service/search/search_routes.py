@@ -13,7 +13,7 @@ from planner_service.kernels.arrivals import arrivals
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import NONE, step_offsets
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.padded_climbs import turned_round
+from planner_service.tree.growth import turned_round
 from shared_map.arrays import Floats
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import SEARCHING, RouteBatch

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.search.belief import Belief
-from planner_service.search.blocks import Blocks, blocks_of
+from planner_service.search.belief import Belief, Blocks, blocks_of
 from planner_service.search.search_routes import Way, Ways
 from shared_map.arrays import Bools, Floats
 from swarm.wire.routes import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, RouteBatch

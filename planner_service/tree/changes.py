@@ -1,14 +1,16 @@
-"""What changed in the cell costs of a map."""
+"""What changed in the cell costs of a map, and what is known of all of them: their range, the rounding of sums."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels.cell_costs import BLOCK, block_ranges, count_classes
 from shared_map.arrays import Floats
 
 Cells = NDArray[np.int64]
@@ -39,3 +41,84 @@ def joined(parts: Sequence[Changes]) -> Changes:
         np.concatenate([part.before for part in parts]),
         np.concatenate([part.after for part in parts]),
     )
+
+
+class CostRange:
+    """The lowest and the highest of cell costs, or of what cells cost to the root: float32, none of them negative.
+
+    It is kept block by block, so that a change looks at its own blocks only.
+
+    ranges  int32 (3, n), of each block what the properties say of all, as bits
+    """
+
+    def __init__(self, costs: Floats) -> None:
+        self._ranges: NDArray[np.int32] = np.empty((3, -(-costs.size // BLOCK)), np.int32)
+        block_ranges(costs.view(np.int32), np.arange(self._ranges.shape[1]), self._ranges)
+
+    def change(self, costs: Floats, cells: Cells) -> None:
+        """Become the range of the array after these cells of it have changed."""
+        block_ranges(costs.view(np.int32), np.unique(cells // BLOCK), self._ranges)
+
+    @property
+    def lowest(self) -> float:
+        """inf if there is no finite one."""
+        return float(self._ranges[0].view(np.float32).min())
+
+    @property
+    def highest(self) -> float:
+        """Of the finite ones; 0 if there is none."""
+        return float(self._ranges[1].view(np.float32).max())
+
+    @property
+    def last(self) -> float:
+        """The highest, inf with them; NaN is beyond that."""
+        return float(self._ranges[2].max().view(np.float32))
+
+
+_MANY = 1 << 11
+_LETHAL = 0x7F8
+"""The class of inf."""
+
+
+class Rounding:
+    """How far float32 may have put the labels of trees off, on a map whose cell costs are as they are now.
+
+    docs/certificates.md says why that is enough. Nobody changes one, so that snapshots share it.
+
+    classes  how many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide
+    """
+
+    def __init__(self, classes: Cells) -> None:
+        self.classes = classes
+
+    @classmethod
+    def of(cls, cell_cost: Floats) -> Self:
+        """That of a map; of no cells, before there is one."""
+        classes = np.zeros(_MANY, np.int64)
+        count_classes(cell_cost.view(np.int32), classes)
+        return cls(classes)
+
+    def after(self, changes: Changes) -> Self:
+        """That of the map with these changes."""
+        kinds = [part.view(np.int32) >> 20 for part in (changes.after, changes.before)]
+        more, fewer = (np.bincount(part, minlength=_MANY) for part in kinds)
+        return type(self)(self.classes + more - fewer)
+
+    def at(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
+        """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
+
+        One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
+        than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
+        that, where the lowest cell cost alone would say a step for each of it.
+        """
+        return np.minimum((np.interp(cost, *self.cheapest) + 8.0) * 2.0**-24, 1.0)
+
+    @cached_property
+    def cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What the cheapest cells cost together at least, s, and how many they are; both begin with 0."""
+        classes = np.flatnonzero(self.classes[:_LETHAL])
+        counts = self.classes[classes]
+        least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)
+        # Of the first class zero; a way that costs nothing has no steps.
+        costs = np.cumsum(counts * np.maximum(least, np.finfo(np.float64).tiny))
+        return np.append(0.0, costs), np.append(0.0, np.cumsum(counts))

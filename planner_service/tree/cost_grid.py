@@ -6,7 +6,6 @@ import copy
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
 from planner_service.kernels import repair, route_walk
-from planner_service.kernels.cell_costs import count_classes
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import (
     RULE_FOUR,
@@ -25,66 +23,13 @@ from planner_service.kernels.layout import (
     PaddedGrid,
     step_offsets,
 )
-from planner_service.tree.changes import NO_CHANGES, Cells, Changes, joined
-from planner_service.tree.cost_range import CostRange
-from planner_service.tree.growth import grow_tree
-from planner_service.tree.padded_climbs import padded_climbs, with_scratch
+from planner_service.tree.changes import NO_CHANGES, Cells, Changes, CostRange, Rounding, joined
+from planner_service.tree.growth import grow_tree, padded_climbs, with_scratch
 from shared_map.arrays import Bools, Floats, private_copy
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
-
-# How far float32 may have put the labels of trees off: docs/certificates.md says why that is enough.
-
-_MANY = 1 << 11
-_LETHAL = 0x7F8
-"""The class of inf."""
-
-
-class Rounding:
-    """Of all trees on a map whose cell costs are as they are now. Nobody changes one, so that snapshots share it.
-
-    classes  how many cell costs begin with the same 11 bits: classes that are an eighth of a power of two wide
-    """
-
-    def __init__(self, classes: Cells) -> None:
-        self.classes = classes
-
-    @classmethod
-    def of(cls, cell_cost: Floats) -> Self:
-        """That of a map; of no cells, before there is one."""
-        classes = np.zeros(_MANY, np.int64)
-        count_classes(cell_cost.view(np.int32), classes)
-        return cls(classes)
-
-    def after(self, changes: Changes) -> Self:
-        """That of the map with these changes."""
-        kinds = [part.view(np.int32) >> 20 for part in (changes.after, changes.before)]
-        more, fewer = (np.bincount(part, minlength=_MANY) for part in kinds)
-        return type(self)(self.classes + more - fewer)
-
-    def at(self, cost: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
-        """How far float32 may have put an exact label off, relatively, of a cell that has a way of so much, s.
-
-        One rounding for each step and some for the last: a way enters no cell twice, so that it has no more steps
-        than the cheapest cells of the map that cost as much together. One cheap cell among many makes little of
-        that, where the lowest cell cost alone would say a step for each of it.
-        """
-        return np.minimum((np.interp(cost, *self.cheapest) + 8.0) * 2.0**-24, 1.0)
-
-    @cached_property
-    def cheapest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What the cheapest cells cost together at least, s, and how many they are; both begin with 0."""
-        classes = np.flatnonzero(self.classes[:_LETHAL])
-        counts = self.classes[classes]
-        least = (classes << 20).astype(np.int32).view(np.float32).astype(np.float64)
-        # Of the first class zero; a way that costs nothing has no steps.
-        costs = np.cumsum(counts * np.maximum(least, np.finfo(np.float64).tiny))
-        return np.append(0.0, costs), np.append(0.0, np.cumsum(counts))
-
-
-# What the paces of a map must be before kernels are handed them.
 
 
 def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:

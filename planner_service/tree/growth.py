@@ -13,12 +13,11 @@ from planner_service.kernels import bucket_queue, wide_buckets
 from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.directed_buckets import BASE_BITS, WIDTH, grow_directed_by_buckets, make_scratch
-from planner_service.kernels.layout import NONE, TOO_FINE, PaddedGrid, step_offsets
-from planner_service.kernels.parents import point_to_parents
-from planner_service.kernels.tied_parents import untie_parents
-from planner_service.tree.cost_range import CostRange
-from planner_service.tree.padded_climbs import climbs_in
+from planner_service.kernels.layout import NONE, RULE_FOUR, RULE_OCTILE, SQRT2, TOO_FINE, PaddedGrid, step_offsets
+from planner_service.kernels.parents import point_to_parents, untie_parents
+from planner_service.tree.changes import CostRange
 from shared_map.arrays import Floats
+from shared_map.terrain.step_climb import Climb
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
@@ -98,8 +97,6 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
     return lowest, highest
 
 
-# A full growth where steps cost by what they climb, too: how wide its buckets are.
-
 _SAMPLE = 1 << 10
 """Cells by which the usual cell cost is told."""
 _RARE = 1 / 16
@@ -145,8 +142,6 @@ def _width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, boo
             return width, True
     return lowest * WIDTH, False
 
-
-# A window of a map, grown on its own around a target's new cell.
 
 Box = tuple[int, int, int, int]
 
@@ -202,3 +197,42 @@ def _in_window(grid: CostGrid, cell: int, window: Window) -> int:
     if not window.contains(row, col):
         raise OutsideGridError(f"cell {cell} is not in {window}")
     return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1
+
+
+def padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
+    """(climbs, what the dearest step that is not forbidden costs, in cell costs)."""
+    grid = climb.grid
+    height = np.zeros((grid.rows + 2, grid.cols + 2), np.float32)
+    height[1:-1, 1:-1] = climb.elevation_m
+    diagonal = {RULE_FOUR: np.float32(np.inf), RULE_OCTILE: SQRT2}.get(rule, np.float32(1.0))
+    tables = climb.table[: 8 if climb.windy else 2] / np.float32(climb.lowest)
+    tables[1::2] *= diagonal
+    begins = (np.arange(8) % len(tables) * tables.shape[1]).astype(np.int32)
+    per_metre = np.array(climb.per_metre, np.float32)
+    climbs = height.reshape(-1), tables.reshape(-1), per_metre, begins, *_rows(grid.cols + 2)
+    return climbs, float(tables[tables < np.inf].max())
+
+
+def with_scratch(climbs: Climbs) -> Climbs:
+    """The same, with rows of its own to write to: one thread's."""
+    return *climbs[:4], *_rows(climbs[4].size)
+
+
+def _rows(stride: int) -> tuple[Floats, Floats, Floats, NDArray[np.int32]]:
+    keys, best, codes = np.empty((3, stride), np.float32)
+    return keys, best, codes, np.empty(stride, np.int32)
+
+
+def climbs_in(climbs: Climbs, stride: int, box: tuple[int, int, int, int]) -> Climbs:
+    """Of a window, as a padded grid of its own."""
+    row0, col0, row1, col1 = box
+    part = climbs[0].reshape(-1, stride)[row0 : row1 + 2, col0 : col1 + 2]
+    return np.ascontiguousarray(part).reshape(-1), *climbs[1:]
+
+
+def turned_round(climbs: Climbs) -> Climbs:
+    """Of whoever drives every way backwards: what was uphill is downhill, and the wind comes from ahead that came
+    from behind."""
+    height, prices, scale, begins, keys, best, codes, entries = climbs
+    tables = np.roll(prices.reshape(-1, int(begins[1])), 4, axis=0)
+    return -height, tables.reshape(-1), scale, begins, keys, best, codes, entries

@@ -17,6 +17,7 @@ from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.pieces import ALTERED, CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.growth import KeptScratch, grow_window
 from swarm.grid import Window
 
@@ -214,3 +215,30 @@ class PieceTree:
         self.exact = not left
         self.work = looked, mended, rounds
         return int(looked) * CELLS
+
+
+AnyTree = CostToGoTree | PieceTree
+
+
+def empty_tree(cost_grid: CostGrid, in_pieces: bool) -> AnyTree:
+    """One that is to be grown."""
+    return PieceTree(cost_grid) if in_pieces else CostToGoTree(cost_grid)
+
+
+def in_pieces(tree: AnyTree) -> PieceTree:
+    """The tree in pieces, which makes it exact; itself if it is."""
+    if isinstance(tree, PieceTree):
+        return tree
+    pieces = PieceTree(tree.cost_grid)
+    pieces.take(tree.root, tree.parent)
+    return pieces
+
+
+def in_cells(tree: AnyTree) -> CostToGoTree:
+    """The tree with a cost in every cell; itself if it has them."""
+    if isinstance(tree, CostToGoTree):
+        return tree
+    whole = CostToGoTree(tree.cost_grid)
+    whole.take_parents(tree.root, tree.parent)
+    whole.exact = tree.exact
+    return whole

@@ -14,8 +14,8 @@ from support.planner_strategies import Job, Marks, Move, happenings, paces, plan
 from support.planner_swarm import GRID, Swarm, flat
 
 from planner_service import growth_times
+from planner_service.growth_times import WindowSchedule
 from planner_service.strategy import STAGES
-from planner_service.tree.windows import WindowSchedule
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.routes import RouteStatus

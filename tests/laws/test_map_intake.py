@@ -12,7 +12,7 @@ from support.effort import few
 from support.planner_strategies import STRATEGIES, random_pace
 from support.scripted_planner import TICK, World, chasers
 
-from planner_service.map_intake import LONGEST_WAIT_NS
+from planner_service.followers import LONGEST_WAIT_NS
 from planner_service.planner import Planner
 from planner_service.search.target_search import Hidden, TargetSearch
 from planner_service.target_tree import TargetTree

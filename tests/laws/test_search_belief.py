@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.effort import few
 
-from planner_service.search.belief import Belief
-from planner_service.search.blocks import blocks_of
+from planner_service.search.belief import Belief, blocks_of
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import IDLE_S, Searcher
 from planner_service.tree.cost_grid import CostGrid
@@ -171,7 +170,7 @@ def test_who_stands_where_it_was_sent_to_look_sees_something_of_that_block(
     costs.load(pace)
     ways = Ways(costs)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("planner_service.search.blocks.MOST_BLOCKS", most_blocks)
+        patch.setattr("planner_service.search.belief.MOST_BLOCKS", most_blocks)
         searcher = Searcher(ways, range_m, 3.0, f"{seed}")
         searcher.begin(pace, None, 0.0)
     assert searcher.belief is not None

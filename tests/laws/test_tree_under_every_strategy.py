@@ -19,8 +19,8 @@ from support.planner_strategies import (
     random_pace,
 )
 
+from planner_service.growth_times import block_half
 from planner_service.strategy import STAGES
-from planner_service.tree.windows import block_half
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 

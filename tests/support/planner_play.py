@@ -10,7 +10,7 @@ import numpy as np
 from support import slow_twins as naive
 from support.planner_strategies import Job, Marks, Move
 
-from planner_service.full_growth import GrownTree
+from planner_service.actions import GrownTree
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.actions import Action, GrowTree, Tell
-from planner_service.full_growth import GrownTree
+from planner_service.actions import Action, GrownTree, GrowTree, Tell
 from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Planner
-from planner_service.target_tree import TargetTree
-from planner_service.update import Update
+from planner_service.target_tree import TargetTree, Update
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from support.planner_strategies import RULES, random_climb, random_pace
 from support.slow_twins import Cells, Driven, cost_to_go, drive
 
-from planner_service.full_growth import GrownTree
+from planner_service.actions import GrownTree
 from planner_service.kernel_build import load_all
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig

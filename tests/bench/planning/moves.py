@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from support.fields import Field, make_field
 
 from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
+from planner_service.growth_times import exact_half
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PieceTree
-from planner_service.tree.windows import exact_half
 from swarm.config.scenario import PlannerConfig
 
 Course = Literal["random", "straight"]

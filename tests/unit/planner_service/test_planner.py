@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scripted_planner import COLS, GRID, ROWS, World, pose
 
-from planner_service.actions import Action, GrowTree
-from planner_service.full_growth import GrownTree
-from planner_service.update import Update
+from planner_service.actions import Action, GrownTree, GrowTree
+from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window
 from swarm.wire.routes import RouteStatus

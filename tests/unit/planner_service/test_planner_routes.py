@@ -9,7 +9,7 @@ from support.scripted_planner import COLS, GRID, World
 
 from planner_service.actions import Refusal
 from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer
-from planner_service.update import Update
+from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
 from swarm.wire.fields import column

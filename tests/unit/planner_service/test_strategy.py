@@ -13,7 +13,6 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
-from planner_service import full_growth
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, GrowthTimes
 from planner_service.strategy import (
     ROWS,
@@ -243,6 +242,6 @@ def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_
     for _ in range(3):
         tree.times.observe_exact_ns(300_000_000)
     assert tree.strategy.on_move is OnMove.SCHEDULED_WINDOW
-    monkeypatch.setattr(full_growth, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
+    monkeypatch.setattr(actions, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
     update = tree.adopt(grown, pace, grid.cell(100, 102), [], 0, np.empty(0, np.int64))
     assert (tree.target_cell, update.wants_full) == (grid.cell(100, 101), True)

@@ -14,12 +14,12 @@ from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
 from planner_service import growth_times
-from planner_service.strategy import STAGES, Auto, Growths
+from planner_service.growth_times import WindowSchedule
+from planner_service.strategy import AHEAD, STAGES, Auto, Growths
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
-from planner_service.tree.windows import AHEAD, WindowSchedule
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 

@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
+from planner_service.kernels.route_walk import OK
 from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.partitioned_tree import PieceTree
 from shared_map.arrays import Floats
+from swarm.wire.routes import RouteBatch
 
 LOWER_SHARE = 16
 """A heuristic is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
@@ -72,3 +74,20 @@ class LowerBounds:
 _NOT_EXACT = (-1.0, 0.0, 0.0)
 _NONE: Floats = np.empty(0, np.float32)
 _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)
+
+
+def read_routes(
+    tree: CostToGoTree | PieceTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int
+) -> RouteBatch:
+    """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
+    grid = tree.cost_grid
+    starts, statuses = asked.copy(), np.empty(asked.size, np.uint8)
+    walks = grid.walk(tree.parent, grid.pad(tree.root), starts, max_cells, grid.time_cost, statuses)
+    if max_cells:
+        tree.tighten(walks.last)
+    rests = tree.time_at(walks.last)
+    cost_s = walks.driven + rests
+    bound_s = bounds.at(tree, starts, None if grid.length_weight_s else cost_s)
+    if grid.length_weight_s:
+        bound_s[statuses != OK] = 0.0
+    return RouteBatch(statuses, asked, walks.directions, walks.ends, cost_s, bound_s, walks.length, rests)
