@@ -1,5 +1,5 @@
 """Exact growth with a bucket queue (R. B. Dial, "Algorithm 360: Shortest-path forest with topological ordering",
-Communications of the ACM 12(11), 1969, 632-633), and a breadth-first search to compare it with.
+Communications of the ACM 12(11), 1969, 632-633).
 
 All neighbours of a cell are offered the same exit key per kind of step (see `layout`). Cells leave the queue in the
 order of their exit keys, so that the first offer to a cell is its least, and its cost is final at first touch: no
@@ -26,7 +26,17 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel, prefetch
-from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL
+from planner_service.kernels.layout import (
+    BUCKETS,
+    GRID,
+    INF,
+    RULE_FOUR,
+    RULE_OCTILE,
+    SQRT2,
+    TOO_FINE,
+    WALL,
+    diagonal_length,
+)
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
@@ -98,12 +108,13 @@ def offer_straight(cell_cost, cost, s, batch, n, touched):
 
 
 @helper
-def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
-    """As `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
+def offer_diagonal(cell_cost, cost, s, slant, corners, batch, n, touched, count):
+    """As `offer_straight`, to the diagonal neighbours, which are `slant` away; there are `count` in `touched`
+    already."""
     for p in range(n):
         _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u] * SQRT2
+        key = cost[u] + cell_cost[u] * slant
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -115,41 +126,6 @@ def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
         )
         if not corners:
             # inf past a wall. inf - inf is no number, and no match: a shut diagonal touches nothing.
-            for i, old, gate in around:
-                offer = max(key, -gate)
-                cost[i] = min(old, offer)
-                touched[count] = i
-                count += np.uint64(old - offer == INF)
-            continue
-        for i, old, _ in around:
-            cost[i] = min(old, key)
-            touched[count] = i
-            count += np.uint64(old == INF)
-    return count
-
-
-@helper
-def offer_around(cell_cost, cost, s, corners, batch, n, touched):
-    """As `offer_straight`, to eight neighbours, all a step of length 1 away."""
-    count = _ZERO
-    for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
-        u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u]
-        above = u - s
-        below = u + s
-        north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
-        around = (
-            (above - _ONE, cost[above - _ONE], min(north, west)),
-            (above + _ONE, cost[above + _ONE], min(north, east)),
-            (below - _ONE, cost[below - _ONE], min(south, west)),
-            (below + _ONE, cost[below + _ONE], min(south, east)),
-        )
-        for i, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
-            cost[i] = min(old, key)
-            touched[count] = i
-            count += np.uint64(old == INF)
-        if not corners:
             for i, old, gate in around:
                 offer = max(key, -gate)
                 cost[i] = min(old, offer)
@@ -185,6 +161,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
     mask = length - _ONE
     second = length if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / np.float32(width)
+    slant = diagonal_length(rule)
 
     open_costs(cell_cost, cost)
     cost[np.uint64(root)] = _ZERO32
@@ -214,36 +191,9 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
             b = np.uint64(current) & mask
         n = take(queue, b, batch)
         waiting -= n
-        if rule == RULE_PAPER:
-            count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
-        else:
-            count = offer_straight(cell_cost, cost, s, batch, n, touched)
+        count = offer_straight(cell_cost, cost, s, batch, n, touched)
         if rule == RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
-            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
-
-
-@kernel(f"({GRID}, f4[::1], i8, u4[::1])")
-def breadth_first(grid, cost, root, queue):
-    """Steps from every cell to the root over 8 neighbours, whatever they cost: what no growth can be faster than.
-    Returns how many cells have a way; `cost` is written whole, and WALL stays on lethal cells. `queue` has room for
-    all cells."""
-    cell_cost, offsets, _, _, _ = grid
-    for i in range(cell_cost.size):
-        cost[i] = INF if cell_cost[i] < INF else WALL
-    cost[root] = np.float32(0.0)
-    queue[0] = root
-    first = 0
-    last = 1
-    while first < last:
-        u = np.int64(queue[first])
-        first += 1
-        key = cost[u] + _ONE32
-        for k in range(8):
-            v = u + offsets[k]
-            if cost[v] == INF:
-                cost[v] = key
-                queue[last] = v
-                last += 1
-    return last
+        if rule != RULE_FOUR:
+            count = offer_diagonal(cell_cost, cost, s, slant, corners, batch, n, touched, count)

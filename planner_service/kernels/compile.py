@@ -14,7 +14,7 @@ import contextlib
 import hashlib
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -144,10 +144,39 @@ def helper(function: Any) -> Any:
     return _compiled(function, no_cpython_wrapper=True)
 
 
-def kernel(signature: str) -> Callable[[Any], Any]:
+_ARRAYS = {
+    "Bytes": "u1[::1]",
+    "ByteRows": "u1[:, ::1]",
+    "Shorts": "i2[::1]",
+    "Ints": "i4[::1]",
+    "IntRows": "i4[:, ::1]",
+    "Longs": "i8[::1]",
+    "LongRows": "i8[:, ::1]",
+    "Floats": "f4[::1]",
+    "Doubles": "f8[::1]",
+    "DoubleRows": "f8[:, ::1]",
+    "int": "i8",
+}
+"""What `layout` calls arrays -> as numba writes their types."""
+
+
+def type_of(named: Any) -> Any:
+    """The numba type of a NamedTuple, each of whose fields is declared by a name of `layout`, or as int."""
+    fields = (_ARRAYS[each.__forward_arg__] for each in named.__annotations__.values())
+    return types.NamedTuple(_types(fields), named)
+
+
+def _types(arguments: Iterable[Any]) -> tuple[Any, ...]:
+    return tuple(
+        sigutils.normalize_signature(f"({each},)")[0][0] if isinstance(each, str) else each for each in arguments
+    )
+
+
+def kernel(*signature: Any) -> Callable[[Any], Any]:
     """What Python calls: compiled for these types alone, without the GIL, and kept on disk.
 
-    signature  as numba reads one, of the arguments; any other type is a TypeError
+    signature  as numba reads one, of the arguments, or each on its own, where one is a `type_of`; any other type is
+               a TypeError
 
     It is compiled, or loaded, by `load`, or else by its first call. Where no folder can be written to, every
     process compiles for itself what NUMBA_CACHE_DIR lacks. With NUMBA_DISABLE_JIT the function stays as it is.
@@ -161,7 +190,7 @@ def kernel(signature: str) -> Callable[[Any], Any]:
         if not config.DISABLE_JIT:
             if isinstance(compiled._cache, _FolderCache):
                 compiled._cache._impl.linked = False  # a kernel calls helpers only
-            compiled.declared = signature
+            compiled.declared = signature[0] if len(signature) == 1 else _types(signature)
             compiled._compile_for_args = lambda *_: _load(compiled)  # numba's name for the first call
         KERNELS[function.__name__] = compiled
         return compiled
@@ -270,5 +299,6 @@ def _llvm_prefetch(typing, array, index):
 
 
 prefetch = _nothing if config.DISABLE_JIT else _llvm_prefetch
-"""prefetch(array, index): ask for a cell's memory before it is needed. `index` is not read, and may lie anywhere. It
-changes no result; uncompiled it does nothing."""
+"""prefetch(array, index) asks for a cell's memory before it is needed. `index` is not read, and may lie anywhere.
+
+It changes no result; uncompiled it does nothing."""

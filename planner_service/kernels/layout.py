@@ -38,6 +38,18 @@ WALL = np.float32(-np.inf)
 """While growing, the cost of a lethal cell. No minimum lifts it; and max(key, -WALL) is inf, an offer that nobody
 takes, without a branch."""
 
+Bytes = NDArray[np.uint8]
+ByteRows = NDArray[np.uint8]
+Shorts = NDArray[np.int16]
+Ints = NDArray[np.int32]
+IntRows = NDArray[np.int32]
+Longs = NDArray[np.int64]
+LongRows = NDArray[np.int64]
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+DoubleRows = NDArray[np.float64]
+"""Arrays of one axis, and of two, as fields of NamedTuples: `compile.type_of` reads these names."""
+
 TOO_FINE = -1
 """Returned by a growth whose keys grew so large, in lowest cell costs, that float32 could not tell them apart."""
 

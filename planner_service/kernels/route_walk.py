@@ -9,11 +9,6 @@ Routes follow parents, without any search. Arrays, beside those of `layout`; n i
     length      float64  (n,)    m
     last        int64    (n,)    last padded cell
     status      uint8    (n,)    OK, UNREACHABLE, OUTSIDE or LETHAL_START
-    trails      uint8    (4, room)  directions of the routes that were walked in each lane, one after the other
-    lanes       int64    (5, 4)     of each lane: its route, the first one that is not its own any more, where its
-                                    route begins in the trail, how long the trail is, the padded cell it has come to
-    sums        float64  (4,)       s; what each lane's route has cost so far
-    joined      uint8    (4 * room,)  the trails of all lanes, one after the other: `directions`, and room behind
 """
 
 from __future__ import annotations
@@ -37,23 +32,14 @@ from planner_service.kernels.layout import (
 
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
 """What became of a route that was asked for."""
+BROKEN = -2
+"""What `walk_routes` returns instead of a number of steps."""
 
 Moves = tuple[NDArray[np.uint64], NDArray[np.float64]]
 Ways = tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float64], int, int]
 """(parent, offsets, lengths, root, stride): the parents, what `moves_of` returns, the padded root."""
-Lanes = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.uint8], NDArray[np.uint8]]
 _WAYS = "Tuple((u1[::1], u8[::1], f8[::1], i8, i8))"
 _WALKS = "Tuple((u1[::1], i8[::1], f8[::1], f8[::1], i8[::1]))"
-_WALK = "Tuple((i8[:, ::1], f8[::1], u1[:, ::1], u1[::1]))"
-
-_LANES = 4
-"""Routes that are walked side by side. A step waits for the one before it, but not for another route's."""
-_ROUTE, _UNTIL, _BEGUN, _FILL, _CELL = range(5)
-"""Rows of `lanes`."""
-NO_ROOM, BROKEN = -1, -2
-"""What `walk_routes` returns instead of a number of steps."""
-_STRETCH = 32
-"""Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
 
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
@@ -82,84 +68,22 @@ def relabel(grid, climbs, labels, trail):
 
 @helper
 def _driven(cell_cost, climbs, lengths, before, cell, code):
-    """float64, s: what the step costs that led from `before` to a cell; 0 beyond a route's end."""
+    """float64, s: what the step costs that led from `before` to a cell."""
     own = np.float64(cell_cost[cell])
     if climbs is None:
         return own * lengths[code]
-    return own * np.float64(step_price(climbs, before, cell, code)) if code != NONE else 0.0
-
-
-@helper
-def _walk_on(cell_cost, climbs, ways, lanes, sums, trails, steps):
-    """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
-    parent, offsets, lengths, _, _ = ways
-    a, b, c, d = (
-        np.uint64(lanes[_CELL, 0]),
-        np.uint64(lanes[_CELL, 1]),
-        np.uint64(lanes[_CELL, 2]),
-        np.uint64(lanes[_CELL, 3]),
-    )
-    sum_a, sum_b, sum_c, sum_d = sums[0], sums[1], sums[2], sums[3]
-    at_a, at_b, at_c, at_d = (
-        np.uint64(lanes[_FILL, 0]),
-        np.uint64(lanes[_FILL, 1]),
-        np.uint64(lanes[_FILL, 2]),
-        np.uint64(lanes[_FILL, 3]),
-    )
-    for i in range(np.uint64(steps)):
-        code_a, code_b, code_c, code_d = parent[a], parent[b], parent[c], parent[d]
-        trails[0, at_a + i] = code_a
-        trails[1, at_b + i] = code_b
-        trails[2, at_c + i] = code_c
-        trails[3, at_d + i] = code_d
-        from_a, from_b, from_c, from_d = a, b, c, d
-        a += offsets[code_a]
-        b += offsets[code_b]
-        c += offsets[code_c]
-        d += offsets[code_d]
-        sum_a += _driven(cell_cost, climbs, lengths, from_a, a, code_a)
-        sum_b += _driven(cell_cost, climbs, lengths, from_b, b, code_b)
-        sum_c += _driven(cell_cost, climbs, lengths, from_c, c, code_c)
-        sum_d += _driven(cell_cost, climbs, lengths, from_d, d, code_d)
-    lanes[_CELL, 0], lanes[_CELL, 1], lanes[_CELL, 2], lanes[_CELL, 3] = (
-        np.int64(a),
-        np.int64(b),
-        np.int64(c),
-        np.int64(d),
-    )
-    sums[0], sums[1], sums[2], sums[3] = sum_a, sum_b, sum_c, sum_d
+    return own * np.float64(step_price(climbs, before, cell, code))
 
 
 def moves_of(stride: int, rule: int) -> Moves:
     """Of each direction code, what it adds to a padded cell (uint64) and its length in straight steps (float64).
 
-    Beyond the codes of directions, NONE: to stay, at no cost. Unsigned, as sums of a cell and a signed offset would
-    be floating-point numbers; they wrap.
+    Unsigned, as sums of a cell and a signed offset would be floating-point numbers; they wrap.
     """
-    offsets, lengths = np.zeros(256, np.uint64), np.zeros(256, np.float64)
-    offsets[:8] = step_offsets(stride).astype(np.uint64)
-    lengths[:8] = 1.0
+    lengths = np.ones(8, np.float64)
     if rule == RULE_OCTILE:
-        lengths[1:8:2] = SQRT2_EXACT
-    return offsets, lengths
-
-
-def make_lanes() -> Lanes:
-    """(lanes, sums, trails, joined), for routes of usual length; `longer` for others."""
-    return np.empty((5, _LANES), np.int64), np.empty(_LANES, np.float64), *_trails(1024)
-
-
-def _trails(room: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    return np.empty((_LANES, room), np.uint8), np.empty(_LANES * room, np.uint8)
-
-
-def longer(walk: Lanes) -> Lanes:
-    """The same lanes, their trails with twice the room."""
-    lanes, sums, trails, _ = walk
-    room = trails.shape[1]
-    twice, joined = _trails(2 * room)
-    twice[:, :room] = trails
-    return lanes, sums, twice, joined
+        lengths[1::2] = SQRT2_EXACT
+    return step_offsets(stride).astype(np.uint64), lengths
 
 
 @helper
@@ -184,110 +108,52 @@ def _find_starts(cell_cost, ways, starts, status):
             starts[i] = v
 
 
-@helper
-def _begin(lanes, sums, starts, root):
-    """Each lane has a share of the routes, and its trail holds them in order."""
-    count = starts.size
-    for j in range(_LANES):
-        first = count * j // _LANES
-        lanes[_ROUTE, j] = first
-        lanes[_UNTIL, j] = count * (j + 1) // _LANES
-        lanes[_BEGUN, j] = 0
-        lanes[_FILL, j] = 0
-        lanes[_CELL, j] = starts[first] if first < lanes[_UNTIL, j] else root
-        sums[j] = 0.0
-
-
-@helper
-def _join(walks, walk, metres):
-    """Put the trails of all lanes into one row. Ends of routes in their lane's trail become their ends in that row;
-    lengths are written. Returns how many steps all have; BROKEN if a route that was looked for has no end."""
-    status, ends, driven, length, _ = walks
-    lanes, _, trails, joined = walk
-    resolution, diagonal = metres
-    count = ends.size
-    n = 0
-    for j in range(_LANES):
-        for i in range(lanes[_FILL, j]):
-            joined[n + i] = trails[j, i]
-        for r in range(count * j // _LANES, count * (j + 1) // _LANES):
-            ends[r] += n if ends[r] >= 0 else 0
-        n += lanes[_FILL, j]
-    begin = 0
-    for r in range(count):
-        odd = 0
-        for i in range(begin, ends[r]):
-            odd += joined[i] & 1
-        end = max(begin, ends[r])
-        length[r] = (np.float64(end - begin) + np.float64(odd) * (diagonal - 1.0)) * resolution
-        begin = end
-        if r < status.size and status[r] != OK:
-            driven[r] = np.inf
-        elif r < status.size and ends[r] < 0:
-            return np.int64(BROKEN)
-    return n
-
-
-@step_kernel(f"(f4[::1], CLIMBS, {_WAYS}, i8[::1], UniTuple(i8, 3), UniTuple(f8, 2), {_WALKS}, {_WALK})", CLIMBS)
-def walk_routes(cell_cost, climbs, ways, starts, most, metres, walks, walk):
+@step_kernel(f"(f4[::1], CLIMBS, {_WAYS}, i8[::1], UniTuple(i8, 2), UniTuple(f8, 2), {_WALKS}, u1[::1])", CLIMBS)
+def walk_routes(cell_cost, climbs, ways, starts, most, metres, walks, directions):
     """The routes from `starts` to the root.
 
-    starts  padded cells that have a way; or, if `status` is not empty, any numbers of cells of the grid. Then these
-            become padded cells, and `status` is written
-    most    (steps of a route, 0 for all of it; no route can be longer than so many; 1 to begin, 0 to go on)
-    metres  (resolution, m; length of a diagonal in straight steps)
-    walks   (status, ends, driven, length, last), written; inf, 0 m and the root where `status` says that there is
-            no route
-    walk    as `make_lanes` returns them; `joined` is written
-    Raises ValueError where a start is no padded cell. Returns how many steps all routes have; NO_ROOM if the trails
-    have none for the next ones: call it again with longer ones to go on; BROKEN if a route with a status has no
-    end.
+    starts      padded cells that have a way; or, if `status` is not empty, any numbers of cells of the grid. Then
+                these become padded cells, and `status` is written
+    most        (steps of a route, 0 for all of it; no route can be longer than so many)
+    metres      (resolution, m; length of a diagonal in straight steps)
+    walks       (status, ends, driven, length, last), written; inf, 0 m and the root where `status` says that there
+                is no route
+    directions  written, as far as there is room
+    Raises ValueError where a start is no padded cell. Returns how many steps all routes have, for which there may
+    be no room; BROKEN if a route with a status has no end.
     """
-    parent, _, _, root, _ = ways
-    status, ends, driven, _, last = walks
-    lanes, sums, trails, _ = walk
-    limit = most[1]
-    longest = limit if most[0] <= 0 else min(limit, most[0])
-    if most[2]:
-        if status.size:
-            _find_starts(cell_cost, ways, starts, status)
-        check_cells(starts, parent.size)
-        _begin(lanes, sums, starts, root)
-    while True:
-        steps = np.int64(0)  # a literal would have `_walk_on` compiled twice
-        room = trails.shape[1]
-        for j in range(_LANES):
-            room = min(room, trails.shape[1] - lanes[_FILL, j])
-            if lanes[_ROUTE, j] < lanes[_UNTIL, j]:
-                left = min(_STRETCH, longest - (lanes[_FILL, j] - lanes[_BEGUN, j]))
-                steps = left if steps == 0 else min(steps, left)
-        if steps == 0:
-            break
-        if steps > room:
-            return np.int64(NO_ROOM)
-        _walk_on(cell_cost, climbs, ways, lanes, sums, trails, steps)
-        for j in range(_LANES):
-            r = lanes[_ROUTE, j]
-            if r == lanes[_UNTIL, j]:
-                continue
-            begun = lanes[_BEGUN, j]
-            end = lanes[_FILL, j] + steps
-            while end > begun and trails[j, end - 1] == NONE:
-                end -= 1
-            lanes[_FILL, j] = end
-            v = lanes[_CELL, j]
-            if parent[v] != NONE and end - begun < longest:
-                continue
-            broken = v != root and (parent[v] == NONE or end - begun == limit)
-            ends[r] = -1 if broken else end
-            driven[r] = sums[j]
-            last[r] = v
-            r += 1
-            lanes[_ROUTE, j] = r
-            lanes[_BEGUN, j] = end
-            lanes[_CELL, j] = starts[r] if r < lanes[_UNTIL, j] else root
-            sums[j] = 0.0
-    return _join(walks, walk, metres)
+    parent, offsets, lengths, root, _ = ways
+    status, ends, driven, length, last = walks
+    resolution, diagonal = metres
+    longest = most[1] if most[0] <= 0 else min(most[1], most[0])
+    if status.size:
+        _find_starts(cell_cost, ways, starts, status)
+    check_cells(starts, parent.size)
+    home, room, end = np.uint64(root), np.uint64(directions.size), np.uint64(0)
+    for r in range(starts.size):
+        v, begin = np.uint64(starts[r]), end
+        until = begin + np.uint64(longest)
+        odd, sum = 0, 0.0
+        code = parent[v]
+        while code != NONE and end < until:
+            u = v + offsets[code]
+            sum += _driven(cell_cost, climbs, lengths, v, u, code)
+            if end < room:
+                directions[end] = code
+            odd += code & 1
+            end += np.uint64(1)
+            v, code = u, parent[u]
+        steps = np.int64(end - begin)
+        broken = v != home and (code == NONE or steps == most[1])
+        ends[r] = -1 if broken else np.int64(end)
+        driven[r] = sum
+        last[r] = np.int64(v)
+        length[r] = (np.float64(steps) + np.float64(odd) * (diagonal - 1.0)) * resolution
+        if r < status.size and status[r] != OK:
+            driven[r] = np.inf
+        elif r < status.size and broken:
+            return np.int64(BROKEN)
+    return np.int64(end)
 
 
 @helper

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from planner_service.kernels.bucket_queue import (
     AHEAD,
     close_costs,
-    offer_around,
     offer_diagonal,
     offer_straight,
     open_costs,
@@ -261,13 +260,12 @@ def grow_by_wide_buckets(grid, cost, root, narrowest, scratch):
                 current, until = np.int32(0), _CIRCLE
                 b = _ZERO
             n = take(queue, b, batch)
-            if rule == RULE_PAPER:
-                count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
-            else:
-                count = offer_straight(cell_cost, cost, s, batch, n, touched)
+            count = offer_straight(cell_cost, cost, s, batch, n, touched)
             if octile:
                 m = take(queue, b + slants, slanted)
-                count = offer_diagonal(cell_cost, cost, s, corners, slanted, m, touched, count)
+                count = offer_diagonal(cell_cost, cost, s, SQRT2, corners, slanted, m, touched, count)
+            elif rule == RULE_PAPER:
+                count = offer_diagonal(cell_cost, cost, s, _ONE32, corners, batch, n, touched, count)
             most = _FEW + _AGAIN * (n + m) if width > least_width else _ANY
             count, more, settled = _serve_again(grid, cost, era, current, touched, count, places, most)
             if not settled:

@@ -143,7 +143,7 @@ class CostGrid:
 
     def _make_scratch(self) -> None:
         """What kernels write to: one thread's."""
-        self._lanes = route_walk.make_lanes()
+        self._directions: NDArray[np.uint8] = np.empty(1 << 12, np.uint8)
         """Scratch of `walk`, which makes it longer where routes are."""
         self._trail: tuple[NDArray[np.uint32], NDArray[np.float64]] | None = None
         """Scratch of `rests`, which makes it: room for all cells, of which only what routes need becomes memory."""
@@ -421,14 +421,15 @@ class CostGrid:
         driven, length = np.empty(count), np.empty(count)
         walks = statuses, ends, driven, length, last
         read = cell_cost, self.climbs, self._ways(parent, root), starts
-        longest, metres = self.grid.cells, (self.grid.resolution_m, self.diagonal)
-        steps = route_walk.walk_routes(*read, (most, longest, 1), metres, walks, self._lanes)
-        while steps == route_walk.NO_ROOM:
-            self._lanes = route_walk.longer(self._lanes)
-            steps = route_walk.walk_routes(*read, (most, longest, 0), metres, walks, self._lanes)
+        limits, metres, asked = (most, self.grid.cells), (self.grid.resolution_m, self.diagonal), starts.copy()
+        steps = route_walk.walk_routes(*read, limits, metres, walks, self._directions)
+        if steps > self._directions.size:
+            self._directions = np.empty(2 * steps, np.uint8)
+            starts[:] = asked
+            steps = route_walk.walk_routes(*read, limits, metres, walks, self._directions)
         if steps == route_walk.BROKEN:
             raise AssertionError("a route does not end at the target: the tree is broken")
-        return Walks(self._lanes[-1][:steps].copy(), ends, driven, length, last)
+        return Walks(self._directions[:steps].copy(), ends, driven, length, last)
 
     def rests(self, parent: NDArray[np.uint8], root: int, starts: Cells, cell_cost: Floats) -> NDArray[np.float64]:
         """float64, s: what is driven from padded cells along the parents to a padded root; inf where there is no

@@ -1,7 +1,7 @@
 """The exact tree of one target over a large map: it stays exact at every move, at a fraction of a growth.
 
-`kernels.pieces` says how it is laid out, `kernels.pieces_risen` where it is looked at after a change, and
-`kernels.pieces_mend` why it ends, never has a cycle, and is optimal.
+`kernels.partition` says how it is laid out, `kernels.partition_totals` where it is checked after a change, and
+`kernels.partition_search` why it ends, never has a cycle, and is optimal.
 """
 
 from __future__ import annotations
@@ -11,10 +11,22 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import pieces, pieces_changes, pieces_labels, pieces_mend, pieces_totals
-from planner_service.kernels.layout import NONE
+from planner_service.kernels import partition, partition_search, partition_totals
+from planner_service.kernels.layout import NONE, PaddedGrid
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.pieces import ALTERED, CELLS, LOOK, MOST_SLACK, NO_PIECE, REHOOK, ROOM, SIDE
+from planner_service.kernels.partition import (
+    ALTERED,
+    CELLS,
+    CHECK,
+    MOST_SLACK,
+    NO_PIECE,
+    PIECES,
+    RELINK,
+    SIDE,
+    Schedule,
+    Tiles,
+    Tree,
+)
 from planner_service.tree.changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -57,16 +69,23 @@ class PieceTree:
         self._across = -(-cost_grid.grid.cols // SIDE)
         self._count = count = -(-cost_grid.grid.rows // SIDE) * self._across
         self._piece = np.full(count * CELLS, NO_PIECE, np.uint8)
-        self._rim = np.zeros(count * ROOM, np.float64)
-        self._pieces = pieces.make_pieces(count)
-        exits, many, span = np.zeros(count * ROOM, np.uint8), np.zeros(count, np.int32), np.zeros(count, np.float64)
+        self._rim = np.zeros(count * PIECES, np.float64)
+        self._totals = partition.make_totals(count)
         self._wanted = np.zeros(count, np.uint8)
-        falls, self._ends = np.zeros((3, count), np.float64), np.zeros((2, count), np.float64)
-        self._tiles: pieces.Tiles = exits, many, span, self._wanted, falls, self._ends, self._across
-        self._bench = pieces.make_bench(count, MOST_KEPT)
+        self._ends = np.zeros((2, count), np.float64)
+        self._tiles = Tiles(
+            exits=np.zeros(count * PIECES, np.uint8),
+            many=np.zeros(count, np.int32),
+            span=np.zeros(count, np.float64),
+            wanted=self._wanted,
+            falls=np.zeros((3, count), np.float64),
+            ends=self._ends,
+            across=self._across,
+        )
+        self._scratch = partition.make_scratch(count, MOST_KEPT)
         self._now = 0
-        self._stack = np.empty(count * ROOM, np.int32)
-        self._sets = pieces.make_sets(count)
+        self._stack = np.empty(count * PIECES, np.int32)
+        self._words = np.zeros((6, -(-count // 8)), np.int64)
         self._at_once = np.zeros(count)
         self._most = MOST_LOOKS * count + 64
         self._kept: KeptScratch = {}
@@ -76,8 +95,10 @@ class PieceTree:
         """The root has moved since totals were added up."""
 
     @property
-    def _labels(self) -> pieces.Cells:
-        return self.parent, self._piece, self._rim, self.cost_grid.pad(self.root)
+    def _arrays(self) -> tuple[PaddedGrid, Tree]:
+        """(map, tree) for kernels."""
+        grid = self.cost_grid
+        return grid.padded, Tree(self.parent, self._piece, self._rim, *self._totals, grid.pad(self.root))
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -95,7 +116,7 @@ class PieceTree:
             raise ValueError(f"parents of this map are uint8, {self.cost_grid.size} cells")
         self.parent = parent
         self.root = root
-        self._wanted[:] = LOOK | REHOOK
+        self._wanted[:] = CHECK | RELINK
         row, col = (at // SIDE for at in self.cost_grid.grid.row_col(root))
         rows, cols = np.divmod(np.arange(self._count), self._across)
         self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
@@ -122,9 +143,8 @@ class PieceTree:
         old_root = grid.pad(self.root)
         self.root = root
         changed = np.zeros(self._count, np.uint8)
-        pieces_changes.merge_parents(
-            *(grid.padded, self._labels, self._pieces, self._tiles, self._bench),
-            *((cost, parent, box, way), old_root, changed),
+        partition_search.merge_parents(
+            *self._arrays, self._tiles, self._scratch, (cost, parent, box, way), old_root, changed
         )
         self._relabel(changed)
         self._moved = True
@@ -145,14 +165,12 @@ class PieceTree:
         if changes.cells.size == 0:
             return 0
         changed = np.zeros(self._count, np.uint8)
-        pieces_changes.cut_ways(
-            self.cost_grid.padded, self._labels, self._across, changes.cells, changes.before, changed
-        )
+        partition_search.cut_parents(*self._arrays, self._across, changes.cells, changes.before, changed)
         turn = self._ends[0].copy()
         self._relabel(changed)
         looked = self._mend(self._most, turn)
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
-        pieces_changes.drop_lost(self.cost_grid.padded, self._labels, self._pieces, self._tiles, lost)
+        partition_search.drop_cut_off(*self._arrays, self._tiles, lost)
         return looked if self.exact or not lost.size else -1
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
@@ -161,10 +179,7 @@ class PieceTree:
         if self._moved:
             self._add_up()
         costs = np.empty(cells.size, np.float64)
-        pieces_totals.costs_at(
-            *(self.cost_grid.padded, self._labels, self._pieces, self._bench, self._across),
-            *(np.ascontiguousarray(cells), costs),
-        )
+        partition_totals.costs_at(*self._arrays, self._scratch, self._across, np.ascontiguousarray(cells), costs)
         return costs
 
     def time_at(self, cells: Cells) -> NDArray[np.float64]:
@@ -177,40 +192,34 @@ class PieceTree:
     @property
     def slack(self) -> tuple[float, float, float]:
         """As of a `CostToGoTree`. Cell costs are float32, a few roundings; the rest is left over step by step."""
-        farthest = self._ends[1].max() + self._tiles[2].max()
+        farthest = self._ends[1].max() + self._tiles.span.max()
         return 2.0**-21, 0.0, float(MOST_SLACK * farthest)
 
     def tighten(self, cells: Cells) -> None:
         """Costs are what is driven at all times."""
 
     def _relabel(self, changed: NDArray[np.uint8]) -> None:
-        """Label tiles anew in which something has changed: uint8 (n,), `pieces.DEARER` or more."""
-        pieces_labels.relabel_tiles(
-            *(self.cost_grid.padded, self._labels, self._tiles, self._bench, np.flatnonzero(changed), changed),
-        )
+        """Label tiles anew in which something has changed: uint8 (n,), `partition.DEARER` or more."""
+        partition.relabel_tiles(*self._arrays, self._tiles, self._scratch, np.flatnonzero(changed), changed)
 
-    def _turns(self, turn: NDArray[np.float64]) -> pieces.Turns:
-        """As `kernels.pieces_mend.mend_tiles` takes them; totals are up to date after what they are handed to."""
+    def _schedule(self, turn: NDArray[np.float64]) -> Schedule:
+        """As `improve_tiles` takes it; totals are up to date after what it is handed to."""
         self._now += self._moved
         now = self._now if self._moved else 0
         self._moved = False
         order = np.argsort(self._ends[0])
         place = np.empty_like(order)
         place[order] = np.arange(order.size)
-        return order, place, turn, now, self._stack, *self._sets
+        return Schedule(order, place, turn, now, self._stack, self._words.view(np.uint8), self._words)
 
     def _add_up(self) -> None:
         """Evaluate the totals."""
-        pieces_totals.add_up(
-            *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench),
-            self._turns(self._at_once),
-        )
+        partition_totals.add_up(*self._arrays, self._tiles, self._scratch, self._schedule(self._at_once))
 
     def _mend(self, most: float, turn: NDArray[np.float64]) -> int:
         """Look at tiles until the tree is exact, or as many as `most` have been."""
-        looked, mended, rounds, left = pieces_mend.mend_tiles(
-            *(self.cost_grid.padded, self._labels, self._pieces, self._tiles, self._bench),
-            *(self._turns(turn), most),
+        looked, mended, rounds, left = partition_search.improve_tiles(
+            *self._arrays, self._tiles, self._scratch, self._schedule(turn), most
         )
         self.exact = not left
         self.work = looked, mended, rounds

@@ -145,7 +145,7 @@ def ours(pace: Pace, edge: Edge) -> Tool:
 
 def breadth_first(pace: Pace, edge: Edge) -> Tool:
     """A plain breadth-first search over the same arrays: a lower bound for any search that visits every cell."""
-    from planner_service.kernels.bucket_queue import breadth_first as search
+    from bench.planning.breadth_first import breadth_first as search
 
     cost_grid = _our_tree(pace, edge).cost_grid
     cost, queue = np.empty(cost_grid.size, np.float32), np.empty(cost_grid.size, np.uint32)

@@ -25,7 +25,7 @@ from swarm.config.scenario import Scenario
 
 def test_every_kernel_of_a_planner_is_built() -> None:
     built = [name_of(kernel) for kernel in all_kernels()]
-    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first"})
+    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first"})  # of a benchmark
 
 
 def scenario(*, directional: bool = False, aloft: bool = False, routes: str = "grid") -> Scenario:

@@ -13,6 +13,7 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
+from planner_service import actions
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, GrowthTimes
 from planner_service.strategy import (
     ROWS,

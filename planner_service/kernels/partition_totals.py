@@ -1,0 +1,451 @@
+"""What the pieces of a tree cost, and where their totals have come apart, so that a tile is to be checked.
+
+Where no cell was offered less, one is by a cell of another piece only if its own piece's total has risen by more
+than that one's. So a tile is checked where two pieces *meet*, have cells beside each other, and one of them has
+risen by more than the other. What is known of a tile is one number, how much less a cell may be offered by all
+changes since it was checked (`Tiles.falls`).
+
+Of a piece that loses its way it is kept what it cost, and once it has one again its change is reckoned from that: a
+branch behind a closed way mostly comes back as it was, at a higher cost, and is then checked along its edge only.
+What a tile's cells are offered by a piece without a way is not seen when the tile is checked. It is
+`CHECKED_CUT_OFF` then, and checked again when a piece about it has found one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planner_service.kernels.compile import helper, kernel, prefetch
+from planner_service.kernels.layout import GRID, NONE, check_cells
+from planner_service.kernels.partition import (
+    BEFORE,
+    BITS,
+    CELLS,
+    CHANGED,
+    CHECK,
+    CHECKED_CUT_OFF,
+    CHECKING,
+    CUT_OFF,
+    FINEST,
+    INSIDE,
+    LINKING,
+    NEARBY,
+    NO_PIECE,
+    NOTED,
+    OFFSET,
+    PIECES,
+    RECHECK,
+    RECONNECTED,
+    RELINK,
+    RELINK_INTO,
+    ROOT_PIECE,
+    SCHEDULE,
+    SCRATCH,
+    SIDE,
+    STAMP,
+    SUCCESSOR,
+    SUMMING,
+    TILES,
+    TOTAL,
+    TREE,
+    WIDE,
+    border_index,
+    cell_behind,
+    corner_of,
+    next_in,
+    push_around,
+    step_cost,
+    step_of,
+    tile_of,
+)
+
+_ONE = np.uint64(1)
+_DRIFT = 4.0
+"""How many times `FINEST` a tile's totals may come apart before it is looked at."""
+_EVEN = 2.0**-4
+"""How many times `FINEST` changes may differ and be taken for the same number: they are differences of sums."""
+
+
+@helper
+def settle(t, tiles):
+    """Totals of a tile have not changed since they were noted."""
+    many, falls = tiles.many, tiles.falls
+    falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)
+
+
+@helper
+def _change(total, y):
+    """By how much the total of a piece has changed in the last evaluation, if its tile's totals have; 0 of one that
+    has no way, or never had one."""
+    cost, before = total[y, TOTAL], abs(total[y, BEFORE])
+    return cost - before if cost < np.inf and before < np.inf else 0.0
+
+
+@helper
+def note_changes(t, tree, tiles):
+    """Write `falls` and `ends` of a tile whose totals have changed, and whether pieces have lost their way or found
+    one."""
+    total = tree.total
+    exits, many, wanted, falls, ends = tiles.exits, tiles.many, tiles.wanted, tiles.falls, tiles.ends
+    least, most, near, far = np.inf, -np.inf, np.inf, 0.0
+    what = np.uint8(0)
+    for j in range(many[t]):
+        y = t * PIECES + np.int64(exits[t * PIECES + j])
+        cost, before = total[y, TOTAL], total[y, BEFORE]
+        change = _change(total, y)
+        had = 0.0 <= before < np.inf
+        if not cost < np.inf:
+            what |= CUT_OFF | (RECHECK if had else np.uint8(0))
+        elif not had:
+            what |= RECONNECTED
+        least = min(least, change)
+        most = max(most, change)
+        near = min(near, cost)
+        far = max(far, cost)
+    wanted[t] = (wanted[t] & ~CUT_OFF) | what
+    if not what & CUT_OFF:
+        wanted[t] &= ~RECHECK
+    falls[0, t] = least
+    falls[1, t] = most
+    ends[0, t] = near
+    ends[1, t] = far
+
+
+@helper
+def _differ(a, b):
+    """uint8, not 0: whether two groups differ, and both are some."""
+    return np.uint8((a != b) & (a != NO_PIECE) & (b != NO_PIECE))
+
+
+@helper
+def _meet_inside(t, tree, tiles, scratch, fine):
+    """Whether two pieces of a tile lie beside each other whose totals have changed by different numbers, which are
+    more than `fine` apart."""
+    piece, total = tree.piece, tree.total
+    exits, many = tiles.exits, tiles.many
+    less, name, changes = scratch.less, scratch.name, scratch.changes
+    # Pieces are grouped by what their totals have changed by: `less` holds the group of each name.
+    groups = 0
+    for j in range(many[t]):
+        one = np.int64(exits[t * PIECES + j])
+        change = _change(total, t * PIECES + one)
+        group = 0
+        while group < groups and abs(change - changes[group]) > fine:
+            group += 1
+        if group == groups:
+            if groups == changes.size:
+                return True
+            changes[groups] = change
+            groups += 1
+        less[one] = group
+    less[NO_PIECE] = np.int32(NO_PIECE)
+    for row in range(SIDE):
+        i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
+        for col in range(np.uint64(SIDE)):
+            name[at + col] = less[piece[i + col]]
+    for row in range(1, SIDE + 1):
+        at, s = np.uint64(row * WIDE), np.uint64(WIDE)
+        other = np.uint8(0)
+        for col in range(_ONE, np.uint64(SIDE) + _ONE):
+            here = name[at + col]
+            other |= _differ(here, name[at + col + _ONE]) | _differ(here, name[at + s + col])
+            other |= _differ(here, name[at + s + col + _ONE]) | _differ(here, name[at + s + col - _ONE])
+        if other:
+            return True
+    return False
+
+
+@helper
+def _meet(t, other, way, tree, schedule, fine):
+    """Whether along the border of a tile a piece's total has risen by more than that of one beside it, of tile
+    `other`, which lies `way`, so many tiles down and to the right; by more than `fine`."""
+    piece, total = tree.piece, tree.total
+    place, sets = schedule.place, schedule.sets
+    down, right = way
+    noted, other_noted = sets[NOTED, place[t]], sets[NOTED, place[other]]
+    count = 1 if down and right else SIDE
+    step = 1 if down else SIDE
+    cell = (INSIDE << BITS if down > 0 else 0) + (INSIDE if right > 0 else 0)
+    beside = (INSIDE << BITS if down < 0 else 0) + (INSIDE if right < 0 else 0)
+    for n in range(count):
+        one = piece[t * CELLS + cell + n * step]
+        if one == NO_PIECE:
+            continue
+        change = (_change(total, t * PIECES + np.int64(one)) if noted else 0.0) - fine
+        for k in range(max(n - 1, 0), min(n + 2, count)):
+            one = piece[other * CELLS + beside + k * step]
+            if one == NO_PIECE:
+                continue
+            if change > (_change(total, other * PIECES + np.int64(one)) if other_noted else 0.0):
+                return True
+    return False
+
+
+@helper
+def _any_meet(t, tree, tiles, scratch, schedule, fine):
+    """Whether a piece of a tile has risen by more than one that lies beside it, in the tile or about it; by more
+    than `fine`."""
+    falls, across = tiles.falls, tiles.across
+    row, col = t // across, t % across
+    down = falls.shape[1] // across
+    if falls[1, t] > falls[0, t] + fine and _meet_inside(t, tree, tiles, scratch, fine):
+        return True
+    for i in range(max(row - 1, 0), min(row + 2, down)):
+        for j in range(max(col - 1, 0), min(col + 2, across)):
+            other = i * across + j
+            if other == t or not falls[1, t] > falls[0, other] + fine:
+                continue
+            if _meet(t, other, (i - row, j - col), tree, schedule, fine):
+                return True
+    return False
+
+
+@helper
+def _rise(t, tiles):
+    """By how much more a piece of a tile has risen than another in it or about it, s. What is wanted of the tile is
+    taken down, too."""
+    wanted, falls, ends, across = tiles.wanted, tiles.falls, tiles.ends, tiles.across
+    row, col = t // across, t % across
+    down = wanted.size // across
+    least, near = np.inf, np.inf
+    what = np.uint8(0)
+    for i in range(max(row - 1, 0), min(row + 2, down)):
+        for j in range(max(col - 1, 0), min(col + 2, across)):
+            other = i * across + j
+            least = min(least, falls[0, other])
+            near = min(near, ends[0, other])
+            what |= wanted[other]
+    if what & RECONNECTED:
+        if wanted[t] & CHECKED_CUT_OFF:
+            wanted[t] |= CHECK
+        if wanted[t] & CUT_OFF:
+            wanted[t] |= RECHECK
+    if not near < np.inf:
+        wanted[t] &= ~RECHECK
+    return falls[1, t] - least if falls[1, t] > least else 0.0
+
+
+@helper
+def queue_checks(tree, tiles, scratch, schedule):
+    """Put tiles into `CHECKING` that are to be checked: where it is wanted, and where a piece's total has risen by
+    more than that of one beside it since they were looked at. Only tiles about which totals have changed, and those
+    of `NEARBY`, are asked; others stay in it or out of it."""
+    wanted, falls, ends, across = tiles.wanted, tiles.falls, tiles.ends, tiles.across
+    order, place, sets, words = schedule.order, schedule.place, schedule.sets, schedule.words
+    n = next_in(CHANGED, 0, sets, words)
+    while n < order.size:
+        sets[CHANGED, n] = 0
+        sets[NOTED, n] = 1
+        note_changes(order[n], tree, tiles)
+        push_around(NEARBY, order[n], across, place, sets)
+        n = next_in(CHANGED, n + 1, sets, words)
+    n = next_in(NEARBY, 0, sets, words)
+    while n < order.size:
+        sets[NEARBY, n] = 0
+        t = order[n]
+        nearest = ends[0, t] if ends[0, t] < np.inf else 0.0
+        rise, fine = _rise(t, tiles), _EVEN * FINEST * nearest
+        if rise > 2.0 * fine and not _any_meet(t, tree, tiles, scratch, schedule, fine):
+            rise = 2.0 * fine
+        falls[2, t] += rise
+        risen = ends[0, t] < np.inf and falls[2, t] > _DRIFT * FINEST * nearest
+        sets[CHECKING, n] = risen or wanted[t] & (CHECK | RECHECK) != 0
+        n = next_in(NEARBY, n + 1, sets, words)
+    n = next_in(NOTED, 0, sets, words)
+    while n < order.size:
+        sets[NOTED, n] = 0
+        wanted[order[n]] &= ~RECONNECTED
+        settle(order[n], tiles)
+        n = next_in(NOTED, n + 1, sets, words)
+
+
+@helper
+def _forget(total, y):
+    """Changes of a piece's total are reckoned from now on."""
+    cost, before = total[y, TOTAL], total[y, BEFORE]
+    total[y, BEFORE] = cost if cost < np.inf else (-abs(before) if before < np.inf else np.inf)
+
+
+@helper
+def _forget_all(t, tree, tiles):
+    """Changes of a tile's totals are reckoned from now on."""
+    for j in range(tiles.many[t]):
+        _forget(tree.total, t * PIECES + np.int64(tiles.exits[t * PIECES + j]))
+
+
+@helper
+def _link(t, name, grid, tree, across, names):
+    """Write where a piece leads, and how far that is."""
+    cell_cost, offsets, stride, rule, _ = grid
+    parent, piece, rim = tree.parent, tree.piece, tree.rim
+    total, successor = tree.total, tree.successor
+    y = t * PIECES + name
+    if name == ROOT_PIECE:
+        successor[y, SUCCESSOR] = -1
+        total[y, OFFSET] = 0.0
+        return
+    origin, _, _ = corner_of(grid, across, t)
+    cell = np.int64(names[name])
+    v = origin + (cell >> BITS) * stride + (cell & INSIDE)
+    way = np.int64(parent[v])
+    other, beside = cell_behind(across, t, cell, way)
+    successor[y, SUCCESSOR] = other * PIECES + np.int64(piece[other * CELLS + beside])
+    total[y, OFFSET] = rim[other * PIECES + border_index(beside)] + step_cost(
+        rule, cell_cost[v + offsets[way]], way
+    )
+
+
+@helper
+def _link_all(grid, tree, tiles, names, schedule):
+    """Link the pieces of tiles of `LINKING` whose parents have changed, and those that lead there."""
+    successor = tree.successor
+    exits, many, wanted, across = tiles.exits, tiles.many, tiles.wanted, tiles.across
+    order, sets, words = schedule.order, schedule.sets, schedule.words
+    n = next_in(LINKING, 0, sets, words)
+    while n < order.size:
+        t = order[n]
+        anew = wanted[t] & RELINK != 0
+        if anew:
+            sets[SUMMING, n] = sets[CHANGED, n] = 1
+            _forget_all(t, tree, tiles)
+        for j in range(many[t] if wanted[t] & (RELINK | RELINK_INTO) else 0):
+            name = np.int64(exits[t * PIECES + j])
+            y = t * PIECES + name
+            if anew or (successor[y, SUCCESSOR] >= 0 and wanted[successor[y, SUCCESSOR] // PIECES] & RELINK):
+                _link(t, name, grid, tree, across, names)
+                sets[SUMMING, n] = 1
+        n = next_in(LINKING, n + 1, sets, words)
+    n = next_in(LINKING, 0, sets, words)
+    while n < order.size:
+        sets[LINKING, n] = 0
+        wanted[order[n]] &= ~(RELINK | RELINK_INTO)
+        n = next_in(LINKING, n + 1, sets, words)
+
+
+@helper
+def _add_up(t, tree, tiles, first):
+    """Totals of a tile := what its exits are offered. Returns whether one has changed. `first`: none of them has
+    before in this evaluation."""
+    total, successor, exits, many = tree.total, tree.successor, tiles.exits, tiles.many
+    changed = False
+    for j in range(many[t]):
+        y = t * PIECES + np.int64(exits[t * PIECES + j])
+        next = np.int64(successor[y, SUCCESSOR])
+        cost = total[y, OFFSET] + (total[next, TOTAL] if next >= 0 else 0.0)
+        if cost != total[y, TOTAL]:
+            if first and not changed:
+                _forget_all(t, tree, tiles)
+            changed = True
+            total[y, TOTAL] = cost
+    return changed
+
+
+@helper
+def _add_up_all(tree, tiles, schedule):
+    """The same for all tiles, each piece after the one that it leads into."""
+    total, successor = tree.total, tree.successor
+    exits, many = tiles.exits, tiles.many
+    order, now, stack, sets = schedule.order, schedule.now, schedule.stack, schedule.sets
+    for n in range(order.size):
+        t = order[n]
+        next = order[min(n + 1, order.size - 1)]
+        for j in range(many[next]):
+            prefetch(total, (next * PIECES + np.int64(exits[next * PIECES + j])) * 4)
+        sets[SUMMING, n] = sets[CHANGED, n] = 0
+        sets[NOTED, n] = sets[NEARBY, n] = 1
+        for j in range(many[t]):
+            y = t * PIECES + np.int64(exits[t * PIECES + j])
+            steps = 0
+            while y >= 0 and successor[y, STAMP] != now:
+                stack[steps] = y
+                steps += 1
+                y = np.int64(successor[y, SUCCESSOR])
+            cost = total[y, TOTAL] if y >= 0 else 0.0
+            for i in range(steps - 1, -1, -1):
+                y = np.int64(stack[i])
+                cost += total[y, OFFSET]
+                _forget(total, y)
+                total[y, TOTAL] = cost
+                successor[y, STAMP] = now
+        note_changes(t, tree, tiles)
+
+
+@helper
+def evaluate_totals(grid, tree, tiles, names, schedule, now):
+    """Totals := what is driven from each exit to the root, after what has changed about tiles of `LINKING`.
+
+    now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
+    If not, tiles about one whose totals have changed are added up, those nearest the root first. That takes a tenth
+    of the time where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way
+    it ends, as no piece leads to itself.
+    """
+    across = tiles.across
+    order, place, sets, words = schedule.order, schedule.place, schedule.sets, schedule.words
+    _link_all(grid, tree, tiles, names, schedule)
+    if now:
+        _add_up_all(tree, tiles, schedule)
+    n = next_in(SUMMING, 0, sets, words)
+    while n < order.size:
+        sets[SUMMING, n] = 0
+        if _add_up(order[n], tree, tiles, not sets[CHANGED, n]):
+            sets[CHANGED, n] = 1
+            push_around(SUMMING, order[n], across, place, sets)
+            sets[SUMMING, n] = 0
+        n = next_in(SUMMING, n + 1, sets, words)
+        if n >= order.size:
+            n = next_in(SUMMING, 0, sets, words)
+
+
+@helper
+def begin(tiles, schedule):
+    """Make the sets from what is wanted of tiles."""
+    wanted, falls, across = tiles.wanted, tiles.falls, tiles.across
+    order, place, sets = schedule.order, schedule.place, schedule.sets
+    for n in range(order.size):
+        t = order[n]
+        if wanted[t] & RELINK:
+            push_around(LINKING, t, across, place, sets)
+        sets[NEARBY, n] = wanted[t] & (CHECK | RECHECK) != 0 or falls[2, t] > 0.0
+        sets[CHECKING, n] = 0
+
+
+@kernel(GRID, TREE, TILES, SCRATCH, SCHEDULE)
+def add_up(grid, tree, tiles, scratch, schedule):
+    """Evaluate totals, and note where they have risen."""
+    begin(tiles, schedule)
+    evaluate_totals(grid, tree, tiles, scratch.border, schedule, schedule.now)
+    queue_checks(tree, tiles, scratch, schedule)
+
+
+@kernel(GRID, TREE, SCRATCH, "i8", "i8[::1]", "f8[::1]")
+def costs_at(grid, tree, scratch, across, cells, costs):
+    """costs := float64, s, of padded cells; inf where there is no way. Raises ValueError where one is no cell."""
+    cell_cost, offsets, stride, rule, _ = grid
+    parent, piece = tree.parent, tree.piece
+    total, steps_s, kept, place = tree.total, scratch.cost, scratch.kept, scratch.place
+    check_cells(cells, cell_cost.size)
+    for i in range(cells.size):
+        v = cells[i]
+        t, cell = tile_of(v, stride, across)
+        costs[i] = total[t * PIECES + np.int64(piece[t * CELLS + cell]), TOTAL]
+        if place[t] >= 0:
+            costs[i] += kept[np.int64(place[t]) * CELLS + cell]
+            continue
+        row, col = cell >> BITS, cell & INSIDE
+        way = np.int64(parent[v])
+        steps = 0
+        while way != NONE:
+            down, right = step_of(way)
+            row += down
+            col += right
+            if (row | col) & -SIDE:
+                break
+            v += offsets[way]
+            steps_s[steps] = step_cost(rule, cell_cost[v], way)
+            steps += 1
+            way = np.int64(parent[v])
+        # Summed from the exit, as elsewhere: the same numbers in another order are another sum.
+        inner = 0.0
+        for step in range(steps - 1, -1, -1):
+            inner += steps_s[step]
+        costs[i] += inner
