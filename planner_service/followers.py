@@ -109,7 +109,7 @@ class Followers:
         """Where they all are."""
         return np.fromiter((follower.cell for follower in self._by_id.values()), np.int64, len(self._by_id))
 
-    def hear(self, chasers: Chasers, now_ns: int) -> None:
+    def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
         """Which vehicles of an agent chase the target, and from where. Ignored if older than the last."""
         before = self._told.get(chasers.author)
         if before is not None and chasers.stamp_ns < before.stamp_ns:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -154,22 +155,22 @@ class Planner:
         self.tree.times.set_budget(cpu_budget)
 
     def is_lost(self, now_ns: int) -> bool:
-        """Whether nobody knows where the target is that somebody knew of."""
+        """True if the target was tracked once and is not tracked now."""
         return self._watch.lost(now_ns)
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+    def on_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
         if pose.target == self.target:
-            self._watch.hear(pose, now_ns)
+            self._watch.on_pose(pose, now_ns)
 
-    def set_pose(self, pose: TargetPose, now_ns: int) -> None:
+    def on_sighting(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target is, by the best sighting of it: sightings are ordered before they come here."""
-        self._watch.see(pose, now_ns)
+        self._watch.on_sighting(pose, now_ns)
 
-    def hear_chasers(self, chasers: Chasers, now_ns: int) -> None:
+    def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
         """Note which vehicles of an agent chase this target, and from where."""
         if chasers.target == self.target:
-            self.followers.hear(chasers, now_ns)
+            self.followers.on_chasers(chasers, now_ns)
 
     def answer(
         self,
@@ -197,7 +198,7 @@ class Planner:
         if self.tree.ready and self.tree.wants_strides:
             actions.append(FindStrides(self.tree.stride_job(self._shelf)))
         self.followers.drop_silent(now_ns)
-        told = self._watch.take_told(now_ns)
+        told = self._watch.drain(now_ns)
         if self.leads:
             actions.extend(told)
             actions.extend(self._pushes(now_ns))
@@ -384,17 +385,7 @@ class Planner:
                 routes = self._read(cells, max_cells, now_ns)
         given = self._pulled(routes)
         reply = RouteReply(
-            target=self.target,
-            incarnation=self._incarnation,
-            target_cell=self.tree.target_cell,
-            map_version=max(self.tree.map_version, 0),
-            tree_age_ms=self._age_ms(now_ns),
-            rows=self._grid.rows,
-            cols=self._grid.cols,
-            routes=given.columns(),
-            pose_age_s=self._watch.age_s(now_ns),
-            tracker_lost=self._watch.lost(now_ns),
-            vehicle_class=self.vehicle_class,
+            rows=self._grid.rows, cols=self._grid.cols, routes=given.columns(), **self._reply_fields(now_ns)
         )
         send(reply)
         if search is None:
@@ -464,17 +455,22 @@ class Planner:
         if (search := self._under_way) is not None:
             on_map = [0 <= cell < self._grid.cells and self.tree.cost_grid.passable(cell) for cell in cells]
             costs_s = search.costs_s(costs_s, np.array(on_map, np.bool_))
-        return CostReply(
-            target=self.target,
-            incarnation=self._incarnation,
-            target_cell=self.tree.target_cell,
-            map_version=max(self.tree.map_version, 0),
-            tree_age_ms=self._age_ms(now_ns),
-            cost_to_go_s=pack_column(costs_s, "<f4"),
-            pose_age_s=self._watch.age_s(now_ns),
-            tracker_lost=self._watch.lost(now_ns),
-            vehicle_class=self.vehicle_class,
-        )
+        return CostReply(cost_to_go_s=pack_column(costs_s, "<f4"), **self._reply_fields(now_ns))
+
+    def _fields(self, now_ns: int) -> dict[str, Any]:
+        """What replies and the status say of the tree and of the target."""
+        return {
+            "target": self.target,
+            "incarnation": self._incarnation,
+            "map_version": max(self.tree.map_version, 0),
+            "tree_age_ms": self._age_ms(now_ns),
+            "pose_age_s": self._watch.age_s(now_ns),
+            "tracker_lost": self._watch.lost(now_ns),
+        }
+
+    def _reply_fields(self, now_ns: int) -> dict[str, Any]:
+        own = {"target_cell": self.tree.target_cell, "vehicle_class": self.vehicle_class}
+        return self._fields(now_ns) | own
 
     def _cells(self, request: RouteRequest | CostRequest) -> list[int]:
         """The cells asked for; a person's row and col come last, as -1 where they are outside."""
@@ -513,8 +509,8 @@ class Planner:
         return pushes
 
     def _places_to_push(self, searcher: Searcher, now_ns: int) -> list[Action]:
-        """Other places for vehicles whose own is not worth the way any more, and for those which still follow a
-        route to where the target was."""
+        """Reassigns search places of vehicles whose place costs more than it is worth, or which still follow a route
+        to the last pose."""
         pushes: list[Action] = []
         searcher.forget_all_but(self._ways, self.followers.ids())
         for id, follower in self.followers.all_items():
@@ -548,13 +544,10 @@ class Planner:
         window, counts, pose = self._window, self.counters.counts, self._watch.pose
         mean, p95, highest = self._gaps.last or (None, None, None)
         return PlannerStatus(
-            target=self.target,
-            incarnation=self._incarnation,
+            **self._fields(now_ns),
             stamp_ns=now_ns,
             strategy=self._config.strategy,
             target_cell=None if pose is None else pose.cell,
-            map_version=max(self.tree.map_version, 0),
-            tree_age_ms=self._age_ms(now_ns),
             window=[] if window.empty else [window.row0, window.col0, window.row1, window.col1],
             growths=counts["growths"],
             window_growths=counts["window_growths"],
@@ -562,8 +555,6 @@ class Planner:
             routes_served=counts["routes_served"],
             following=len(self.followers),
             tracker=None if pose is None else pose.tracker,
-            pose_age_s=self._watch.age_s(now_ns),
-            tracker_lost=self._watch.lost(now_ns),
             gap_mean=mean,
             gap_p95=p95,
             gap_max=highest,

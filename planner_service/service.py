@@ -16,7 +16,6 @@ from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.strides import StrideSearch
 from shared_map.class_grounds import class_terrains
 from shared_map.class_maps import ClassMaps
@@ -83,68 +82,41 @@ class PlannerService:
     ) -> None:
         scenario = setup.scenario
         self._target = job_of(setup.id)
-        self._scenario = scenario
-        self._bus = bus
-        self._post = post
-        self._worker = worker
+        self._scenario, self._incarnation = scenario, setup.incarnation
+        self._stopwatch, self._prepared = stopwatch, prepared
+        self._all_kernels = all_kernels or (lambda: True)
+        # The network: this process among the others, and who of the target's planners leads.
+        self._bus, self._post, self._worker = bus, post, worker
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
+        # The map, of each class of vehicles.
         self._cost_map = CostMap(terrain, learning=scenario.map.learning)
         self._heard_groups = readable_for_target(scenario, self._target)
         filter = MarkFilter(terrain.grid, self._heard_groups)
+        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
+        self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        # Where the target is.
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._presence = Presence(_PRESENCE_NS, filter)
         """Who looks where; nothing is heard of it for a target that has a tracker."""
-        self._maps = ClassMaps(self._cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
-        self._replica = MapReplica(terrain.grid, self._maps, filter=filter)
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        self._faults: list[str] = []
-        """What the strategy's plug-in did wrong and nobody has been told yet."""
-        world = StrategyWorld(self._target, terrain.grid, scenario.planner)
-        chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
-
-        def search_by(costs: CostGrid) -> TargetSearch:
-            hidden = hidden_target(scenario, self._target, setup.incarnation)
-            return TargetSearch(hidden, costs, scenario.time_scale)
-
-        def planner_of(name: str, cost_map: CostMap) -> Planner:
-            tree = TargetTree(
-                terrain.grid,
-                scenario.planner,
-                cost_map.terrain.climb,
-                all_kernels or (lambda: True),
-                has_worker=True,
-                chosen_by=chosen_by,
-                stopwatch=stopwatch or (lambda: 0),
-            )
-            shelf = prepared if name == GROUND else None
-            if shelf is not None:
-                tree.share(shelf.cell_cost)
-            return Planner(
-                self._target,
-                setup.incarnation,
-                scenario.planner,
-                tree,
-                cost_map,
-                self.counters,
-                route_cells=scenario.vehicles.route_cells,
-                stopwatch=stopwatch,
-                newest_mark_ns=self._replica.take_newest_stamp_ns if name == GROUND else lambda: None,
-                shelf=shelf,
-                leads=False,
-                time_scale=scenario.time_scale,
-                target_search=search_by(tree.cost_grid) if name == GROUND else self._planner.target_search,
-                vehicle_class=name,
-            )
-
         self._listens = False
         """Whether vehicles tell where they are and what they see."""
         self._pose: TargetPose | None = None
         """The newest that a tracker told, for the planner of a class that is made later."""
-        self._planner_of = planner_of
-        self._planner = planner_of(GROUND, self._cost_map)
+        # The planners, one of each class that somebody asks for.
+        self._faults: list[str] = []
+        """What the strategy's plug-in did wrong and nobody has been told yet."""
+        world = StrategyWorld(self._target, terrain.grid, scenario.planner)
+        self._chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
+        tree = self._new_tree(self._cost_map)
+        if prepared is not None:
+            tree.share(prepared.cell_cost)
+        hidden = hidden_target(scenario, self._target, setup.incarnation)
+        self._search = TargetSearch(hidden, tree.cost_grid, scenario.time_scale)
+        self._planner = self._new_planner(GROUND, self._cost_map, tree)
         self._planners = ClassPlanners(
             self._planner, self._begin_class, self._maps.of, class_kernels or (lambda: True)
         )
@@ -164,15 +136,47 @@ class PlannerService:
         self._member.needs(f"a tree of {self._target}", lambda: self._planner.tree.ready or self._served_by_search)
         self._learned = LearnedGauges(self._cost_map.keys, self.counters)
 
+    def _new_tree(self, cost_map: CostMap) -> TargetTree:
+        return TargetTree(
+            cost_map.grid,
+            self._scenario.planner,
+            cost_map.terrain.climb,
+            self._all_kernels,
+            has_worker=True,
+            chosen_by=self._chosen_by,
+            stopwatch=self._stopwatch or (lambda: 0),
+        )
+
+    def _new_planner(self, name: str, cost_map: CostMap, tree: TargetTree) -> Planner:
+        """The planner of a class. Stamps of marks and what other processes share are told to that of "ground"."""
+        scenario, is_ground = self._scenario, name == GROUND
+        return Planner(
+            self._target,
+            self._incarnation,
+            scenario.planner,
+            tree,
+            cost_map,
+            self.counters,
+            route_cells=scenario.vehicles.route_cells,
+            stopwatch=self._stopwatch,
+            newest_mark_ns=self._replica.take_newest_stamp_ns if is_ground else lambda: None,
+            shelf=self._prepared if is_ground else None,
+            leads=False,
+            time_scale=scenario.time_scale,
+            target_search=self._search,
+            vehicle_class=name,
+        )
+
     def _begin_class(self, name: str, now_ns: int) -> Planner:
         """The planner of a class that somebody asks for."""
-        planner = self._planner_of(name, self._maps.of[name])
+        cost_map = self._maps.of[name]
+        planner = self._new_planner(name, cost_map, self._new_tree(cost_map))
         planner.lead(self._planner.leads)
         self._pace(planner)
         if self._pose is not None:
-            planner.hear_pose(self._pose, now_ns)
+            planner.on_pose(self._pose, now_ns)
         for seen in self._sightings.best(now_ns).values():
-            planner.set_pose(pose_of(seen), now_ns)
+            planner.on_sighting(pose_of(seen), now_ns)
         log.info("target %s: a tree for the class %s", self._target, name)
         return planner
 
@@ -197,46 +201,40 @@ class PlannerService:
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if isinstance(event, Asked) and isinstance(event.request, (RouteRequest, CostRequest)):
-            self._held.append((now_ns, event))
-            self._answer(now_ns)
-            return
-        if self._member.handle(event) or self._sync.handle(event, now_ns):
-            return
-        if self._candidacy.handle(event, now_ns) or self._obedience.handle(event, now_ns):
-            return
         match event:
-            case Heard(message=Sighted() as sighted):
-                self._hear_sighted(sighted, now_ns)
-            case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag.startswith(_GROW):
-                grows = self._asked_by(tag)
-                if grows is not None:
-                    self._perform(grows, grows.adopt(grown, took_ns, now_ns), now_ns)
+            case Asked(request=RouteRequest() | CostRequest()):
+                self._held.append((now_ns, event))
                 self._answer(now_ns)
-            case WorkDone(tag=tag, result=StrideSearch() as search) if tag.startswith(_STRIDES):
-                self._finding_strides = None
-                looks = self._asked_by(tag)
-                if search.network is not None and looks is not None:
-                    del self._stride_searches[tag]
-                    looks.adopt_strides(search)
-            case _:
-                pass
+            case Heard(message=Sighted() as sighted):
+                self._on_sighted(sighted, now_ns)
+            case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns):
+                self._on_grown(tag, grown, took_ns, now_ns)
+            case WorkDone(tag=tag, result=StrideSearch() as search):
+                self._on_strides(tag, search)
+            case _ if not self._member.handle(event):
+                # Each takes what is its own.
+                handlers = self._sync.handle, self._candidacy.handle, self._obedience.handle
+                any(handle(event, now_ns) for handle in handlers)
+
+    def _on_grown(self, tag: str, grown: GrownTree, took_ns: int, now_ns: int) -> None:
+        planner = self._asked_by(tag)
+        if planner is not None:
+            self._perform(planner, planner.adopt(grown, took_ns, now_ns), now_ns)
+        self._answer(now_ns)
+
+    def _on_strides(self, tag: str, search: StrideSearch) -> None:
+        self._finding_strides = None
+        planner = self._asked_by(tag)
+        if search.network is not None and planner is not None:
+            del self._stride_searches[tag]
+            planner.adopt_strides(search)
 
     def tick(self, now_ns: int) -> None:
-        for heard in self._bus.collected(POSE):
-            assert isinstance(heard.message, TargetPose)
-            self._pose = heard.message
-            for _, planner in self._planners:
-                planner.hear_pose(heard.message, now_ns)
-        for heard in self._bus.collected(CHASERS):
-            assert isinstance(heard.message, Chasers)
-            name = heard.message.vehicle_class
-            if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
-                self._planners.used(name, now_ns).hear_chasers(heard.message, now_ns)
+        self._take_collected(now_ns)
         self._sync.tick(now_ns)
         self._learned.tick(self._cost_map.factors)
         self._sightings.expire(now_ns)
-        self._look(now_ns)
+        self._take_fleet(now_ns)
         self._obey()
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
         self._planners.drop_unused(now_ns)
@@ -254,6 +252,18 @@ class PlannerService:
         self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
+    def _take_collected(self, now_ns: int) -> None:
+        for heard in self._bus.collected(POSE):
+            assert isinstance(heard.message, TargetPose)
+            self._pose = heard.message
+            for _, planner in self._planners:
+                planner.on_pose(heard.message, now_ns)
+        for heard in self._bus.collected(CHASERS):
+            assert isinstance(heard.message, Chasers)
+            name = heard.message.vehicle_class
+            if self._planners.fault(name) is None and (heard.message.ids or self._planners.held(name)):
+                self._planners.used(name, now_ns).on_chasers(heard.message, now_ns)
+
     def _look_for_strides(self) -> None:
         for tag in list(self._stride_searches):
             if self._asked_by(tag) is None:
@@ -263,16 +273,15 @@ class PlannerService:
             model_ns = self._planner.tree.times.model_ns
             self._worker.submit(self._finding_strides, search.step, self._post, model_ns)
 
-    def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
+    def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         if not self._listens or not self._sightings.receive(sighted, now_ns):
             return  # a tracker knows better
         seen = self._sightings.best(now_ns)
         for each in seen.values():
             for _, planner in self._planners:
-                planner.set_pose(pose_of(each), now_ns)
-        search = self._planner.target_search
-        if not seen and search is not None and 0 <= sighted.cell < self._cost_map.grid.cells:
-            search.remember(sighted, now_ns)
+                planner.on_sighting(pose_of(each), now_ns)
+        if not seen and 0 <= sighted.cell < self._cost_map.grid.cells:
+            self._search.remember(sighted, now_ns)
 
     def _tag(self, work: str, name: str) -> str:
         """What a piece of work for the planner of a class is called."""
@@ -284,11 +293,9 @@ class PlannerService:
         work, name, _ = tag.split("/")
         return self._planners.held(name) if tag == self._tag(work, name) else None
 
-    def _look(self, now_ns: int) -> None:
+    def _take_fleet(self, now_ns: int) -> None:
         """Take in where vehicles are, who would see a target that nobody tracks, or whose tracker is lost."""
-        search = self._planner.target_search
-        assert search is not None
-        if search.tracked:
+        if self._search.tracked:
             self._listen(self._planner.is_lost(now_ns))
         if not self._listens:
             return
@@ -296,7 +303,7 @@ class PlannerService:
             assert isinstance(heard.message, Fleet)
             self._presence.receive(heard.message, now_ns)
         self._presence.expire(now_ns)
-        search.hear_vehicles(*self._presence.columns())
+        self._search.hear_vehicles(*self._presence.columns())
 
     def _listen(self, listens: bool) -> None:
         """Hear from vehicles where they are and what they see, or do not."""
@@ -359,8 +366,7 @@ class PlannerService:
     def _pace(self, planner: Planner) -> None:
         """Set a planner's pace as it is ordered."""
         book, scenario = self._obedience.book, self._scenario
-        if planner.target_search is not None:
-            planner.target_search.time_scale = book.setting("time_scale", scenario.time_scale)
+        self._search.time_scale = book.setting("time_scale", scenario.time_scale)
         planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
             book.setting("planner.push_s", scenario.planner.push_s),

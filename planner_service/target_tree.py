@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any, Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from planner_service.tree.changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
-from planner_service.tree.strides import StrideSearch, StrideShelf, StrideUpkeep
+from planner_service.tree.strides import StrideNetwork, StrideSearch, StrideShelf, StrideUpkeep
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -62,12 +63,45 @@ class Update:
         return Update("window", window, cells, self.wants_full, repaired.repair_ns)
 
 
+class State(Enum):
+    """Where a tree stands. Whether its target stands on a cell that can be led to is `TargetTree.ready`.
+
+    =========  ===========================================  ====================================================
+    state      what it means                                what ends it
+    =========  ===========================================  ====================================================
+    STALE      of no use: before the first growth, or the   a growth, here or adopted: CURRENT
+               map changed while there was no target
+    CURRENT    it leads to the target as it was last told   a move that takes too long here: BEHIND; a map that
+                                                            has changed without a target, or too much: STALE
+    BEHIND     a full growth was left to the worker; until  the worker's tree is adopted: CURRENT; STALE as above
+               then it leads where it led
+    =========  ===========================================  ====================================================
+    """
+
+    STALE = "stale"
+    CURRENT = "current"
+    BEHIND = "behind"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """How a tree follows its target, decided before anything is done.
+
+    how   nothing; the whole tree, here or on the worker; an exact move; a window, and strides beyond it
+    half  how far the window reaches to every side of the target, cells; 0 if it has not moved
+    far   how far strides are grown, cells; no further than `half`: none are
+    """
+
+    how: Literal["nothing", "whole", "exact", "window"]
+    half: int = 0
+    far: int = 0
+
+
 class TargetTree:
     """The tree of one target under one strategy.
 
     target_cell  where the tree leads; None before the first update, or while it stands on a lethal or outside cell
     map_version  of the last update; -1 before the first
-    ready        whether routes can be given; if not, every route's status is NO_TARGET
     all_kernels  whether kernels beside those for whole trees may be called by now. While it says no, windows,
                  repairs and strides give way to whole trees, so that nothing waits for a compilation
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
@@ -92,7 +126,6 @@ class TargetTree:
     ) -> None:
         self.target_cell: int | None = None
         self.map_version = -1
-        self.ready = False
         self.last_gaps: NDArray[np.float64] = np.empty(0, np.float64)
         self._grid = grid
         self._all_kernels = all_kernels
@@ -102,12 +135,9 @@ class TargetTree:
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
         self._tree: AnyTree = CostToGoTree(self._costs)
-        # The tree is of no use and must be grown: before the first, and when the map changed without a target.
-        self._stale = True
+        self._state = State.STALE
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
-        # A full growth was left to the worker: until it is adopted, moves are not followed.
-        self._left_to_worker = False
         # The networks of strategies that thin far cells.
         self._strides = StrideUpkeep()
         self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
@@ -116,6 +146,11 @@ class TargetTree:
         self._bounds = LowerBounds(self._costs)
         # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
         self._is_better_bound = False
+
+    @property
+    def ready(self) -> bool:
+        """Whether routes can be given; if not, every route's status is NO_TARGET."""
+        return self.target_cell is not None
 
     @property
     def cost_grid(self) -> CostGrid:
@@ -148,34 +183,11 @@ class TargetTree:
         """
         changes = self._learn(pace, dirty)
         self.map_version = map_version
-        if not self._set_target(target_cell, changes):
-            return Update("none")
-        moved = target_cell != self._tree.root
-        if self._stale:
-            return self._grow_full(target_cell)
-        self._windows.moves += moved
-        row = self.strategy
-        whole = row.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact)
-        if whole and self.times.is_quick(self._grid.cells):
-            return self._grow_full(target_cell)
-        repaired = self._repair(changes)
-        if repaired is None:
-            return self._grow_full(target_cell)
-        done = repaired
-        if whole:
-            done = self._leave_to_worker()
-        elif row.on_move is OnMove.EXACT_MOVE and (moved or not self._tree.exact):
-            done = self._move_exactly(target_cell)
-        elif moved:
-            done = self._move(target_cell)
-        if self._is_full_due(done):
-            done = self._renew(done)
-        includes_repair = not moved and done.kind not in ("none", "full", "exact")
-        return done if repaired.kind == "none" or includes_repair else done.after(repaired)
+        return self._follow(target_cell, changes) if self._set_target(target_cell, changes) else Update("none")
 
     def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
         """A full growth for a worker, on the map as it was told last: see `growth_job`."""
-        leads_there = self.ready and not self._stale and self._tree.root == target_cell
+        leads_there = self.ready and self._state is not State.STALE and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
         return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces)
@@ -206,7 +218,9 @@ class TargetTree:
 
         dirty  covers every cell that changed since the snapshot of `grown` was taken
         """
-        self._job_out = self._left_to_worker = False
+        self._job_out = False
+        if self._state is State.BEHIND:
+            self._state = State.CURRENT
         first = not self._loaded
         changes = self._learn(pace, dirty)
         self.map_version = map_version
@@ -215,14 +229,10 @@ class TargetTree:
         if not self._set_target(target_cell, changes):
             return Update("none")
         since = self._costs.difference(grown.cell_cost, [self._grid.window] if first else dirty)
-        tree = self._tree
         if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
-            repaired = None if self._stale else self._repair(changes)
-            if repaired is None or self.times.is_quick(self._grid.cells):
-                return self._grow_full(target_cell)
-            return self._leave_to_worker() if target_cell != tree.root else repaired
+            return self._follow(target_cell, changes)
         in_pieces = self._in_pieces or not self.times.is_quick(self._grid.cells)  # as it is, if that takes long
-        tree = self._tree = grown.tree_on(self._costs, in_pieces)
+        self._tree = grown.tree_on(self._costs, in_pieces)
         self._windows.note_whole(grown.target_cell)
         self._is_better_bound = grown.heuristic is None
         if grown.heuristic is None:
@@ -230,19 +240,9 @@ class TargetTree:
         else:
             self._bounds.take(grown.heuristic)
             self._learn_bounds(since)
-        self._stale = False
-        moved = target_cell != tree.root
-        row = self.strategy
-        whole = moved and (row.on_move is OnMove.WHOLE_TREE or not tree.fine)
-        if whole and self.times.is_quick(self._grid.cells):
-            return self._grow_full(target_cell)
-        repaired = self._repair(since)
-        if repaired is None:
-            return self._grow_full(target_cell)
-        cells = self._grid.cells + repaired.cells
-        follow = self._move_exactly if row.on_move is OnMove.EXACT_MOVE else self._move
-        then = self._leave_to_worker() if whole else follow(target_cell) if moved else repaired
-        return Update("full", self._grid.window, cells + then.cells * moved, then.wants_full)
+        self._state = State.CURRENT
+        then = self._follow(target_cell, since)
+        return Update("full", self._grid.window, self._grid.cells + then.cells, then.wants_full)
 
     def force(self, cells: Any) -> Update:
         """Force the range to cover these cells (section 3.3.2): what they get afterwards is the best there is.
@@ -312,28 +312,106 @@ class TargetTree:
 
     def _set_target(self, target_cell: int, changes: Changes | None) -> bool:
         """Whether the target stands where a tree can lead. If not, the tree is stale as soon as the map changes."""
-        self.ready = can_be_root(self._costs, target_cell)
-        self.target_cell = target_cell if self.ready else None
+        self.target_cell = target_cell if can_be_root(self._costs, target_cell) else None
         if not self.ready and (changes is None or changes.cells.size):
-            self._stale = True
+            self._state = State.STALE
         return self.ready
 
-    def _leave_to_worker(self) -> Update:
-        """Ask for a full growth, and lead to the old root until it is adopted."""
-        self.target_cell = self._tree.root
-        self._left_to_worker = True
+    def _follow(self, target_cell: int, changes: Changes | None) -> Update:
+        """Bring the tree up to date with the map, then with its target: decide, and do it."""
+        if self._state is State.STALE:
+            return self._grow_full(target_cell)
+        self._windows.moves += target_cell != self._tree.root
+        grows_anew = self.strategy.on_move is OnMove.WHOLE_TREE and self._is_quick
+        if grows_anew and self._decide(target_cell).how == "whole":
+            return self._grow_full(target_cell)
+        repaired = self._repair(changes)
+        if repaired is None:
+            return self._grow_full(target_cell)
+        done = self._perform(self._decide(target_cell), target_cell)
+        if self._is_full_due(done):
+            done = self._renew(done)
+        return done if repaired.kind == "none" else done.after(repaired)
+
+    def _decide(self, target_cell: int) -> Decision:
+        """How to lead to the target's cell from the tree that there is."""
+        tree, row = self._tree, self.strategy
+        moved = target_cell != tree.root
+        if not moved and (tree.exact or not row.is_exact):
+            return Decision("nothing")
+        if row.on_move is OnMove.WHOLE_TREE or self._state is State.BEHIND:
+            return Decision("whole")
+        if row.on_move is OnMove.EXACT_MOVE:
+            # To cut a tree into pieces, or to write a cost into every cell of one, takes as long as to grow it.
+            cuts = self._in_pieces and not isinstance(tree, PieceTree) and not self._is_quick
+            if not self._can_mend or cuts:
+                return Decision("whole")
+            return Decision("exact", exact_half(self._grid, tree.root, target_cell) if moved else 0)
+        if isinstance(tree, PieceTree) and not self._is_quick:
+            return Decision("whole")
+        return Decision("window", *self._windows.after_move(row, tree.root, target_cell, self._network is not None))
+
+    def _perform(self, decision: Decision, target_cell: int) -> Update:
+        """Do what was decided; where it does not lead to the target, grow the whole tree."""
+        if decision.how == "exact" and self._in_pieces:
+            self._tree = in_pieces(self._tree)
+        elif decision.how == "window":
+            self._tree = self._prepared(in_cells(self._tree))
+        if decision.how == "nothing":
+            return Update("none")
+        if decision.how == "whole" or not self._tree.fine:
+            return self._grow_or_leave(target_cell)
+        window, cells = None, 0
+        if decision.half:
+            window, cells = self._grow_window(target_cell, decision.half)
+            if window is None:
+                return self._grow_or_leave(target_cell)
+        if decision.how == "exact":
+            mended = self._mend()
+            return Update(mended.kind, mended.window, mended.cells + cells, mended.wants_full)
+        assert window is not None
+        if self._network is not None and decision.far > decision.half and isinstance(self._tree, CostToGoTree):
+            self._windows.note_window(target_cell, decision.far)
+            cells += self._tree.grow_strides(window, self._network, decision.far)
+            return Update("coarse", self._grid.around(target_cell, decision.far), cells)
+        return Update("window", window, cells)
+
+    @property
+    def _is_quick(self) -> bool:
+        """Whether a whole tree may be grown here."""
+        return self.times.is_quick(self._grid.cells)
+
+    @property
+    def _network(self) -> StrideNetwork | None:
+        return self._strides.network
+
+    def _prepared(self, tree: CostToGoTree) -> CostToGoTree:
+        """A tree before a window makes its costs upper bounds: they are taken for a heuristic if they are exact."""
+        if tree.fine:
+            if not tree.precise:
+                tree.relabel()
+            if self._is_better_bound and tree.exact:
+                self._bounds.take(tree.cost.copy())
+            self._is_better_bound = False
+        return tree
+
+    def _grow_or_leave(self, target_cell: int) -> Update:
+        """Grow the whole tree here, or leave that to the worker and lead to the old root until it is adopted."""
+        if self._is_quick and self._state is not State.BEHIND:
+            return self._grow_full(target_cell)
+        self.target_cell, self._state = self._tree.root, State.BEHIND
         return Update("none", wants_full=not self._job_out)
 
     def _grow_full(self, target_cell: int) -> Update:
         """Grow the whole tree: here or, where that would take too long, on the worker. The one that there is serves
         no more."""
-        if not self.times.is_quick(self._grid.cells):
-            self._stale, self.ready, self.target_cell = True, False, None
+        if not self._is_quick:
+            self._state, self.target_cell = State.STALE, None
             return Update("none", wants_full=not self._job_out)
         if isinstance(self._tree, PieceTree) is not self._in_pieces:
             self._tree = empty_tree(self._costs, self._in_pieces)
         self._tree.grow(target_cell)
-        self._stale = False
+        self._state = State.CURRENT
         self._windows.note_whole(target_cell)
         self._bounds_are_old()
         return Update("full", self._grid.window, self._grid.cells)
@@ -375,7 +453,7 @@ class TargetTree:
         tree = self._tree
         cells = tree.mend()
         if not tree.exact:
-            if not tree.fine or self.times.is_quick(self._grid.cells):
+            if not tree.fine or self._is_quick:
                 return self._grow_full(tree.root)
             return Update("window", self._grid.window, cells, wants_full=not self._job_out)
         self._windows.note_whole(tree.root)
@@ -384,52 +462,10 @@ class TargetTree:
 
     def _renew(self, done: Update) -> Update:
         """The whole tree is due, after what was `done`."""
-        if not self._can_mend or self._left_to_worker:
+        if not self._can_mend or self._state is State.BEHIND:
             return Update(done.kind, done.window, done.cells, wants_full=True)
         mended = self._mend()
         return Update(mended.kind, mended.window, done.cells + mended.cells, mended.wants_full)
-
-    def _move_exactly(self, target_cell: int) -> Update:
-        """Lead to the target's new cell, exactly."""
-        if self._left_to_worker or not self._can_mend:
-            return self._leave_to_worker() if self._left_to_worker else self._give_up(target_cell)
-        if self._in_pieces and not isinstance(self._tree, PieceTree):
-            if not self.times.is_quick(self._grid.cells):
-                return self._leave_to_worker()
-            self._tree = in_pieces(self._tree)
-        cells = 0
-        if target_cell != self._tree.root:
-            half = exact_half(self._grid, self._tree.root, target_cell)
-            window, cells = self._grow_window(target_cell, half)
-            if window is None:
-                return self._give_up(target_cell)
-        mended = self._mend()
-        return Update(mended.kind, mended.window, mended.cells + cells, mended.wants_full)
-
-    def _move(self, target_cell: int) -> Update:
-        """Grow a window around the target's new cell, a wider one where that fails, at last the whole tree."""
-        if isinstance(self._tree, PieceTree) and not self.times.is_quick(self._grid.cells):
-            return self._leave_to_worker()  # a tree with a cost in every cell takes as long as to grow one
-        self._tree = tree = in_cells(self._tree)
-        if self._left_to_worker or not (tree.fine or self.times.is_quick(self._grid.cells)):
-            return self._leave_to_worker()
-        if not tree.fine:
-            return self._grow_full(target_cell)
-        if not tree.precise:
-            tree.relabel()
-        if self._is_better_bound and tree.exact:
-            self._bounds.take(tree.cost.copy())
-        self._is_better_bound = False
-        network = self._strides.network
-        half, far = self._windows.after_move(self.strategy, tree.root, target_cell, network is not None)
-        window, cells = self._grow_window(target_cell, half)
-        if window is None:
-            return self._give_up(target_cell)
-        if network is not None and far > half:
-            self._windows.note_window(target_cell, far)
-            cells += tree.grow_strides(window, network, far)
-            return Update("coarse", self._grid.around(target_cell, far), cells)
-        return Update("window", window, cells)
 
     def _grow_window(self, target_cell: int, half: int) -> tuple[Window | None, int]:
         """Lead to the target's new cell by a window that reaches so far to every side, or further where that does
@@ -446,10 +482,6 @@ class TargetTree:
             half *= 2
             window = self._grid.around(target_cell, half)
         return None, cells
-
-    def _give_up(self, target_cell: int) -> Update:
-        """No window leads to the target's new cell."""
-        return self._grow_full(target_cell) if self.times.is_quick(self._grid.cells) else self._leave_to_worker()
 
     def _is_full_due(self, done: Update) -> bool:
         """Whether the whole tree is due after what was done, unless a growth is under way."""

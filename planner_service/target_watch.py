@@ -66,7 +66,7 @@ class TargetWatch:
         """Whether nobody tracks the target now."""
         return self._tracking.lost(now_ns)
 
-    def hear(self, pose: TargetPose, now_ns: int) -> None:
+    def on_pose(self, pose: TargetPose, now_ns: int) -> None:
         """A tracker tells a pose of the target."""
         before, heard_ns = self._tracking.pose, self._tracking.heard_ns
         verdict = self._tracking.on_pose(pose, now_ns)
@@ -83,14 +83,14 @@ class TargetWatch:
             said = f"{_name(pose)} puts it into {cell}, outside of the terrain of {shape}: not used"
             self._name_once("pose-outside", pose, said)
 
-    def see(self, pose: TargetPose, now_ns: int) -> None:
+    def on_sighting(self, pose: TargetPose, now_ns: int) -> None:
         """The best sighting of a target that has no tracker."""
         before = self._tracking.pose
         self._tracking.place(pose, now_ns)
         if self._tracking.pose is not before:
             self._found("a vehicle sees it", now_ns)
 
-    def take_told(self, now_ns: int) -> list[Tell]:
+    def drain(self, now_ns: int) -> list[Tell]:
         """What people should know, since the last call."""
         if not self._lost and self._tracking.lost(now_ns):
             self._lose(now_ns)

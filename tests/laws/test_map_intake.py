@@ -60,7 +60,7 @@ class Watched:
         told = TargetPose(
             target="t0", tracker="radar", incarnation=1, seq=self.seq, stamp_ns=0, cell=cell, x_m=0, y_m=0
         )
-        self.planner.hear_pose(told, self.now_ns)
+        self.planner.on_pose(told, self.now_ns)
 
     def mark(self) -> None:
         cells = self.rng.integers(0, self.grid.cells, int(self.rng.integers(1, 3)))
@@ -82,7 +82,7 @@ class Watched:
         self.now_ns += TICK
         cells: list[Any] = [("a", int(self.rng.integers(self.grid.cells)))]
         if self.rng.integers(3) == 0:
-            self.planner.hear_chasers(chasers(*cells, stamp_ns=self.now_ns), self.now_ns)
+            self.planner.on_chasers(chasers(*cells, stamp_ns=self.now_ns), self.now_ns)
         for action in self.planner.tick(self.now_ns):
             if isinstance(action, PushedRoute):
                 self.check(action.route)
@@ -140,7 +140,7 @@ class Searched(Watched):
             cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
             x_m, y_m = grid.centre_m(cell)
             seen = TargetPose(target="t0", incarnation=1, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m)
-            self.planner.set_pose(seen, 0)
+            self.planner.on_sighting(seen, 0)
             east_m, south_m = np.array([x_m - grid.west_m]), np.array([grid.north_m - y_m])
             search.hear_vehicles(east_m.astype(np.float32), south_m.astype(np.float32))
         while not search.active:

@@ -157,7 +157,7 @@ class World:
 
     def pose(self, row: int, col: int, seq: int = 1, incarnation: int = 1) -> None:
         cell = GRID.cell(row, col)
-        self.planner.hear_pose(pose(cell, seq, incarnation), self.now_ns)
+        self.planner.on_pose(pose(cell, seq, incarnation), self.now_ns)
 
     def mark(self, *cells: int, stamp_ns: int | None = None) -> None:
         kinds = np.full(len(cells), MarkKind.LETHAL, np.uint8)
@@ -180,7 +180,7 @@ class World:
 
     def chasers(self, *vehicles: tuple[str, int], target: str = "t0", stamp_ns: int | None = None) -> None:
         told = chasers(*vehicles, target=target, stamp_ns=self.now_ns if stamp_ns is None else stamp_ns)
-        self.planner.hear_chasers(told, self.now_ns)
+        self.planner.on_chasers(told, self.now_ns)
 
     def grow(self, action: Action, took_ns: int = 5_000_000) -> list[Action]:
         """Do a growth that was asked for."""

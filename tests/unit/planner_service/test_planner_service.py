@@ -302,7 +302,7 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
         pace[row + 1, 199 if row % 4 == 0 else 0] = 0.1
     tree = TargetTree(GridSpec(200, 200, RES), PlannerConfig())
     planner = Planner("t", 1, PlannerConfig(), tree, CostMap(terrain_of_pace(pace, RES)), Counters())
-    planner.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0), 0)
+    planner.on_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0), 0)
     planner.tick(0)
     whole = planner.answer(RouteRequest(cells=[198 * 200]), 0)
     assert isinstance(whole, RouteReply)
@@ -325,7 +325,7 @@ def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
     def stand(col: int, seq: int, now_ns: int) -> None:
         cell = GRID.cell(20, col)
         pose = TargetPose(target="t", incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
-        planner.hear_pose(pose, now_ns)
+        planner.on_pose(pose, now_ns)
         planner.tick(now_ns)
 
     stand(20, 1, 0)

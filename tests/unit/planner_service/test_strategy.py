@@ -246,3 +246,15 @@ def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_
     monkeypatch.setattr(actions, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
     update = tree.adopt(grown, pace, grid.cell(100, 102), [], 0, np.empty(0, np.int64))
     assert (tree.target_cell, update.wants_full) == (grid.cell(100, 101), True)
+
+
+@pytest.mark.parametrize("tick_hz", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("cpu_budget", [0.05, 0.5, 1.0])
+def test_work_and_the_rest_after_it_keep_to_the_share_of_a_core_whatever_the_ticks(
+    tick_hz: float, cpu_budget: float
+) -> None:
+    config = PlannerConfig(cpu_budget=cpu_budget, tick_hz=tick_hz)
+    times = GrowthTimes(GridSpec(64, 64, 10.0), config, True, False, None)
+    assert times.rest_ns(10_000_000) == pytest.approx(10_000_000 / cpu_budget, abs=1)
+    times.set_budget(cpu_budget / 2)
+    assert times.rest_ns(10_000_000) == pytest.approx(20_000_000 / cpu_budget, abs=1)

@@ -39,12 +39,12 @@ class Watch:
             target="t0", tracker=tracker, incarnation=START_NS, seq=self.seq, stamp_ns=self.now_ns, cell=cell,
             x_m=x_m, y_m=y_m,
         )  # fmt: skip
-        self.watch.hear(msgspec.structs.replace(pose, **changes), self.now_ns)
+        self.watch.on_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
 
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
             self.now_ns += TICK_NS
-            self.told += self.watch.take_told(self.now_ns)
+            self.told += self.watch.drain(self.now_ns)
 
     def counted(self) -> dict[str, int]:
         return {name: count for name, count in self.counters.counts.items() if count}
@@ -169,13 +169,13 @@ def test_losing_and_regaining_are_said_each_time_with_the_reason() -> None:
 def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> None:
     here = Watch()
     seen = TargetPose(target="t0", incarnation=0, seq=1, stamp_ns=START_NS, lease_s=30.0, cell=5, x_m=0.0, y_m=0.0)
-    here.watch.see(seen, here.now_ns)
+    here.watch.on_sighting(seen, here.now_ns)
     here.tick(299)
-    here.watch.see(seen, here.now_ns)  # the same once more: it is as old as it is
+    here.watch.on_sighting(seen, here.now_ns)  # the same once more: it is as old as it is
     assert here.told == []
     here.tick()
     assert here.sentences() == ["target t0: no vehicle has seen it for 30.0 s; it is searched for"]
-    here.watch.see(msgspec.structs.replace(seen, seq=2), here.now_ns)
+    here.watch.on_sighting(msgspec.structs.replace(seen, seq=2), here.now_ns)
     here.tick()
     assert here.told[-1].kind == "tracker-back"
 
