@@ -509,8 +509,8 @@ class Planner:
         return pushes
 
     def _places_to_push(self, searcher: Searcher, now_ns: int) -> list[Action]:
-        """Reassigns search places of vehicles whose place costs more than it is worth, or which still follow a route
-        to the last pose."""
+        """Reassigns search places of vehicles whose place costs more than it is worth, or which still follow a
+        route to the last pose."""
         pushes: list[Action] = []
         searcher.forget_all_but(self._ways, self.followers.ids())
         for id, follower in self.followers.all_items():

@@ -75,11 +75,6 @@ class StrategyRow:
         """Whether the tree is exact after every move."""
         return self.on_move in (OnMove.WHOLE_TREE, OnMove.EXACT_MOVE)
 
-    @property
-    def grows_whole_trees(self) -> bool:
-        """Whether whole trees are grown without a vehicle's asking: with every move, in turn, or for networks."""
-        return self.is_exact or self.full_growth is not FullGrowth.WHEN_FORCED or self.thins_far_cells
-
     def row(self, growths: Growths) -> StrategyRow:
         """Itself: a strategy of one row."""
         return self

@@ -190,11 +190,6 @@ class CostGrid:
         padded: Cells = (rows + 1) * self.stride + cols + 1
         return padded
 
-    def unpad_all(self, padded: Cells) -> Cells:
-        rows, cols = np.divmod(padded, self.stride)
-        cells: Cells = (rows - 1) * self.grid.cols + cols - 1
-        return cells
-
     def load(self, pace: Floats) -> None:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative; the grid is then as it
         was.

@@ -280,12 +280,6 @@ class CostToGoTree:
         """Whether one more window can be merged without losing a cell's cost in the rounding of the offset."""
         return self.fine and self.offset <= FINE / 8 * self.cost_grid.lowest_cell_cost
 
-    def inner(self, padded: NDArray[np.generic]) -> NDArray[np.generic]:
-        """The (rows, cols) view of a padded array."""
-        grid = self.cost_grid.grid
-        view: NDArray[np.generic] = padded.reshape(grid.rows + 2, self.cost_grid.stride)[1:-1, 1:-1]
-        return view
-
 
 def _most_repaired(cells: int) -> tuple[int, int, int]:
     """How much a repair may do before it gives way to a growth.

@@ -165,13 +165,6 @@ class StrideUpkeep:
             self.network = None
 
 
-def find_strides(cost_grid: CostGrid) -> StrideNetwork:
-    """The networks of a map, at once."""
-    network = StrideSearch(cost_grid).run().network
-    assert network is not None
-    return network
-
-
 def one_stride(cost_grid: CostGrid, stride: int) -> tuple[NDArray[np.uint32], Links]:
     """The centres of the nodes of one stride, padded cells, and its links: searched on all cells of the map."""
     return _find_stride(cost_grid, stride, _all_cells(cost_grid), np.empty(0, np.int64), 0)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
 from support.fields import make_field, paces_of_any_ratio
+from support.kernel_oracle import inner
 from support.planner_strategies import RULES, STRATEGIES
 
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
@@ -57,11 +58,11 @@ def said_cost(pace: np.ndarray, resolution_m: float, weight: float) -> np.ndarra
 
 
 def assert_exact(ground: CostGrid, tree: CostToGoTree, target: int, rules: dict) -> None:
-    costs = tree.inner(ground.cell_cost)
+    costs = inner(tree, ground.cell_cost)
     best = naive.cost_to_go(costs, target, **rules)
     # Each step is rounded by 2^-23 at most, where costs drown in others; and so is the product before.
     np.testing.assert_allclose(
-        tree.inner(tree.cost), np.where(np.isfinite(costs), best, np.inf), rtol=(costs.size + 2) * 2**-23
+        inner(tree, tree.cost), np.where(np.isfinite(costs), best, np.inf), rtol=(costs.size + 2) * 2**-23
     )
 
 
@@ -75,8 +76,8 @@ def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> 
         tree = CostToGoTree(ground)
         target = int(np.flatnonzero(np.isfinite(paces))[1500])
         tree.grow(target)
-        best = naive.cost_to_go_in_float32(tree.inner(ground.cell_cost), target, **rules)
-        np.testing.assert_array_equal(tree.inner(tree.cost), best)
+        best = naive.cost_to_go_in_float32(inner(tree, ground.cell_cost), target, **rules)
+        np.testing.assert_array_equal(inner(tree, tree.cost), best)
         assert tree.reach >= best[np.isfinite(best)].max()
         starts = ground.pad_all(np.flatnonzero(np.isfinite(best) & (best > 0)))
         walks = ground.walk(tree.parent, ground.pad(target), starts, 0, ground.cell_cost)
@@ -99,7 +100,7 @@ def test_a_tree_is_exact_on_any_paces_after_any_marks(
         ground.load(pace)
         tree = CostToGoTree(ground)
         for _ in range(data.draw(st.integers(1, 4))):
-            costs = tree.inner(ground.cell_cost)
+            costs = inner(tree, ground.cell_cost)
             with np.errstate(all="ignore"):
                 np.testing.assert_allclose(costs, said_cost(pace, resolution_m, weight), rtol=1e-6, atol=1e-38)
             finite = costs[np.isfinite(costs)]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.effort import few
+from support.kernel_oracle import inner
 from support.planner_strategies import random_pace
 from support.slow_twins import lower_bound
 from support.tree_lives import Findings, Life, lives
@@ -155,7 +156,7 @@ def test_an_exact_tree_in_pieces_proves_all_but_what_its_pieces_may_lack() -> No
 @pytest.mark.parametrize("seed", range(3))
 def test_of_any_cells_it_is_said_whether_there_is_a_route_and_each_is_read_as_alone(seed: int, most: int) -> None:
     tree, pace = a_tree(seed)
-    bounds, cost = LowerBounds(tree.cost_grid), tree.inner(tree.cost).reshape(-1)
+    bounds, cost = LowerBounds(tree.cost_grid), inner(tree, tree.cost).reshape(-1)
     asked = np.random.default_rng(seed).integers(-9, GRID.cells + 9, 300)
     asked[-1] = tree.root
     batch = read_routes(tree, bounds, asked, most)

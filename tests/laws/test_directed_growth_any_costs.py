@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from support import slow_twins as naive
+from support.kernel_oracle import inner
 from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.kernels.directed_buckets import grow_directed_by_buckets, make_scratch
@@ -53,7 +54,7 @@ def planned(draw: Paces, seed: int, rows: int, cols: int) -> tuple[CostToGoTree,
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     tree = CostToGoTree(costs)
     tree.grow(root)
-    best = naive.cost_to_go_in_float32(tree.inner(costs.cell_cost), root, climb=climb, **RULES[seed % 5])
+    best = naive.cost_to_go_in_float32(inner(tree, costs.cell_cost), root, climb=climb, **RULES[seed % 5])
     return tree, best, root
 
 
@@ -61,7 +62,7 @@ def planned(draw: Paces, seed: int, rows: int, cols: int) -> tuple[CostToGoTree,
 def test_costs_are_exact_to_the_last_bit_and_parents_lead_to_the_root(ground: str) -> None:
     seed = sorted(GROUNDS).index(ground)
     tree, best, root = planned(GROUNDS[ground], seed, 19, 23)
-    cost, parent, costs = tree.inner(tree.cost), tree.inner(tree.parent), tree.cost_grid
+    cost, parent, costs = inner(tree, tree.cost), inner(tree, tree.parent), tree.cost_grid
     np.testing.assert_array_equal(cost, best)
     assert tree.reach >= best[np.isfinite(best)].max()
     # Each parent offers what the cell costs, and 23 * 19 steps along them end at the root.
@@ -87,7 +88,7 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
     cost = np.empty(costs.size, np.float32)
     scratch = make_scratch(costs.size)
     grow_directed_by_buckets(costs.padded, cost, costs.pad(root), costs.climbs, width, True, scratch)
-    np.testing.assert_array_equal(tree.inner(cost), best)
+    np.testing.assert_array_equal(inner(tree, cost), best)
 
 
 def test_no_costs_make_a_growth_many_times_as_long() -> None:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
+from support.kernel_oracle import find_strides, inner
 from support.planner_play import Play
 from support.planner_strategies import (
     RULES,
@@ -28,7 +29,6 @@ from support.planner_strategies import (
 from support.repaired_tree import FACTORS, Patchwork
 
 from planner_service.kernels.layout import NONE
-from planner_service.tree.strides import find_strides
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
@@ -96,7 +96,7 @@ def test_growth_equals_scipys(seed: int) -> None:
     tree = ground.tree
     best = naive.cost_to_go(ground.pace, ground.root, **RULES[seed % 5], climb=ground.climb)
     best[~np.isfinite(ground.pace)] = np.inf
-    np.testing.assert_allclose(tree.inner(tree.cost), best, rtol=3e-6)
+    np.testing.assert_allclose(inner(tree, tree.cost), best, rtol=3e-6)
     assert np.isinf(best[np.isfinite(ground.pace)]).any() or seed % 3 < 2
 
 

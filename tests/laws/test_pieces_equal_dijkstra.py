@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import slow_twins as naive
 from support.effort import few
+from support.kernel_oracle import unpadded
 from support.planner_play import Play
 from support.planner_strategies import RULES, random_pace
 
@@ -135,7 +136,7 @@ class Chase:
         np.testing.assert_allclose(walks.driven, cost[given][some], rtol=FINE)
         end = 0
         for start, stop in zip(starts[some][:20], walks.ends[:20], strict=True):
-            cell = int(self.ground.unpad_all(np.array([start]))[0])
+            cell = int(unpadded(self.ground, np.array([start]))[0])
             steps = walks.directions[end:stop].tobytes()
             assert naive.follow(self.pace, cell, steps, **self.rules) is not None, "a step that no rule allows"
             end = stop
@@ -261,7 +262,7 @@ def test_what_loses_its_way_and_has_it_again_is_looked_at_along_its_edge_only() 
         start = ground.pad_all(np.flatnonzero(np.isfinite(pace.reshape(-1)[: far + 1]))[-1:])
         steps = int(ground.walk(tree.parent, ground.pad(root), start, 0, ground.cell_cost).ends[0])
         trunk = ground.walk(tree.parent, ground.pad(root), start, steps - 60, ground.cell_cost).last
-        row, col = divmod(int(ground.unpad_all(trunk)[0]), cols)
+        row, col = divmod(int(unpadded(ground, trunk)[0]), cols)
         pace[row, col] = np.inf
         tree.repair(ground.apply(pace, [Window(row, col, row + 1, col + 1)]))
         assert tree.exact

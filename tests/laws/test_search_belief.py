@@ -10,6 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.effort import few
+from support.kernel_oracle import inner
 
 from planner_service.search.belief import Belief, blocks_of
 from planner_service.search.search_routes import Ways
@@ -239,7 +240,7 @@ def test_a_target_is_never_taken_to_be_where_it_is_not_because_it_came_there_by_
     ways.grow(goal)
     if goal == start or np.isinf(ways.costs_s.flat[start]):
         return
-    took_s = 3.0 * float(tree.inner(tree.cost)[divmod(start, cols)])
+    took_s = 3.0 * float(inner(tree, tree.cost)[divmod(start, cols)])
     searcher = Searcher(ways, range_m, 3.0, "s")
     searcher.begin(pace, start, took_s * (1 + 1e-5))
     assert searcher.belief is not None

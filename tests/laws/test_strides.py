@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from support import slow_twins as naive
+from support.kernel_oracle import find_strides, inner, unpadded
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import stride_growth
 from planner_service.tree import cost_to_go, strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.strides import StrideNetwork, find_strides
+from planner_service.tree.strides import StrideNetwork
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -95,7 +96,7 @@ def _way(ground: Ground, n: int, link: int) -> list[int]:
 def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     centre, doublings = ground.network.arrays[:2]
-    cells = ground.costs.unpad_all(centre.astype(np.int64))
+    cells = unpadded(ground.costs, centre.astype(np.int64))
     links = _links(ground.network)
     for level in np.unique(doublings):
         label = ground.labels(1 << int(level))
@@ -113,7 +114,7 @@ def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: i
 def test_a_links_way_is_of_legal_steps_inside_its_two_nodes(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     legal = {(u, v) for u, v, _ in ground.steps}
-    cells = ground.costs.unpad_all(ground.network.arrays[0].astype(np.int64))
+    cells = unpadded(ground.costs, ground.network.arrays[0].astype(np.int64))
     doublings = ground.network.arrays[1].astype(int)
     labels = {level: ground.labels(1 << level) for level in set(doublings)}
     for a, b, link in _links(ground.network):
@@ -130,7 +131,7 @@ def test_a_links_way_is_of_legal_steps_inside_its_two_nodes(seed: int, rules: di
 def test_at_the_least_stride_a_links_way_is_the_cheapest_through_one_step(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     centre, doublings, *_ = ground.network.arrays
-    cells = ground.costs.unpad_all(centre.astype(np.int64))
+    cells = unpadded(ground.costs, centre.astype(np.int64))
     label, pace = ground.labels(2), ground.pace.reshape(-1).astype(float)
     inside: dict[int, list[tuple[int, float]]] = {}
     for u, v, cost in ground.steps:
@@ -194,7 +195,7 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
     lowest, by, place = kept[0][3], kept[0][4], kept[0][2]
     assert (place == -1).all()
     centre, doublings, *_ = ground.network.arrays
-    cells = ground.costs.unpad_all(centre.astype(np.int64))
+    cells = unpadded(ground.costs, centre.astype(np.int64))
     row, col = np.divmod(np.arange(rows * cols), cols)
     away = np.maximum(abs(row - root // cols), abs(col - root % cols))
     window = ground.costs.grid.around(root, half)
@@ -204,7 +205,7 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
         root % cols - window.col0,
         window.col1 - 1 - root % cols,
     )
-    has_way = np.isfinite(tree.inner(tree.cost).reshape(-1))
+    has_way = np.isfinite(inner(tree, tree.cost).reshape(-1))
     # A way over cells further than `far` may be the only one: then nothing is promised.
     if far < max(away):
         return

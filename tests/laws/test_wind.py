@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from support.effort import few
+from support.kernel_oracle import inner
 from support.segments import crossed
 
 from planner_service.pulled_routes import Puller
@@ -137,7 +138,7 @@ def test_trees_and_ways_back_in_wind_are_scipys_over_the_wind_triangle(
     tree = CostToGoTree(costs)
     tree.grow(0)
     to_target = dijkstra(edges.T, indices=0)
-    np.testing.assert_allclose(tree.inner(tree.cost).reshape(-1), to_target, rtol=ROUNDED)
+    np.testing.assert_allclose(inner(tree, tree.cost).reshape(-1), to_target, rtol=ROUNDED)
     ways = Ways(costs)
     ways.grow(0)
     from_vehicle = dijkstra(edges, indices=0)

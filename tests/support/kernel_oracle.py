@@ -8,11 +8,31 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.strides import StrideNetwork, StrideSearch
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 RATIOS = (1.0, 2.0, 10.0, 100.0, 1e4, 1e6, 1e9)
 WALLS = (0.0, 0.1, 0.25, 0.45)
+
+
+def inner(tree: CostToGoTree, padded: np.ndarray) -> np.ndarray:
+    """The (rows, cols) view of a padded array."""
+    grid = tree.cost_grid.grid
+    return padded.reshape(grid.rows + 2, grid.cols + 2)[1:-1, 1:-1]
+
+
+def unpadded(cost_grid: CostGrid, padded: np.ndarray) -> np.ndarray:
+    """The cells of the grid of padded ones."""
+    rows, cols = np.divmod(padded, cost_grid.stride)
+    return (rows - 1) * cost_grid.grid.cols + cols - 1
+
+
+def find_strides(cost_grid: CostGrid) -> StrideNetwork:
+    """The networks of a map, at once."""
+    network = StrideSearch(cost_grid).run().network
+    assert network is not None
+    return network
 
 
 def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
@@ -25,7 +45,7 @@ def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
 
 def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict, rtol: float = 1e-5) -> None:
     tree = grown(pace, target, rules)
-    mine, parents = tree.inner(tree.cost), tree.inner(tree.parent)
+    mine, parents = inner(tree, tree.cost), inner(tree, tree.parent)
     best = naive.cost_to_go(pace, target, **rules)
     np.testing.assert_allclose(mine, np.where(np.isfinite(pace), best, np.inf), rtol=rtol)
     # Every reachable cell's parent is a neighbour whose offer is what the cell costs.

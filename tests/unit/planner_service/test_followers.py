@@ -148,7 +148,7 @@ def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None
 
 
 def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
-    """Of a route cut after 8 steps to the east, whose rest is told: it goes on, and so does what the tree says now."""
+    """Of a route cut after 8 steps to the east, which goes on beyond them."""
     followers, start = Followers("t", GRID, 10, 0), GRID.cell(5, 5)
     cut = Route(status=RouteStatus.OK, start=start, directions=bytes([2] * 8), cost_s=9.0, remaining_s=5.0)
     followers.given("v", cut, 8, 0, 0)
@@ -159,7 +159,8 @@ def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
         return followers.is_news(follower, RouteOutline(RouteStatus.OK, start + driven, directions, 5.0))
 
     assert [driven for driven in range(9) if is_news(driven)] == [5, 6, 7, 8]
-    assert is_news(0, 3) and is_news(4, 3, 3, 3, 3, 3)  # other steps are news at once
+    assert is_news(0, 3)  # other steps are news at once
+    assert is_news(4, 3, 3, 3, 3, 3)
 
 
 @pytest.mark.parametrize("away", range(4))
@@ -168,7 +169,7 @@ def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
 def test_a_change_concerns_routes_through_it_and_in_the_row_or_column_beside_it(
     away: int, side: int, across: bool
 ) -> None:
-    """One route along a row, or a column; a changed cell so far from it. A diagonal step depends on cells beside it."""
+    """A diagonal step depends on the cells beside it."""
     followers, directions = Followers("t", GRID, 10, 0), bytes([4 if across else 2] * 6)
     route = Route(status=RouteStatus.OK, start=GRID.cell(7, 7), directions=directions, cost_s=1.0)
     followers.given("v", route, 0, 0, 0)

@@ -8,13 +8,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from support.kernel_oracle import find_strides
 from support.planner_strategies import random_pace
 
 from planner_service.prepared_costs import PreparedCosts, prepared_costs
 from planner_service.target_tree import TargetTree
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.strides import StrideSearch, find_strides
+from planner_service.tree.strides import StrideSearch
 from shared_map.terrain.store import fetch_kept, keep, load_prepared, save_prepared
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import PlannerConfig

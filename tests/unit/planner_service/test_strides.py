@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
+from support.kernel_oracle import find_strides
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
@@ -19,7 +20,6 @@ from planner_service.strategy import AHEAD, STAGES, Auto, Growths
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.strides import find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
