@@ -1,4 +1,38 @@
-"""Cost map to tree to route: one process per target. The same without a process, a network or a file:
+"""Cost map to tree to route: one process per target.
+
+What a planner promises: every route that it gives leads over passable cells of the map as it knows it, and states a
+proven lower bound of what any route costs. How it keeps to that, step by step:
+
+1. *Map.* Marks come in by replication; the cost map says which windows have changed (`service`, `planner`).
+2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
+3. *Repair.* Costs that have risen detach what hung on them, costs that have fallen spread (`kernels.repair`).
+4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
+   costs are made exact by the parents (`kernels.mend`, or `kernels.partition*` on large maps). Where that takes too
+   long for the thread that answers, a worker grows the whole tree. `target_tree.Decision` is what was decided, by
+   the row of the strategy (`strategy`) and by what growths have taken (`growth_times`).
+5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered
+   with the map, and the last window adds its rim (`tree.certificates`, docs/certificates.md).
+6. *Push.* Followers whose route passes a change, or begins in what was grown, are pushed another one if it is news.
+
+What a planner is doing, and what changes that:
+
+============  ==============================================  =====================================================
+state         what it answers                                 what ends it
+============  ==============================================  =====================================================
+without tree  NO_TARGET; a query waits for a second at most   the first growth: current
+current       routes to where the target is                   a move that takes too long here: behind; a map that
+                                                              has changed while no tree can lead to the target:
+                                                              without tree; a tracker lost for 30 s, or a target
+                                                              that vehicles do not see where it was: searching
+behind        routes to where the tree led; a worker grows    its tree is adopted, and what has happened since is
+                                                              made up for: current
+searching     routes to places where to look, SEARCHING       a sighting or a pose: current
+standby       as above, but it pushes nothing                 the leader falls silent: it leads, and pushes a route
+                                                              to every follower
+============  ==============================================  =====================================================
+
+The tree's own states are `target_tree.State`; whether a search is under way is `search.target_search`'s, who leads
+the candidacy's. The same without a process, a network or a file:
 
 >>> import numpy as np
 >>> from planner_service import RouteFinder

@@ -24,10 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from planner_service.kernels import (
-    bucket_queue,
     cell_costs,
-    directed_buckets,
-    heap,
     lower_bounds,
     mend,
     parents,
@@ -35,11 +32,14 @@ from planner_service.kernels import (
     partition_search,
     partition_totals,
     pull,
+    queue_dial,
+    queue_directed,
+    queue_heap,
+    queue_wide,
     repair,
     route_walk,
     stride_growth,
     stride_network,
-    wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 from swarm.config.classes import aloft_classes
@@ -50,9 +50,9 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
-    StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
+    StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(wide_buckets.grow_by_wide_buckets, None),
+    StepKernel(queue_wide.grow_by_wide_buckets, None),
     parents.untie_parents,
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
@@ -84,7 +84,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     partition_search.merge_parents,
     partition_search.drop_cut_off,
     partition_totals.costs_at,
-    heap.arrivals,
+    queue_heap.arrivals,
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 

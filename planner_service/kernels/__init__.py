@@ -1,1 +1,21 @@
-"""Arrays in, arrays out: all that is compiled. `layout` says how arrays are laid out."""
+"""Searches over padded arrays, compiled by numba: they see arrays only, no grid, map or message.
+
+`layout` says what the arrays are, `compile` how kernels are compiled and kept, `climbs` what a step's rise does to its
+cost. Trees are grown by the queues, made exact again by `repair`, `mend` and `partition*`, thinned out far from their
+root by `stride_*`, and read by `route_walk`, `pull` and `lower_bounds`.
+
+Cells leave a queue in the order of their costs. There is one for each kind of search, as one for all would take 2.5 to
+3 times as long (decision 22, on two shared cores):
+
+=================  ==========================================================  ====================================
+queue              of                                                          why it stays
+=================  ==========================================================  ====================================
+`queue_dial`       growths whose dearest step is at most 256 buckets           0.4 to 0.6 of the time of the next
+`queue_wide`       growths over cell costs of any ratio                        any width is exact: the map decides
+`queue_directed`   growths where uphill is not downhill                        a first offer is not the least there
+`repair.spread`    what falls after a change                                   memory follows what has changed
+`queue_heap`       strides, tiles of a partition: few cells, served by cost    a key may fall below what was served
+=================  ==========================================================  ====================================
+
+The first three keep their buckets in `queue_chunks`.
+"""

@@ -15,7 +15,6 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.heap import heap_lower, heap_pop
 from planner_service.kernels.layout import (
     BOX,
     GRID,
@@ -64,6 +63,7 @@ from planner_service.kernels.partition import (
     tile_of,
 )
 from planner_service.kernels.partition_totals import begin, evaluate_totals, queue_checks, settle
+from planner_service.kernels.queue_heap import heap_lower, heap_pop
 
 _ONE = np.uint64(1)
 _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"

@@ -20,8 +20,8 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.heap import heap_lower, heap_pop
 from planner_service.kernels.layout import GRID, INF, NONE, RULE_FOUR, step_length
+from planner_service.kernels.queue_heap import heap_lower, heap_pop
 
 OPEN = np.int32(-2)
 """`node` of a cell that belongs to one which has no number yet."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import Climbs
-from planner_service.kernels.heap import arrivals
 from planner_service.kernels.layout import NONE, step_offsets
+from planner_service.kernels.queue_heap import arrivals
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import turned_round
 from shared_map.arrays import Floats

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import bucket_queue, wide_buckets
+from planner_service.kernels import queue_dial, queue_wide
 from planner_service.kernels.cell_costs import cut_window
 from planner_service.kernels.climbs import Climbs
-from planner_service.kernels.directed_buckets import BASE_BITS, WIDTH, grow_directed_by_buckets, make_scratch
 from planner_service.kernels.layout import NONE, RULE_FOUR, RULE_OCTILE, SQRT2, TOO_FINE, PaddedGrid, step_offsets
 from planner_service.kernels.parents import point_to_parents, untie_parents
+from planner_service.kernels.queue_directed import BASE_BITS, WIDTH, grow_directed_by_buckets, make_scratch
 from planner_service.tree.changes import CostRange
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
@@ -81,14 +81,14 @@ def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kep
         count = 1 << max(2, math.ceil(math.log2(needed)))
         if (size, count) not in kept:
             kept.clear()
-            kept[size, count] = bucket_queue.make_scratch(size, rule, count)
-        last = int(bucket_queue.grow_by_buckets(padded, cost, root, (width, count), kept[size, count]))
+            kept[size, count] = queue_dial.make_scratch(size, rule, count)
+        last = int(queue_dial.grow_by_buckets(padded, cost, root, (width, count), kept[size, count]))
         if last != TOO_FINE:
             return (last + 1) * width
     if (size, 0) not in kept:
         kept.clear()
-        kept[size, 0] = wide_buckets.make_scratch(size, rule)
-    return float(wide_buckets.grow_by_wide_buckets(padded, cost, root, width, kept[size, 0]))
+        kept[size, 0] = queue_wide.make_scratch(size, rule)
+    return float(queue_wide.grow_by_wide_buckets(padded, cost, root, width, kept[size, 0]))
 
 
 def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:

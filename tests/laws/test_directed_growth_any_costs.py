@@ -12,8 +12,8 @@ from support import slow_twins as naive
 from support.kernel_oracle import inner
 from support.planner_strategies import RULES, random_climb, random_pace
 
-from planner_service.kernels.directed_buckets import grow_directed_by_buckets, make_scratch
 from planner_service.kernels.layout import NONE
+from planner_service.kernels.queue_directed import grow_directed_by_buckets, make_scratch
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig

@@ -212,8 +212,8 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
     for level in np.unique(doublings):
         label = ground.labels(1 << int(level))
         outer = np.inf if level == doublings.max() else reach << int(level - 1)
-        inner = -1 if level == 1 else reach << int(level - 2)
-        asked = set(label[has_way & (away > inner) & (away <= outer)])
+        nearest = -1 if level == 1 else reach << int(level - 2)
+        asked = set(label[has_way & (away > nearest) & (away <= outer)])
         for n in np.flatnonzero(doublings == level):
             if label[cells[n]] in asked:
                 assert lowest[n] == -np.inf

@@ -8,7 +8,7 @@ key is ever decreased. Octile steps make two keys per cell, straight and diagona
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
-    queue    as of `chunked_buckets`; `make_scratch` says how large
+    queue    as of `queue_chunks`; `make_scratch` says how large
 
 What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -24,7 +24,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import (
     BUCKETS,
@@ -37,6 +36,7 @@ from planner_service.kernels.layout import (
     WALL,
     diagonal_length,
 )
+from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)

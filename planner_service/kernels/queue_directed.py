@@ -3,7 +3,7 @@ levels (E. V. Denardo, B. L. Fox, "Shortest-route methods: 1. Reaching, pruning,
 27(1), 1979, 161-186).
 
 Neighbours of a cell are offered different keys, so that a cell's first offer is not its least, as it is in
-`bucket_queue`. But where no cell of a bucket offers anything that lies in it, all of them are final. So a cell
+`queue_dial`. But where no cell of a bucket offers anything that lies in it, all of them are final. So a cell
 waits under its own cost, once for each time that it fell, and is served once. Parents follow from the costs.
 
 A cost's *index* is how many finest widths it has. Its digits to the base 128 say where a cell waits: in the bucket
@@ -21,7 +21,7 @@ Arrays, beside those of `layout` and `climbs`:
     steps    float32, int32 (8 * _PIECE + 8,)  of the steps into a piece's cells, a row for each direction: rise, m;
                                                entry of `prices`
     waiting  uint64  (_LEVELS,)  how many entries wait at each level
-    queue    as of `chunked_buckets`; bucket `digit` of a level is the one numbered _BASE * level + digit
+    queue    as of `queue_chunks`; bucket `digit` of a level is the one numbered _BASE * level + digit
 
 While growing, the cost of a cell that was served is negative, so that no offer lowers it, and WALL on lethal cells.
 """
@@ -31,10 +31,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy, step_price
 from planner_service.kernels.compile import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
+from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)

@@ -2,7 +2,7 @@
 "Shortest paths algorithms: theory and experimental evaluation", Mathematical Programming 73, 1996, 129-174) whose
 width follows the map.
 
-As in `bucket_queue`, all neighbours of a cell are offered the same exit key per kind of step, and cells are served
+As in `queue_dial`, all neighbours of a cell are offered the same exit key per kind of step, and cells are served
 a bucket at a time. But a bucket may be wider than the cheapest steps: a cell whose exit key falls back into the
 bucket that touched it is served again at once, until none is offered less (label correction). Then all that the
 bucket has touched is final, as later keys are larger, and waits once under its exit keys, as there.
@@ -16,7 +16,7 @@ Arrays, beside those of `layout`:
     touched         uint32  (size + AHEAD,)  padded cells that got their cost from the last bucket
     batch, slanted  uint32  (size + AHEAD,)  those of the bucket that is served, by straight and by diagonal steps
     places          uint32  (size + AHEAD,)  where in the queue cells go; a ring of those to serve again
-    queue           as of `chunked_buckets`; of each kind of step `CIRCLE` buckets and one for what is behind them
+    queue           as of `queue_chunks`; of each kind of step `CIRCLE` buckets and one for what is behind them
 
 While a bucket is served, the cost of a cell that waits to be served again is negative, and WALL on lethal cells.
 """
@@ -26,14 +26,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.bucket_queue import (
-    AHEAD,
-    close_costs,
-    offer_diagonal,
-    offer_straight,
-    open_costs,
-)
-from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import (
     GRID,
@@ -43,6 +35,14 @@ from planner_service.kernels.layout import (
     SQRT2,
     WALL,
     diagonal_length,
+)
+from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue, put, take
+from planner_service.kernels.queue_dial import (
+    AHEAD,
+    close_costs,
+    offer_diagonal,
+    offer_straight,
+    open_costs,
 )
 
 _ONE = np.uint64(1)
