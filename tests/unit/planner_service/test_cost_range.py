@@ -9,7 +9,7 @@ import pytest
 
 from planner_service.kernels.cell_costs import block_ranges
 from planner_service.target_tree import TargetTree
-from planner_service.tree import cost_grid as cost_range
+from planner_service.tree import changes
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -50,7 +50,7 @@ def test_a_change_of_an_extreme_cell_passes_over_its_own_blocks_only(length_weig
     where = np.unravel_index([np.argmin(pace), np.argmax(pace), 77], pace.shape)
     pace[where] = (0.5, 0.06, np.inf)
     windows = [Window(row, col, row + 1, col + 1) for row, col in np.transpose(where).tolist()]
-    with mock.patch.object(cost_range, "block_ranges", look):
+    with mock.patch.object(changes, "block_ranges", look):
         assert grid.apply(pace, windows).cells.size == 3
     assert looked == [3] * (2 if length_weight else 1)
     time = pace[np.isfinite(pace)] * np.float32(10)
