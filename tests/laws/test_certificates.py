@@ -17,10 +17,10 @@ from support.tree_lives import Findings, Life, lives
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.partition import MOST_SLACK
 from planner_service.target_tree import TargetTree
-from planner_service.tree.certificates import LowerBounds, read_routes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PieceTree
+from planner_service.tree.route_bounds import LowerBounds, read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.routes import Route, RouteStatus

@@ -85,7 +85,8 @@ def test_a_growth_for_a_target_that_was_outside_is_made_up_for_once_it_is_back(o
     )
     play.tree.update(play.pace, outside, [], 0)
     grown = play.tree.full_job(outside)()
-    assert play.tree.adopt(grown, play.pace, play.target, [], 0, np.arange(400)).kind == "full"
+    play.tree.adopt(grown, play.pace, play.target, [], 0, np.arange(400))
+    assert play.tree.target_cell == play.target
     play.check()
 
 

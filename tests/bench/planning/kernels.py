@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from support.fields import Field, Pace, make_field, paces_of_any_ratio
 
 from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
-from planner_service.tree.certificates import LowerBounds, read_routes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.route_bounds import LowerBounds, read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 

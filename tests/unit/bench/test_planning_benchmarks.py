@@ -19,7 +19,7 @@ from support.benchmarks import assert_fits, bench, run
 from support.fields import FIELDS, Field, make_field
 from support.tree_lives import LAWS
 
-from planner_service.tree.certificates import LowerBounds
+from planner_service.tree.route_bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import TerrainError
 from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, RouteStatus
