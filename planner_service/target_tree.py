@@ -221,14 +221,13 @@ class TargetTree:
         self._job_out = False
         if self._state is State.BEHIND:
             self._state = State.CURRENT
-        first = not self._loaded
         changes = self._learn(pace, dirty)
         self.map_version = map_version
         if grown.offered is not None:
             self.last_gaps = offered_gaps(self._costs, grown, self._inside(followed_cells))
         if not self._set_target(target_cell, changes):
             return Update("none")
-        since = self._costs.difference(grown.cell_cost, [self._grid.window] if first else dirty)
+        since = self._costs.changes_since(grown.cell_cost)
         if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
             return self._follow(target_cell, changes)
         in_pieces = self._in_pieces or not self.times.is_quick(self._grid.cells)  # as it is, if that takes long

@@ -351,19 +351,6 @@ class CostGrid:
         self._read_range()
         return changes
 
-    def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:
-        """What changed inside the dirty windows since the `older` cell costs (padded)."""
-        parts: list[Cells] = []
-        shape = (self.grid.rows + 2, self.stride)
-        for row0, col0, row1, col1 in self._boxes(dirty):
-            part = np.s_[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1]
-            rows, cols = np.nonzero(self.cell_cost.reshape(shape)[part] != older.reshape(shape)[part])
-            parts.append((rows + row0 + 1) * self.stride + cols + col0 + 1)
-        if not parts:
-            return NO_CHANGES
-        cells = np.unique(np.concatenate(parts))
-        return Changes(cells, older[cells], self.cell_cost[cells])
-
     def window_of(self, cells: Cells) -> Window:
         """The least window that holds these padded cells, one at least."""
         rows, cols = np.divmod(cells, self.stride)
