@@ -98,11 +98,11 @@ class ScriptedTree(TargetTree):
         self.told_version = map_version
         update = self.answers.pop(0) if self.answers else otherwise
         if update.kind != "none":
-            self.ready, self.target_cell, self.map_version = True, target_cell, map_version
+            self.target_cell, self.map_version = target_cell, map_version
         return update
 
     def _route(self, cell: int, max_cells: int) -> Route:
-        if not self.ready or self.target_cell is None:
+        if self.target_cell is None:
             return Route(status=RouteStatus.NO_TARGET, start=cell)
         if not 0 <= cell < GRID.cells:
             return Route(status=RouteStatus.OUTSIDE, start=cell)
