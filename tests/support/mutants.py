@@ -64,8 +64,10 @@ def mutants_of(path: Path, lines: set[int] | None) -> Iterator[Mutant]:
     nodes = list(ast_nodes(tree))
     for name in OPERATORS:
         operator = get_operator(name)()
-        places = [start for node in nodes for start, _ in operator.mutation_positions(node)]
-        for occurrence, (line, _) in enumerate(places):
+        places = [(start, node) for node in nodes for start, _ in operator.mutation_positions(node)]
+        for occurrence, ((line, _), node) in enumerate(places):
+            if node.type == "number" and not node.value.isdecimal():
+                continue  # how long somebody waits, or a tolerance: one more or less breaks no rule
             if lines is None or line in lines:
                 yield Mutant(path.relative_to(ROOT).as_posix(), line, name, occurrence)
 
@@ -98,32 +100,39 @@ def _imports(path: Path) -> set[str]:
 
 
 class Suite:
-    """Which test files see a module: those that import it, themselves or by a module of `tests/support`.
+    """Which test files see a module: those that import it, themselves or by a module of `tests/support`, or if none
+    does, those which see the modules of its core that import it.
 
-    near  only the unit tests that import it themselves
+    near  of three groups only the first that is not empty: unit tests that import the module, laws that do, and all
+          that do by a module of `tests/support`
     """
 
     def __init__(self, near: bool = False) -> None:
+        self._near = near
         folder = ROOT / "tests"
         support = {f"support.{path.stem}": _imports(path) for path in (folder / "support").glob("*.py")}
-        files = sorted((folder / "unit").rglob("test_*.py"))
-        if near:
-            support = {}
-        else:
-            files += sorted((folder / "laws").glob("test_*.py"))
-        self._direct = {path: _imports(path) for path in files}
+        files = [*sorted((folder / "unit").rglob("test_*.py")), *sorted((folder / "laws").glob("test_*.py"))]
+        self._direct = {path.relative_to(ROOT).as_posix(): _imports(path) for path in files}
         self._by_support = {
             path: {name for each in own & support.keys() for name in support[each]}
             for path, own in self._direct.items()
         }
+        self._core = {path.relative_to(ROOT).as_posix(): _imports(path) for path in core_files(())}
         self._passes: dict[tuple[str, ...], bool] = {}
 
-    def of(self, file: str) -> list[str]:
-        """Test files for a file of the product, those that name it first; none if nobody imports it."""
+    def of(self, file: str, steps: int = 2) -> list[str]:
+        """Test files for a file of the product, those that name it first; none if nobody imports it in so many
+        steps."""
         module = file.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
         direct = [path for path, names in self._direct.items() if module in names]
-        by_support = [path for path, names in self._by_support.items() if module in names and path not in direct]
-        return [path.relative_to(ROOT).as_posix() for path in (*direct, *by_support)]
+        unit = [path for path in direct if path.startswith("tests/unit")]
+        laws = [path for path in direct if path not in unit]
+        others = [path for path, names in self._by_support.items() if module in names and path not in direct]
+        found = (unit or laws or others) if self._near else [*unit, *laws, *others]
+        if not found and steps:
+            users = [each for each, names in self._core.items() if module in names]
+            return list(dict.fromkeys(test for user in users for test in self.of(user, steps - 1)))
+        return found
 
     def passes(self, tests: list[str], limit_s: float) -> bool:
         """True if these tests pass in time while nothing is broken."""
@@ -206,7 +215,7 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=50, help="a sample of so many mutants at most (50)")
     parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
     parser.add_argument("--seconds", type=float, default=300.0, help="for the tests of each mutant at most (300)")
-    parser.add_argument("--near", action="store_true", help="only unit tests that import the module themselves")
+    parser.add_argument("--near", action="store_true", help="only the tests nearest to the module: a quick look")
     parser.add_argument("--json", type=Path, help="write every mutant and its outcome here")
     chosen = parser.parse_args()
     since = chosen.since or (None if chosen.files or chosen.all else "HEAD~1")
