@@ -302,7 +302,7 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
 
 
 def _print_summary(summary: Summary, folder: Path) -> None:
-    from launch_scripts.simulation.study.summary_page import outcome_table
+    from launch_scripts.simulation.study.summary import outcome_table
     from launch_scripts.simulation.study.sweep import PAGE, RESULTS
 
     for name in summary.cases[0].outcomes:

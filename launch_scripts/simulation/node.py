@@ -138,12 +138,8 @@ class Node:
         worker = self._worker = InlineWorker(simulation.scheduler)
 
         def post(event: Event) -> None:
-            if self.bus is not bus or self._shell is None:
-                return
-            if self._waiting is not None:
-                self._waiting.append(event)
-            else:
-                self._shell.handle(event, self.now_ns())
+            if self.bus is bus and self._shell is not None:
+                self._take(event)
 
         setup = RoleSetup(
             scenario=simulation.scenario,
@@ -205,12 +201,16 @@ class Node:
     def wake(self) -> None:
         """Ends a hang: everything that has come meanwhile is read at once."""
         waiting, self._waiting = self._waiting or (), None
-        bus = self.bus
         if waiting:
             self._simulation.log.event(self._clock.now_ns(), "wake", self.name)
         for event in waiting:
-            if self.bus is bus and self._shell is not None:
-                self._shell.handle(event, self.now_ns())
+            self._take(event)
+
+    def _take(self, event: Event) -> None:
+        if self._waiting is not None:
+            self._waiting.append(event)
+        elif self._shell is not None:
+            self._shell.handle(event, self.now_ns())
 
     def stop(self) -> None:
         if self._shell is not None:

@@ -14,10 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from launch_scripts.observe.run_folder import write_file
-from launch_scripts.simulation.study import summary_page as page
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import Case, load_study, plan
-from launch_scripts.simulation.study.summary import Summary, summarise
+from launch_scripts.simulation.study.summary import Summary, document, pictures_of, summarise
 from launch_scripts.simulation.study.trials import Result, Trial
 from swarm.config.explain import nearest
 from swarm.config.write import scenario_text
@@ -133,12 +132,12 @@ class Sweep:
                 assert case.given is not None
                 write_file(path, f"# {case.label}\n{scenario_text(case.given, Path.cwd())}".encode())
             write_file(self.folder / RESULTS, self._table())
-            pictures = page.pictures_of(summary)
+            pictures = pictures_of(summary)
             for name, file in pictures.items():
                 from launch_scripts.report.run_plots import draw_outcome  # matplotlib takes a moment
 
                 write_file(self.folder / file, draw_outcome(summary.cases, name))
-            write_file(self.folder / PAGE, page.document(summary, pictures).encode())
+            write_file(self.folder / PAGE, document(summary, pictures).encode())
             numbers = msgspec.to_builtins(summary, str_keys=True)
             write_file(self.folder / NUMBERS, (json.dumps(numbers, indent=1) + "\n").encode())
         except OSError as error:

@@ -152,31 +152,30 @@ def test_a_key_of_a_result_follows_from_what_decides_it_and_from_nothing_else(tm
     assert not keys(f"faults = true{STUDY}") & first
 
 
+def first_key(path: Path) -> str:
+    plan.__globals__["_file_digest"].cache_clear()
+    return plan(load_study(path), path.parent, "x")[0].trials[0].key
+
+
 def test_a_file_that_a_scenario_names_counts_by_what_is_in_it(tmp_path):
-    ground = tmp_path / "ground.npz"
-    text = STUDY + "[variants.own]\nterrain.source = 'ground.npz'"
-    path = write_study(tmp_path, text)
+    path = write_study(tmp_path, STUDY + "[variants.own]\nterrain.source = 'ground.npz'")
     found = []
     for height_m in (0.0, 1.0, 0.0):
-        np.savez(ground, elevation_m=np.full((8, 8), height_m))
-        plan.__globals__["_file_digest"].cache_clear()
-        found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
+        np.savez(tmp_path / "ground.npz", elevation_m=np.full((8, 8), height_m))
+        found.append(first_key(path))
     assert found[0] == found[2] != found[1]
     (tmp_path / "ground.prj").write_text("another place")
-    plan.__globals__["_file_digest"].cache_clear()
-    assert plan(load_study(path), tmp_path, "x")[0].trials[0].key not in found, "what lies beside it counts, too"
+    assert first_key(path) not in found, "what lies beside it counts, too"
 
 
 def test_the_modules_of_plug_ins_count_and_those_inside_of_packages(tmp_path):
-    package = tmp_path / "own"
-    package.mkdir()
-    (package / "__init__.py").write_text("from own.walk import Walk")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "__init__.py").write_text("from own.walk import Walk")
     path = write_study(tmp_path, STUDY + "[variants.own]\ntargets.0.walk = 'own:Walk'")
     found = []
     for text in ("class Walk: ...", "class Walk: speed = 2", "class Walk: ..."):
-        (package / "walk.py").write_text(text)
-        plan.__globals__["_file_digest"].cache_clear()
-        found.append(plan(load_study(path), tmp_path, "x")[0].trials[0].key)
+        (tmp_path / "own" / "walk.py").write_text(text)
+        found.append(first_key(path))
     assert found[0] == found[2] != found[1]
 
 
@@ -264,49 +263,34 @@ def test_numbers_of_a_report_are_named_by_their_place():
 # --- what is kept ------------------------------------------------------------------------------------------------
 
 
-def test_results_are_read_again_as_they_were_and_of_two_with_one_key_one_is_left(tmp_path):
-    store = ResultStore(tmp_path)
+def test_results_are_read_again_as_they_were_without_half_a_line_and_of_two_with_one_key_one_is_left(tmp_path):
     first = Result(key="a", figures={"x": 1.0}, broken=[BrokenLaw("l", "s", 2.0)], wall_s=1.0, cpu_s=0.5)
     second = Result(key="b", figures={"y.z": 2.0}, broken=[BrokenLaw("l", "s")], wall_s=1.0, cpu_s=0.5)
-    for each in (first, second, second):
-        store.add(each)
-    assert ResultStore(tmp_path).results == {"a": first, "b": second}
-
-
-def test_half_a_line_is_cut_off_and_what_comes_next_is_kept(tmp_path):
     store = ResultStore(tmp_path)
-    first = Result(key="a", figures={}, broken=[], wall_s=1.0, cpu_s=0.5)
     store.add(first)
     with store.path.open("ab") as file:
         file.write(b'{"key":"b","figures":{"x"')
     again = ResultStore(tmp_path)
     assert again.results == {"a": first}
-    second = Result(key="c", figures={}, broken=[], wall_s=1.0, cpu_s=0.5)
     again.add(second)
-    assert ResultStore(tmp_path).results == {"a": first, "c": second}
+    again.add(second)
+    assert ResultStore(tmp_path).results == {"a": first, "b": second}
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "line",
     [
-        {"key": 1},
-        {"key": None},
-        {"broken": ["abc"]},
-        {"wall_s": "x"},
-        {"figures": {"x": "text"}},
-        {"figures": [1.0]},
+        '{"x":' * 100_000,
+        *(
+            json.dumps({"key": "a", "figures": {}, "broken": [], "wall_s": 1.0, "cpu_s": 1.0, **wrong})
+            for wrong in ({"key": 1}, {"broken": ["abc"]}, {"wall_s": "x"}, {"figures": {"x": "text"}})
+        ),
     ],
+    ids=range(5),
 )
-def test_a_line_of_another_program_is_no_result(tmp_path, wrong):
-    row = {"key": "a", "figures": {}, "broken": [], "wall_s": 1.0, "cpu_s": 1.0, **wrong}
-    (tmp_path / "results.jsonl").write_text(json.dumps(row) + "\n", encoding="utf-8")
+def test_a_line_of_another_program_is_no_result(tmp_path, line):
+    (tmp_path / "results.jsonl").write_text(f"{line}\n", encoding="utf-8")
     with pytest.raises(StoreError, match=r"line 1 is damaged; remove it"):
-        ResultStore(tmp_path)
-
-
-def test_a_line_nested_too_deeply_is_no_result(tmp_path):
-    (tmp_path / "results.jsonl").write_text('{"x":' * 100_000 + "\n", encoding="utf-8")
-    with pytest.raises(StoreError, match=r"line 1 is damaged"):
         ResultStore(tmp_path)
 
 
