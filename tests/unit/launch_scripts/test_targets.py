@@ -132,23 +132,21 @@ def test_a_captured_target_turns_up_far_away() -> None:
     assert world.grid.distance_cells(publish.cell, before.cell) >= 11
 
 
-def test_a_vehicle_out_of_range_captures_nothing() -> None:
+@pytest.mark.parametrize(
+    ("col", "how", "captures"),
+    [
+        (28, {}, False),
+        (25, {"target": "other"}, False),
+        (35, {"state": VehicleState.ARRIVED}, False),
+        (29, {"state": VehicleState.ARRIVED}, True),  # it is believed when it is near
+    ],
+)
+def test_only_a_vehicle_in_reach_that_chases_a_target_captures_it(
+    col: int, how: dict[str, Any], captures: bool
+) -> None:
     world = World(still())
     world.settle()
-    assert world.hear(world.grid.cell(20, 28)) == []
-
-
-def test_a_vehicle_that_says_it_has_arrived_is_believed_when_it_is_near() -> None:
-    world = World(still())
-    world.settle()
-    assert world.hear(world.grid.cell(20, 35), state=VehicleState.ARRIVED) == []
-    assert len(world.hear(world.grid.cell(20, 29), state=VehicleState.ARRIVED)) == 2
-
-
-def test_a_vehicle_that_chases_another_target_captures_nothing() -> None:
-    world = World(still())
-    world.settle()
-    assert world.hear(world.grid.cell(20, 25), target="other") == []
+    assert len(world.hear(world.grid.cell(20, col), **how)) == 2 * captures
 
 
 def test_one_catch_counts_once() -> None:
@@ -345,11 +343,11 @@ def test_a_pose_is_told_when_the_target_has_moved_or_was_caught_and_else_twice_a
 # --- on the bus ---------------------------------------------------------------------------------------------
 
 
-def targets_on(pace: NDArray[np.float32], plan: Scenario) -> tuple[SwarmModel, Ear]:
+def targets_on(pace: NDArray[np.float32], plan: Scenario, **said: Any) -> tuple[SwarmModel, Ear]:
     """A swarm of nothing but targets, and what it says."""
     model = SwarmModel(terrain=terrain_of_pace(pace, RES), scenario=plan)
     ear = Ear(model)
-    setup = model.setup("targets", "0")
+    setup = replace(model.setup("targets", "0"), **said)
     model.start("targets", lambda bus, post: TargetsService(setup, model.terrain, pace, bus, post), phase_ns=0)
     return model, ear
 
@@ -375,19 +373,17 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
     pace = flat()
     pace[0, 0] = np.inf
     world, ear = targets_on(pace, scenario(still()))
+    world.run(0.01)
+    counts = ear.of(Stats)[0].counts  # declared before anything happens
+    assert [counts[name] for name in ("captures", "collisions", "lethal_entries", "poses")] == [0, 0, 0, 0]
     world.run(2)
     assert 2 <= len(ear.of(TargetPose)) <= 3  # one that stays is told twice a second
     cell = 20 * 50 + 25
     for n in range(4):
         for author, ids in (("a0.1", ["v", "x"]), ("a1.1", ["w"])):
             at = {"v": cell, "x": 0 if n else 1, "w": cell}
-            report = fleet(
-                world.now_ns / 1e6,
-                *((id, at[id]) for id in ids),
-                author=author,
-                seq=n,
-                at_m=(255.0, 205.0),
-            )
+            places = ((id, at[id]) for id in ids)
+            report = fleet(world.now_ns / 1e6, *places, author=author, seq=n, at_m=(255.0, 205.0))
             ear.bus.publish(FLEET, report, region=0, author=author)
         world.run(0.1)
     world.run(1.5)
@@ -402,20 +398,9 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
 def test_a_service_with_which_the_run_begins_waits_for_what_is_ordered_but_for_no_planner(
     anew: bool,
 ) -> None:
-    plan = scenario(still())
-    model = SwarmModel(terrain=terrain_of_pace(flat(), RES), scenario=plan)
-    ear = Ear(model)
-    setup = replace(model.setup("targets", "0"), anew=anew)
-    model.start("targets", lambda bus, post: TargetsService(setup, model.terrain, flat(), bus, post), phase_ns=0)
+    model, ear = targets_on(flat(), scenario(still()), anew=anew)
     model.run(0.3)
     assert ear.of(TargetPose) == []
     model.keeper("0", KeeperStore(":memory:"))
     model.run(0.5)
     assert bool(ear.of(TargetPose)) == anew
-
-
-def test_counts_are_declared_before_anything_happens() -> None:
-    world, ear = targets_on(flat(), scenario(still()))
-    world.run(0.01)
-    counts = ear.of(Stats)[0].counts
-    assert [counts[name] for name in ("captures", "collisions", "lethal_entries", "poses")] == [0, 0, 0, 0]
