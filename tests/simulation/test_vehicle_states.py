@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from launch_scripts.simulation.trial import nodes_of
 from support.vehicle_states import record, table
 
+from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import world
