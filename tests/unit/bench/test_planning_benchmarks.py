@@ -111,7 +111,7 @@ def test_a_field_may_be_an_array_a_map_or_a_terrain(tmp_path: Path) -> None:
         (np.array([[1.0, -2.0]]), "row 0, column 1: a pace of -2.0; expected more than 0"),
         (np.array([[np.nan]]), "row 0, column 0: a pace of nan"),
         (np.ones(3), r"shape \(3,\) of float64; expected rows x cols"),
-        (np.array([["a"]]), "it holds '<U1'; expected numbers"),
+        (np.array([["a"]]), r"shape \(1, 1\) of <U1; expected rows x cols"),
         (np.full((3, 3), np.inf), "every cell of the terrain is lethal"),
     ],
 )
