@@ -110,6 +110,7 @@ _SMALL = """
 import sys
 sys.path.insert(0, {tests!r})
 import numpy as np
+from planner_service.pulled_routes import Puller
 from support.kernel_oracle import random_grids
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
@@ -122,6 +123,8 @@ for strategy in ("full", "variable_range", "auto", "multi_resolution"):
     for event in (*first, Move(1, 1), Move(5, 5), Marks(4, 3)):
         play.happen(event)
         play.check()
+    routes = play.tree.routes(np.arange(play.grid.cells))
+    Puller(pace, 1.0, play.config).pull_batch(routes)
 print("fine")
 """
 
