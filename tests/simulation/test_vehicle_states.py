@@ -21,4 +21,4 @@ def test_simulated_vehicles_make_no_transition_but_those_of_the_table(
     scenario, terrain = world(name, seed)
     Simulation(scenario, faults=random_plan(seed, nodes_of(scenario), SECONDS), terrain=terrain).run_until(SECONDS)
     assert made - table() == set()
-    assert {event for _, event, _ in made} >= {"assign", "give_route", "set_in_reach"}
+    assert {event for _, event, _ in made} >= {"assign", "give_route"}
