@@ -34,7 +34,7 @@ _QOS = {
     "TRANSFORMS": "reliable, volatile, last 100",
 }
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
-_OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `--help`.*\n", re.MULTILINE)
+_OF_EVERY_COMMAND = re.compile(r"^(?:\*\*Options\*\*:\n\n)?\* `(?:-h, )?--help`.*\n", re.MULTILINE)
 
 
 def command_line() -> str:

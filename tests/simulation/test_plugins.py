@@ -201,8 +201,8 @@ def test_whatever_plugins_say_under_all_faults_no_law_of_safety_breaks(seed: int
     """Sensors that lie put walls around vehicles, and dynamics let them stand: they may wait, and nothing else."""
     (tmp_path / "wild.py").write_text(WILD)
     (tmp_path / "scenario.toml").write_text(WILD_SCENARIO)
-    verdict = try_seed("wild", seed, 12.0, load_scenario(tmp_path / "scenario.toml"))
-    assert [sentence for sentence in verdict.broken if " waits " not in sentence] == []
+    verdict, _ = try_seed("wild", seed, 12.0, load_scenario(tmp_path / "scenario.toml"))
+    assert [law for law in verdict.broken if " waits " not in law.sentence] == []
 
 
 def test_a_seed_replays_a_run_with_plugins(tmp_path: Path) -> None:

@@ -15,10 +15,15 @@ from typing import Any
 from msgspec.json import encode
 from support.wire_strategies import EXAMPLES
 
-from shared_map.keeper.mark_store import KeeperStore
 from swarm.grid import GridSpec
 from vehicle_agent.promise_store import FilePromiseStore
-from vehicle_agent.traffic.right_of_way_core import OwnRecord
+
+try:
+    from shared_map.keeper.mark_store import KeeperStore
+    from vehicle_agent.traffic.right_of_way_core import OwnRecord
+except ModuleNotFoundError:  # a build from before these modules had a name of their own
+    from shared_map.keeper.store import KeeperStore
+    from vehicle_agent.traffic.right_of_way import OwnRecord
 
 _GRID = GridSpec(64, 96, 30.0)
 

@@ -68,7 +68,7 @@ def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_stil
                 vehicles.append((id, chased[id], range(driven[id], driven[id] + 4)))
             for message in report.reports(vehicles, now_ns):
                 messages += 1
-                planners[message.target].hear(message, now_ns)
+                planners[message.target].on_chasers(message, now_ns)
             for target, followers in planners.items():
                 followers.drop_silent(now_ns)
                 chasers = {id for id in driven if chased[id] == target}
@@ -83,7 +83,7 @@ def test_an_agent_that_comes_back_with_a_clock_put_back_is_believed_at_once() ->
 
     def hear(author: str, stamp_ns: int, cell: int) -> None:
         [message] = ChasersReport(author).reports([("v", "t0", (cell,))], stamp_ns)
-        followers.hear(message, now_ns=0)
+        followers.on_chasers(message, now_ns=0)
 
     hear("all.a0.1", 1000, cell=5)
     hear("all.a0.2", 10, cell=6)
@@ -93,7 +93,7 @@ def test_an_agent_that_comes_back_with_a_clock_put_back_is_believed_at_once() ->
 def test_a_planner_remembers_no_more_authors_than_followers() -> None:
     followers = Followers("t0", GRID, 5 * NS_PER_S, 0)
     for n in range(5000):
-        followers.hear(Chasers(target="t0", author=f"x{n}", stamp_ns=0, ids=[], cells=b""), 0)
+        followers.on_chasers(Chasers(target="t0", author=f"x{n}", stamp_ns=0, ids=[], cells=b""), 0)
     assert len(followers._told) == 4096
     followers.drop_silent(6 * NS_PER_S)
     assert len(followers._told) == 0
