@@ -5,11 +5,16 @@ for new ones."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 from support.effort import few, try_all
+
+TESTS = Path(__file__).parent
+# What a test starts finds this checkout and what tests share, wherever it is started.
+os.environ["PYTHONPATH"] = os.pathsep.join((str(TESTS.parent), str(TESTS)))
 
 EXAMPLES = 100
 """Of a property that names no number of its own, with `--thorough`; each commit tries a share (support.effort)."""

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import IO, Any
 
 from bench import harness
 from typer.testing import CliRunner, Result
 
-TESTS = Path(__file__).parents[1]
 BENCH = [sys.executable, "-m", "bench"]
-_PATHS = {"PYTHONPATH": os.pathsep.join((str(TESTS.parent), str(TESTS)))}
 
 
 def command(*words: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Runs `./launch_scripts/bench` to its end, in a process of its own."""
     called = [*BENCH, *map(str, words)]
-    return subprocess.run(
-        called, capture_output=True, text=True, timeout=timeout_s, check=False, env={**os.environ, **_PATHS}
-    )
+    return subprocess.run(called, capture_output=True, text=True, timeout=timeout_s, check=False)
 
 
 def begin(*words: object, said: IO[str], **options: Any) -> subprocess.Popen[bytes]:
     """Starts it, and returns at once; `said` gets what it prints."""
     called = [*BENCH, *map(str, words)]
-    return subprocess.Popen(called, stdout=said, stderr=said, env={**os.environ, **_PATHS}, **options)
+    return subprocess.Popen(called, stdout=said, stderr=said, **options)
 
 
 def run(*words: str) -> Result:
