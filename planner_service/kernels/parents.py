@@ -31,9 +31,28 @@ _ONE = np.uint64(1)
 
 
 @helper
-def _parents_alike(cell_cost, cost, s, first, last, step, limit, parent, least):
-    """A diagonal, which is `step` long, counts where the dearer of its two corners costs at most `limit`; over four
-    neighbours it is inf long, and counts nowhere. Free of branches: it vectorises."""
+def _parents_of_four(cell_cost, cost, s, first, last, parent, least):
+    for i in range(first, last):
+        best = cost[i - s] + cell_cost[i - s]
+        code = np.uint8(0)
+        key = cost[i + _ONE] + cell_cost[i + _ONE]
+        code = np.uint8(2) if key < best else code
+        best = min(best, key)
+        key = cost[i + s] + cell_cost[i + s]
+        code = np.uint8(4) if key < best else code
+        best = min(best, key)
+        key = cost[i - _ONE] + cell_cost[i - _ONE]
+        code = np.uint8(6) if key < best else code
+        best = min(best, key)
+        parent[i] = code if max(cost[i], best) < INF else NONE
+        if least is not None:
+            least[i - first] = best
+
+
+@helper
+def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
+    """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
+    vectorises."""
     for i in range(first, last):
         north = cost[i - s] + cell_cost[i - s]
         east = cost[i + _ONE] + cell_cost[i + _ONE]
@@ -119,9 +138,11 @@ def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
     if climbs is not None:
         _parents_by_climb(grid, climbs, cost, begin, end, parent, least)
+    elif rule == RULE_FOUR:
+        _parents_of_four(cell_cost, cost, s, begin, end, parent, least)
     else:
         limit = INF if corners else HUGE
-        _parents_alike(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
+        _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
 
 
 @step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, {BOX}, u1[::1])", CLIMBS)

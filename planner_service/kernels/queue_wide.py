@@ -40,6 +40,7 @@ from planner_service.kernels.queue_chunks import QUEUE, Queue, empty, make_queue
 from planner_service.kernels.queue_dial import (
     AHEAD,
     close_costs,
+    offer_around,
     offer_diagonal,
     offer_straight,
     open_costs,
@@ -260,12 +261,13 @@ def grow_by_wide_buckets(grid, cost, root, narrowest, scratch):
                 current, until = np.int32(0), _CIRCLE
                 b = _ZERO
             n = take(queue, b, batch)
-            count = offer_straight(cell_cost, cost, s, batch, n, touched)
+            if rule == RULE_PAPER:
+                count = offer_around(cell_cost, cost, s, corners, batch, n, touched)
+            else:
+                count = offer_straight(cell_cost, cost, s, batch, n, touched)
             if octile:
                 m = take(queue, b + slants, slanted)
-                count = offer_diagonal(cell_cost, cost, s, SQRT2, corners, slanted, m, touched, count)
-            elif rule == RULE_PAPER:
-                count = offer_diagonal(cell_cost, cost, s, _ONE32, corners, batch, n, touched, count)
+                count = offer_diagonal(cell_cost, cost, s, corners, slanted, m, touched, count)
             most = _FEW + _AGAIN * (n + m) if width > least_width else _ANY
             count, more, settled = _serve_again(grid, cost, era, current, touched, count, places, most)
             if not settled:
