@@ -22,6 +22,8 @@ _MAP = (0.046, 0.058, 0.552, 0.776)
 """Left, bottom, width and height of the map at most, as shares of the page."""
 _BESIDE = ("states", "captures", "gaps", "waiting", "messages", "timings")
 """Plots beside the map; the page of the run has all."""
+_PLOTTED = ("certified gap, p95", "messages/s, mean")
+"""Figures that a plot beside the map shows: the head of the picture has no room for them."""
 
 
 class Card(NamedTuple):
@@ -116,7 +118,7 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
     figure.text(0.033, 0.936, facts, fontsize=9, color=palette.FAINT, va="center")
     for y in (0.918, 0.853):
         figure.add_artist(Line2D([0.033, 0.967], [y, y], color=palette.RULE, linewidth=1))
-    tiles = cards(report)
+    tiles = [tile for tile in cards(report) if tile.label not in _PLOTTED]
     widths = [max(len(tile.label), 1.9 * len(tile.text)) + 5 for tile in tiles]
     x, unit = 0.033, 0.95 / sum(widths)
     tones = {"": palette.INK, "good": palette.GREEN, "bad": palette.RED}
