@@ -102,10 +102,12 @@ def draw_border(axes: Axes, ground: GroundPicture, tracks: RunTracks) -> None:
         axes.set_xticks([0, width_km], [f"{abs(each):.4f}° {'EW'[each < 0]}" for each in lon.tolist()])
         axes.set_yticks([0, height_km], [f"{abs(each):.4f}° {'NS'[each < 0]}" for each in lat.tolist()])
         # Towards the middle, so that those of one corner do not meet.
-        for label, side in zip(axes.get_xticklabels(), ("left", "right"), strict=True):
-            label.set_horizontalalignment(side)
-        for label, side in zip(axes.get_yticklabels(), ("top", "bottom"), strict=True):
-            label.set_verticalalignment(side)
+        west, east = axes.get_xticklabels()
+        north, south = axes.get_yticklabels()
+        west.set_horizontalalignment("left")
+        east.set_horizontalalignment("right")
+        north.set_verticalalignment("top")
+        south.set_verticalalignment("bottom")
         axes.tick_params(length=2.5, pad=2, labelsize=7.5)
         axes.tick_params(axis="y", labelrotation=90)
     of_ground = {
