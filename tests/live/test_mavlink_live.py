@@ -65,9 +65,6 @@ def write_ground(path: Path) -> None:
         file.write(heights, 1)
 
 
-_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-
-
 class Child:
     """A process under way, whose output is read from a file."""
 
@@ -79,8 +76,7 @@ class Child:
             )
 
     def said(self, pattern: str) -> re.Match[str] | None:
-        # MAVSDK writes colours beside what the vehicle says, also in front of its lines.
-        return re.search(pattern, _COLOURS.sub("", self.output.read_text()), re.MULTILINE)
+        return re.search(pattern, self.output.read_text(), re.MULTILINE)
 
     def waits_for(self, pattern: str, within_s: float = 60.0) -> None:
         eventually(lambda: self.said(pattern), within_s, f"{pattern!r} in {self.output.name}")

@@ -9,6 +9,7 @@ straight from item to item. Each line that it prints is what it has heard, or `a
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
 from typing import Any
@@ -57,9 +58,17 @@ class Vehicle:
             return
 
 
+# MAVSDK logs to the same descriptor from threads of its own, in pieces: a line of ours could begin in the middle of
+# one of its lines. What is said here has the descriptor to itself.
+_SAID = os.fdopen(os.dup(1), "w")
+for descriptor in (1, 2):
+    os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+sys.stderr = _SAID
+
+
 def say(*words: object) -> None:
-    sys.stdout.write(" ".join(map(str, words)) + "\n")
-    sys.stdout.flush()
+    _SAID.write(" ".join(map(str, words)) + "\n")
+    _SAID.flush()
 
 
 def main() -> None:
