@@ -62,7 +62,8 @@ def code_lines(path: Path) -> int:
 
 def row_of(path: Path, rows: Rows) -> str | None:
     """The deepest folder above a file that has a row; None if there is none."""
-    return next((name for each in path.parents if (name := each.relative_to(ROOT).as_posix()) in rows), None)
+    folders = path.relative_to(ROOT).parents
+    return next((name for each in folders if (name := each.as_posix()) in rows), None)
 
 
 def counted(files: list[Path], rows: Rows) -> tuple[Rows, list[str]]:

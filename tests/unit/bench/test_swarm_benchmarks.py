@@ -259,25 +259,8 @@ def test_the_worst_wait_of_several_drives_counts_and_shares_are_of_all_vehicles(
 
 
 def test_a_small_crowd_is_driven() -> None:
-    found = bench(
-        *[
-            "crowd",
-            "--worlds",
-            "open",
-            "--seeds",
-            "1:2",
-            "--vehicles",
-            "12",
-            "--agents",
-            "3",
-            "--size",
-            "16",
-            "--seconds",
-            "8",
-            "--jobs",
-            "1",
-        ]
-    )
+    small = "--seeds 1:2 --vehicles 12 --agents 3 --size 16".split()
+    found = bench("crowd", "--worlds", "open", *small, "--seconds", "8", "--jobs", "1")
     [drive], [shown] = found["drives"], found["rows"]
     assert (drive["world"], drive["seed"], drive["vehicles"]) == ("open", 1, 12)
     assert drive["simulated_s"] == pytest.approx(8.0)
@@ -285,23 +268,7 @@ def test_a_small_crowd_is_driven() -> None:
     assert drive["longest_wait_s"] < 8.0
     assert drive["arrivals"] > 0
     assert (drive["collisions"], drive["lethal_entries"]) == (0, 0)
-    assert_fits(
-        *[
-            "crowd",
-            "--worlds",
-            "open,maze",
-            "--seeds",
-            "1:2",
-            "--vehicles",
-            "12",
-            "--agents",
-            "3",
-            "--size",
-            "16",
-            "--seconds",
-            "1",
-        ]
-    )
+    assert_fits("crowd", "--worlds", "open,maze", *small, "--seconds", "1")
 
 
 def test_a_simulated_swarm_is_measured() -> None:
