@@ -259,7 +259,7 @@ def test_the_worst_wait_of_several_drives_counts_and_shares_are_of_all_vehicles(
 
 
 def test_a_small_crowd_is_driven() -> None:
-    small = "--seeds 1:2 --vehicles 12 --agents 3 --size 16".split()
+    small = ["--seeds", "1:2", "--vehicles", "12", "--agents", "3", "--size", "16"]
     found = bench("crowd", "--worlds", "open", *small, "--seconds", "8", "--jobs", "1")
     [drive], [shown] = found["drives"], found["rows"]
     assert (drive["world"], drive["seed"], drive["vehicles"]) == ("open", 1, 12)
