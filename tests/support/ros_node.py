@@ -23,7 +23,7 @@ class PeerNode(Node):
             if (message := newest.take()) is not None:
                 hear(message)
 
-        newest.wake = wake
+        newest.on_each(wake)
 
 
 class FakeNewest:
@@ -31,8 +31,10 @@ class FakeNewest:
 
     def __init__(self, topic: str) -> None:
         self.endpoint = SimpleNamespace(topic=topic)
-        self.wake: Callable[[], None] | None = None
         self.waiting: deque[Any] = deque(maxlen=1)
+
+    def on_each(self, wake: Callable[[], None]) -> None:
+        pass
 
     def take(self) -> Any | None:
         return self.waiting.pop() if self.waiting else None

@@ -48,22 +48,26 @@ class Publisher:
 
 
 class Newest:
-    """What came last on a topic and was not taken yet. Made by `Node.newest`.
-
-    wake  called on Zenoh's thread with each; None at first
-    """
+    """What came last on a topic and was not taken yet. Made by `Node.newest`."""
 
     def __init__(self, node: Node, endpoint: Endpoint, most_bytes: int) -> None:
         self.endpoint = endpoint
-        self.wake: Callable[[], None] | None = None
         self._node, self._most_bytes = node, most_bytes
+        self._wake: Callable[[], None] | None = None
         self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
 
     def keep(self, sample: zenoh.Sample) -> None:
         """On Zenoh's threads: keeps the bytes as they are."""
         self._waiting.append(sample)
-        if self.wake is not None:
-            self.wake()
+        if self._wake is not None:
+            self._wake()
+
+    def on_each(self, wake: Callable[[], None]) -> None:
+        """Calls `wake` for each message that comes, on Zenoh's thread; and at once for what has come already: a
+        latched message may be here before anybody can ask for it."""
+        self._wake = wake
+        if self._waiting:
+            wake()
 
     def take(self) -> Any | None:
         """The newest message, once; None if none has come, or it is none of its type."""

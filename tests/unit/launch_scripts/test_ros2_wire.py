@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from launch_scripts.gateways.ros2 import rmw
+from launch_scripts.gateways.ros2.ros_node import Newest
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.errors import ProtocolError
 
@@ -113,3 +115,15 @@ def test_bytes_that_are_no_message_raise_only_a_protocol_error(content: bytes, n
     for each in (content, b"\0\1\0\0" + content, b"\0\0\0\0" + content):
         with suppress(ProtocolError):
             types.unpack(each, name)
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_a_message_that_comes_before_anybody_asks_wakes_as_a_later_one_does(early: bool) -> None:
+    nothing: Any = None
+    newest, woken = Newest(nothing, nothing, 100), []
+    if early:
+        newest.keep(nothing)
+    newest.on_each(lambda: woken.append(True))
+    if not early:
+        newest.keep(nothing)
+    assert woken == [True]

@@ -70,7 +70,7 @@ class Robot:
         self._certificate = node.publisher(f"/{id}/plan_certificate", status, Qos.LATCHED)
         self._goal_out = node.publisher(own(robots.goal), _POSE)
         self._service = node.serve(f"/{id}/get_plan", "nav_msgs/srv/GetPlan", self._answer_plan)
-        self._goals.newest.wake = self._take_goal
+        self._goals.newest.on_each(self._take_goal)
 
     @property
     def present(self) -> bool:
