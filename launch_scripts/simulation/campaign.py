@@ -42,9 +42,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """What became of one seed.
 
     broken          each law that did not hold
-    longest_wait_s  see `laws.Waits`
-    entered         cells that vehicles entered; near_rovers: within two cells of one; met_rovers: onto one, which
-                    had not been reported in time
+    longest_wait_s  see `laws.LawBook`
     routed_after_s  from when all processes work again until every vehicle has a route; None if one never has
     faults          how many of each kind there were
     """
@@ -56,9 +54,6 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     longest_wait_s: float = 0.0
     routed_after_s: float | None = None
     captures: int = 0
-    entered: int = 0
-    near_rovers: int = 0
-    met_rovers: int = 0
     deliveries: int = 0
     faults: dict[str, int] = {}
     wall_s: float = 0.0
@@ -117,12 +112,9 @@ def try_seed(
         seed=seed,
         seconds=seconds,
         broken=broken,
-        longest_wait_s=book.waits.longest_s,
-        routed_after_s=book.routed.after_s,
+        longest_wait_s=book.longest_s,
+        routed_after_s=book.routed_after_s,
         captures=report["captures"] or 0,
-        entered=book.bodies.entered,
-        near_rovers=book.bodies.near,
-        met_rovers=len(book.bodies.met),
         deliveries=simulation.log.deliveries,
         faults=plan.counts(),
         wall_s=time.perf_counter() - began_s,

@@ -20,30 +20,17 @@ import msgspec
 
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED, RunObserver
-from launch_scripts.process_table import (
-    SIMULATED_ROLES,
-    STOP_ORDER,
-    ProcessSpec,
-    planner_spec,
-    processes_of,
-    spec_of,
-)
+from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, ProcessSpec, processes_of
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
-from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
-from swarm.liveness import ranked_id
-from swarm.runtime.order_book import OrderBook
 from swarm.runtime.process import collected_rarely
 from swarm.wire.access import Authenticator
-from swarm.wire.messages import Message
-from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
-from swarm.wire.topics import GIVE_ORDER, ZONES
 
 
 class EventLog:
@@ -55,9 +42,8 @@ class EventLog:
     Seconds since the start, source, destination, topic, digest of the payload. Two runs are equal if their logs
     are. Counts deliveries, and writes them if there is a file. A full disk cuts the log, not the simulation."""
 
-    def __init__(self, began_ns: int, out: TextIO | None) -> None:
+    def __init__(self, out: TextIO | None) -> None:
         self.deliveries = 0
-        self._began_ns = began_ns
         self._out = out
         self.cut: str | None = None
         """Why the log has no end; None if it is whole."""
@@ -69,7 +55,7 @@ class EventLog:
             self.event(now_ns, f"{source} >", f"{destination} {topic} {digest}")
 
     def event(self, now_ns: int, what: str, whom: str) -> None:
-        whole, rest = divmod(now_ns - self._began_ns, NS_PER_S)
+        whole, rest = divmod(now_ns - EPOCH_NS, NS_PER_S)
         self._write(f"{whole}.{rest:09d} {what} {whom}\n")
 
     def flush(self) -> None:
@@ -116,8 +102,6 @@ class Simulation:
     record_to   folder in which the inputs of every process are recorded; None: they are not
     after_tick  called with a node after each of its ticks
     after_boot  called with a node after each of its starts
-    book        what operators ordered and a keeper acknowledged
-    refused     what was not acknowledged: (when, order, why)
     """
 
     def __init__(
@@ -138,7 +122,7 @@ class Simulation:
         self.truth = build_truth(scenario, self.terrain)
         self.recorder = Recorder(scenario, self.terrain.grid, EPOCH_NS)
         self.scheduler = Scheduler(ManualClock(EPOCH_NS))
-        self.log = EventLog(EPOCH_NS, trace)
+        self.log = EventLog(trace)
         chance = random.Random(f"simulation/{scenario.seed}")
         self.links = FaultyLinks(self.faults, chance, EPOCH_NS, scenario.network.lease_s)
         self.network = MemoryNetwork(self.scheduler, self.links, self.log.delivery)
@@ -148,12 +132,8 @@ class Simulation:
         self._phases = random.Random(f"phases/{scenario.seed}")
         for spec in processes_of(scenario, SIMULATED_ROLES):
             skew_ns = int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6)
-            node = self._node(spec, skew_ns)
+            node = self.node(spec, skew_ns)
             self.scheduler.at(EPOCH_NS + int(self._phases.random() * BOOT_SPREAD_S * NS_PER_S), node.boot)
-        self.book = OrderBook()
-        self.refused: list[tuple[float, Message, str | None]] = []
-        self._operator = self.network.bus(OBSERVER, scenario.network.namespace)
-        self._orders_given = 0
         bus = self.network.bus(OBSERVER, scenario.network.namespace, self.authenticator)
         clock = self.scheduler.clock
         observer = RunObserver(bus, lambda event: observer.take(event, clock.now_ns()), self.recorder, RECORDED)
@@ -178,15 +158,10 @@ class Simulation:
             backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
             self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
 
-    def add(self, added: AddedAgent) -> Node:
-        """Let an agent join that is not in the scenario."""
-        node = self._node(spec_of("agent", added.plan.id), added=added)
-        node.boot()
-        return node
-
-    def _node(
+    def node(
         self, spec: ProcessSpec, skew_ns: int = 0, name: str | None = None, added: AddedAgent | None = None
     ) -> Node:
+        """A process more, which has not started yet."""
         node = Node(self, spec, self._phases.randrange(NS_PER_S), skew_ns, name, added)
         self.nodes[node.name] = node
         return node
@@ -214,43 +189,11 @@ class Simulation:
         numbers = recorder.report(run_id=self.run_id, seconds=seconds, startup_s=startup_s)
         return {**numbers, "simulated": True, "deliveries": self.log.deliveries}
 
-    def order(self, at_s: float, order: GiveOrder | ZoneOrder) -> None:
-        """An operator gives an order then. A target that is added gets a planner, as a launcher would start it."""
-        self._at(at_s, partial(self._give, order))
-
-    def _give(self, order: GiveOrder | ZoneOrder) -> None:
-        topic = ZONES if isinstance(order, ZoneOrder) else GIVE_ORDER
-        self._orders_given += 1
-        self._note("order", str(self._orders_given))
-
-        def post(event: Event) -> None:
-            match event:
-                case Replied(message=Orders(given=Order() as given)):
-                    self.book.merge([given], self.scheduler.clock.now_ns())
-                    self._start_planners()
-                case AskEnded(replies=0, failure=failure):
-                    self.refused.append((self.now_s, order, failure))
-
-        self._operator.ask(topic, order, post, tag=f"order-{self._orders_given}", timeout_s=1.0, keeper="0")
-
-    def _start_planners(self) -> None:
-        """As a launcher does: a planner for each target, and none for one that was removed."""
-        targets = self.book.targets(self.scenario)
-        standbys = self.scenario.standbys.planner
-        wanted = {ranked_id(id, rank) for id in targets for rank in range(standbys + 1)}
-        there = {node.spec.id: node for node in self.nodes.values() if node.spec.role == "planner"}
-        for id in sorted(wanted - there.keys()):
-            self.scheduler.after(NS_PER_S // 2, self._node(planner_spec(id)).boot)
-        for id in sorted(there.keys() - wanted):
-            node = self.nodes.pop(there[id].name)
-            node.crash()
-            node.retired = True
-
     def twin(self, name: str) -> None:
         """Starts a second life of an agent now, on another machine: with another file, and a clock of its own."""
         first = self.nodes[name]
         others = sum(node.spec == first.spec for node in self.nodes.values())
-        self._node(first.spec, -first.skew_ns, f"{name}.{others + 1}").boot()
+        self.node(first.spec, -first.skew_ns, f"{name}.{others + 1}").boot()
 
     def step_clock(self, name: str, by_s: float) -> None:
         """Sets the clock of a node's machine; the process that runs there has read it already."""
@@ -261,25 +204,26 @@ class Simulation:
     def _plan_faults(self) -> None:
         plan = self.faults
         for crash in plan.crashes:
-            self._at(crash.at_s, partial(self.crash, crash.node, for_good=crash.for_good))
+            self.at(crash.at_s, partial(self.crash, crash.node, for_good=crash.for_good))
         for hang in plan.hangs:
-            self._at(hang.from_s, self.nodes[hang.node].hang)
-            self._at(hang.until_s, self.nodes[hang.node].wake)
+            self.at(hang.from_s, self.nodes[hang.node].hang)
+            self.at(hang.until_s, self.nodes[hang.node].wake)
         for step in plan.clock_steps:
-            self._at(step.at_s, partial(self.step_clock, step.node, step.by_s))
+            self.at(step.at_s, partial(self.step_clock, step.node, step.by_s))
         for twin in plan.twins:
-            self._at(twin.at_s, partial(self.twin, twin.node))
+            self.at(twin.at_s, partial(self.twin, twin.node))
         for partition in plan.partitions:
-            self._at(partition.from_s, partial(self._note, "cut", *partition.nodes))
-            self._at(partition.until_s, partial(self._note, "heal", *partition.nodes))
+            self.at(partition.from_s, partial(self._note, "cut", *partition.nodes))
+            self.at(partition.until_s, partial(self._note, "heal", *partition.nodes))
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
-                self._at(lost_s, partial(self.network.relink, partition.nodes, False))
+                self.at(lost_s, partial(self.network.relink, partition.nodes, False))
                 # A microsecond late: rounding must not put it before the heal, when the links are still cut.
                 found_s = partition.until_s + RELINK_S + 1e-6
-                self._at(found_s, partial(self.network.relink, partition.nodes, True))
+                self.at(found_s, partial(self.network.relink, partition.nodes, True))
 
-    def _at(self, seconds: float, action: Callable[[], None]) -> None:
+    def at(self, seconds: float, action: Callable[[], None]) -> None:
+        """Runs an action so many seconds after the run began."""
         self.scheduler.at(EPOCH_NS + int(seconds * NS_PER_S), action)
 
     def _note(self, what: str, *nodes: str) -> None:
@@ -292,14 +236,12 @@ def simulate(
     seconds: float | None = None,
     faults: FaultPlan | None = None,
     trace: TextIO | None = None,
-    progress: Callable[[float], None] | None = None,
     record_to: Path | None = None,
 ) -> SimulationResult:
     """Runs a scenario to its end.
 
     seed      instead of the scenario's own
     trace     where the event log is written
-    progress  called after each simulated second with the seconds that have passed
     record_to as of `Simulation`
     """
     if seed is not None:
@@ -309,10 +251,7 @@ def simulate(
     simulation = Simulation(scenario, faults=faults, trace=trace, record_to=record_to)
     began_s = time.perf_counter()
     with collected_rarely():
-        while simulation.now_s < seconds:
-            simulation.run_until(min(simulation.now_s + 1.0, seconds))
-            if progress is not None:
-                progress(simulation.now_s)
+        simulation.run_until(seconds)
         simulation.finish()
     simulation.log.flush()
     wall_s = time.perf_counter() - began_s

@@ -9,10 +9,10 @@ import statistics
 import numpy as np
 import pytest
 from support.class_world import captures_by_class, made
+from support.ordered_simulation import OrderedSimulation
 
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.simulate import Simulation
 from shared_map.class_grounds import class_grounds
 from shared_map.terrain.air import clearance_floor
 from swarm.config.load import parse_scenario
@@ -60,7 +60,7 @@ routes = "pulled"
 @pytest.mark.parametrize("added", ["", WINDY], ids=["still", "windy"])
 def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(added: str) -> None:
     scenario, terrain = made(_TEXT + added)
-    simulation = Simulation(scenario, terrain=terrain)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
     cells: dict[str, set[int]] = {"ground": set(), "drone": set()}
     together = 0
     plots: dict[str, set[bool]] = {"ground": set(), "drone": set()}
@@ -129,7 +129,7 @@ WEST, EAST, SOUTH_EAST = (9, 9), (9, 52), (45, 45)
 def speed_mps(routes: str, start: tuple[int, int], end: tuple[int, int]) -> float:
     """How fast a drone is over the ground on its way, as the median of its ticks."""
     text = _PLAIN.replace("START", str([*start])).replace("END", str([*end])).replace("ROUTES", routes)
-    simulation = Simulation(parse_scenario(text))
+    simulation = OrderedSimulation(parse_scenario(text))
     places: list[tuple[float, float, float]] = []
 
     def look(node: Node) -> None:
@@ -155,7 +155,7 @@ def test_the_wind_says_how_fast_a_drone_is_over_the_ground_in_each_direction(rou
 
 def test_an_operators_zone_for_a_class_that_flies_is_a_no_fly_zone_and_rovers_go_on_below() -> None:
     scenario, terrain = made(_TEXT)
-    simulation = Simulation(scenario, terrain=terrain)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
 
     def inside(name: str) -> int:
         agents = [

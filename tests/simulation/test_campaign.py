@@ -7,6 +7,7 @@ import json
 import re
 
 import msgspec
+import numpy as np
 import pytest
 
 from launch_scripts.commands.simulation_commands import simulate_seeds
@@ -74,10 +75,10 @@ def test_each_law_has_its_sentence():
     simulation = Simulation(seeded(1), faults=FaultPlan(quiet_s=4))
     book = LawBook(simulation)
     simulation.run_until(3)
-    book.laws._unmoved |= {f"w{cell}": cell for cell in range(simulation.terrain.grid.cells)}
-    book.laws._passable["ground"][:] = False
-    book.laws.acknowledged["nobody.a9.1", 0] = (1, 1)
-    book.waits.longest_s, book.waits.longest = 11.0, (12.0, "v", 5)
+    book._unmoved |= {f"w{cell}": cell for cell in range(simulation.terrain.grid.cells)}
+    book._truths = {"ground": np.full(simulation.terrain.grid.cells, np.inf, np.float32)}
+    book.acknowledged["nobody.a9.1", 0] = (1, 1)
+    book.longest_s, book.longest = 11.0, (12.0, "v", 5)
     broken = {law.law: law for law in book.run(10)}
     said = {
         "no collision": r"collision at 3.\d\d s: a\d-\d\d and w(\d+) on cell \1",

@@ -8,11 +8,11 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from support.class_world import captures_by_class, made
 from support.effort import few
+from support.ordered_simulation import OrderedSimulation
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.laws import LawBook, Laws
-from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.laws import LawBook
 from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.keeper.zone_orders import zones_of
 from shared_map.terrain.terrain import build_truth
@@ -59,7 +59,7 @@ capture_range_m = 30.0
 class Driven:
     """Where vehicles were, by class."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: OrderedSimulation) -> None:
         self.cells: dict[str, set[int]] = {}
         simulation.after_tick.append(lambda node: self._look(node.service))
 
@@ -69,13 +69,13 @@ class Driven:
             cells.update(vehicle.cell for vehicle in service.agent.vehicles.values())
 
 
-def grounds_of(simulation: Simulation) -> dict[str, ClassGround]:
+def grounds_of(simulation: OrderedSimulation) -> dict[str, ClassGround]:
     return class_grounds(simulation.scenario, simulation.terrain, simulation.truth)
 
 
 def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_own() -> None:
     scenario, terrain = made(_TEXT)
-    simulation = Simulation(scenario, terrain=terrain)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
     trial, driven = LawBook(simulation), Driven(simulation)
     assert trial.run(LONG_S) == []
     report = simulation.report(LONG_S)
@@ -112,9 +112,9 @@ def test_whatever_a_class_may_drive_and_whatever_goes_wrong_it_enters_nothing_el
         text = text.replace(was, now)
     scenario = parse_scenario(f"{text}\n[map]\nlearning = {str(learning).lower()}")
     scenario = msgspec.structs.replace(scenario, seed=seed)
-    simulation = Simulation(scenario, faults=random_plan(seed, nodes_of(scenario), 6.0))
+    simulation = OrderedSimulation(scenario, faults=random_plan(seed, nodes_of(scenario), 6.0))
     try:
-        laws, driven = Laws(simulation), Driven(simulation)
+        laws, driven = LawBook(simulation), Driven(simulation)
     except ConfigError:  # there are too few cells that so poor a class can drive
         reject()
     simulation.run_until(6.0)
@@ -134,7 +134,7 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
         same = ClassConfig(name="same", cost=scenario.cost)
         own = msgspec.structs.replace(walkers, vehicle_class=name)
         given = msgspec.structs.replace(scenario, classes=(same,), groups=(rovers, own))
-        simulation = Simulation(given, terrain=terrain)
+        simulation = OrderedSimulation(given, terrain=terrain)
         places: list[tuple[str, int, float]] = []
         simulation.after_tick.append(lambda node, places=places: places.extend(places_of(node.service)))  # type: ignore[misc]
         simulation.run_until(6.0)
@@ -161,8 +161,8 @@ def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_
     row, col = terrain.grid.row_col(stands)
     corners = [(row + south, col + east) for south, east in ((-5, -5), (-5, 5), (5, 5), (5, -5))]
     zone = [(min(max(r, 0), 63), min(max(c, 0), 63)) for r, c in corners]
-    simulation = Simulation(scenario, terrain=terrain)
-    laws = Laws(simulation)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
+    laws = LawBook(simulation)
     simulation.order(1.0, ZoneOrder(action="add", name="z", polygon=zone))
     simulation.run_until(2.0)
     walkers = [simulation.nodes[f"agent-{id}"].service for id in ("a2", "a3")]
@@ -181,8 +181,8 @@ def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_
 
 def test_a_zone_for_walkers_is_left_by_walkers_and_says_nothing_to_rovers() -> None:
     scenario, terrain = made(_TEXT)
-    simulation = Simulation(scenario, terrain=terrain)
-    laws = Laws(simulation)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
+    laws = LawBook(simulation)
     simulation.run_until(3.0)
     by_class = {"ground": ("a0", "a1"), "walker": ("a2", "a3")}
 

@@ -7,7 +7,7 @@ import pytest
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
-from launch_scripts.simulation.laws import LawBook, Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import CROWDS, crowd, seeded
 from swarm.wire.messages.vehicles import VehicleState
@@ -34,7 +34,7 @@ def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
     scenario, terrain = crowd("open", seed, vehicles=24, per_agent=3, side=16)
     crashes = tuple(Crash(3 + 0.9 * n, f"agent-a{(5 * n + seed) % 8}") for n in range(10))
     simulation = Simulation(scenario, faults=FaultPlan(jitter_ms=20, crashes=crashes), terrain=terrain)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(14.0)
     assert laws.collisions == laws.lethal == []
 
@@ -44,7 +44,7 @@ def test_of_two_lives_of_one_agent_the_older_stops_until_the_younger_is_gone_and
     """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""
     plan = FaultPlan(partitions=(Partition(5, 9, ("agent-a1",)),), twins=(Twin(8, "agent-a1"),))
     simulation = Simulation(seeded(seed), faults=plan)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(22)
     older, younger = (simulation.nodes[name].service for name in ("agent-a1", "agent-a1.2"))
     assert isinstance(older, AgentService)
@@ -66,7 +66,7 @@ def test_of_two_lives_of_one_agent_the_older_stops_until_the_younger_is_gone_and
 def test_an_agent_that_starts_again_with_another_clock_is_like_any_other(skew_s):
     """An hour back, an hour forward, and in 1970."""
     simulation = Simulation(seeded(3), faults=FaultPlan(crashes=(Crash(6, "agent-a1"),)))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(6.1)
     simulation.nodes["agent-a1"].skew_ns = int(skew_s * 1e9)
     simulation.run_until(8)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from support.ordered_simulation import OrderedSimulation
+
 from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import crowd, seeded
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
@@ -22,7 +23,7 @@ from vehicle_agent.service import AgentService
 class Rover:
     """Drives about at random on what it is granted, among vehicles that chase targets."""
 
-    def __init__(self, simulation: Simulation, name: str, lives: MemoryLives, cell: int) -> None:
+    def __init__(self, simulation: OrderedSimulation, name: str, lives: MemoryLives, cell: int) -> None:
         self.simulation = simulation
         self.grid = simulation.terrain.grid
         self.pace = simulation.terrain.pace_s_per_m.reshape(-1)
@@ -56,7 +57,7 @@ class Rover:
         return [other for _, other in self.grid.neighbours(cell) if self.pace[other] < 1e6]
 
 
-def drive(simulation: Simulation, rovers: list[Rover], seconds: float) -> None:
+def drive(simulation: OrderedSimulation, rovers: list[Rover], seconds: float) -> None:
     """Drive on, and look that all vehicles are on cells of their own."""
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:
@@ -67,13 +68,13 @@ def drive(simulation: Simulation, rovers: list[Rover], seconds: float) -> None:
         assert len(on) == len(set(on))
 
 
-def places(simulation: Simulation) -> list[int]:
+def places(simulation: OrderedSimulation) -> list[int]:
     agents = [node.service.agent for node in simulation.nodes.values() if isinstance(node.service, AgentService)]
     return [vehicle.cell for agent in agents for vehicle in agent.vehicles.values()]
 
 
 def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
-    simulation = Simulation(seeded(3))
+    simulation = OrderedSimulation(seeded(3))
     simulation.run_until(3)
     lives = [MemoryLives() for _ in range(3)]
     # Where vehicles stand: they have to leave before it gets in.
@@ -103,7 +104,7 @@ def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_
 
 
 def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
-    simulation = Simulation(seeded(3))
+    simulation = OrderedSimulation(seeded(3))
     simulation.run_until(2)
     rover = Rover(simulation, "a0", MemoryLives(), 5)
     simulation.run_until(4)
@@ -112,7 +113,7 @@ def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
 
 
 def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anybody() -> None:
-    simulation = Simulation(seeded(4))
+    simulation = OrderedSimulation(seeded(4))
     simulation.run_until(3)
     group = simulation.scenario.groups[0].name
     here = simulation.terrain.grid.row_col(places(simulation)[0])
@@ -156,7 +157,7 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
 
 def test_vehicles_are_added_beside_a_body_and_outside_of_a_zone_where_their_place_is_closed() -> None:
     scenario, terrain = crowd("open", 1, vehicles=8, per_agent=4, side=20)
-    simulation = Simulation(scenario, terrain=terrain)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
     zone: Any = [(6, 6), (6, 14), (14, 14), (14, 6)]
     simulation.order(2.0, ZoneOrder(action="add", name="z", polygon=zone))
     bus = simulation.network.bus("walker", scenario.network.namespace, simulation.authenticator)

@@ -6,7 +6,7 @@ import random
 
 from support.wire_strategies import EXAMPLES
 
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import seeded
 from swarm.bus.bus import Event
@@ -32,7 +32,7 @@ def key_fields(topic: Topic, message: Message, chance: random.Random) -> dict[st
 
 def test_garbage_on_every_key_is_counted_and_dropped_and_the_swarm_does_its_work():
     simulation = Simulation(seeded(1))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     chance = random.Random(1)
     stranger = simulation.network.bus("stranger")
     for step in range(120):

@@ -12,7 +12,6 @@ from launch_scripts.simulation.laws import ROUTED_WITHIN_S
 def test_no_law_breaks_whatever_joins_leaves_and_is_ordered(seed: int) -> None:
     world = Interplay(seed)
     assert world.run() == []
-    assert world.trial.bodies.entered > 100
     assert all(robot.moves > 0 for robot in world.robots)
     assert world.routed_after_s is not None
     assert world.routed_after_s < ROUTED_WITHIN_S + 2.0, "the last orders are taken back 2.3 s after the last fault"

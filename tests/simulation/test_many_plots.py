@@ -7,7 +7,7 @@ import pytest
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import WIDE, seeded
 from vehicle_agent.service import AgentService
@@ -28,7 +28,7 @@ def agents_of(simulation: Simulation) -> list[AgentService]:
 
 def test_agents_listen_to_the_plots_near_their_vehicles_and_keep_every_law():
     simulation = Simulation(seeded(1, WIDE))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(6)
     plots = [len(service._right_of_way.core.holdings.plots) for service in agents_of(simulation)]
     assert len(plots) == 8
@@ -45,7 +45,7 @@ def test_agents_listen_to_the_plots_near_their_vehicles_and_keep_every_law():
 @pytest.mark.seeds(1)
 def test_nobody_meets_under_seeded_faults(seed):
     simulation = Simulation(seeded(seed, WIDE), faults=random_plan(seed, nodes_of(WIDE), SECONDS))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(SECONDS)
     simulation.finish()
     assert laws.collisions == laws.lethal == []
@@ -58,7 +58,7 @@ def test_nobody_meets_under_seeded_faults(seed):
 def test_nobody_meets_where_plots_are_larger_than_regions(seed):
     wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, plot_regions=2))
     simulation = Simulation(seeded(seed, wide), faults=random_plan(seed, nodes_of(wide), SECONDS))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     messages = {"standing": 0, "table": 0}
     simulation.network.trace = lambda _, source, destination, topic, payload: messages.update(
         {topic: messages.get(topic, 0) + 1}
@@ -79,7 +79,7 @@ def test_agents_that_drove_alone_and_died_are_not_driven_into():
     crashes = tuple(Crash(3 + 1.1 * n, f"agent-a{(3 * n) % 8}") for n in range(12))
     plan = FaultPlan(drop=0.05, jitter_ms=20, reorder=0.05, quiet_s=17, crashes=crashes)
     simulation = Simulation(seeded(7, WIDE), faults=plan)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(SECONDS)
     assert laws.collisions == laws.lethal == []
     back = [vehicle for service in agents_of(simulation) for vehicle in service.agent.vehicles]

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
+from support.ordered_simulation import OrderedSimulation
 
 from launch_scripts.commands.status_view import print_status, status_fields, status_of
 from launch_scripts.launcher.tables import live_table
@@ -23,7 +24,6 @@ from launch_scripts.observe import facts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.state import RunState
 from launch_scripts.simulation.node import EPOCH_NS
-from launch_scripts.simulation.simulate import Simulation
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
@@ -57,15 +57,15 @@ _HIDDEN = _BASE.replace("speed_m_per_s = 1\n", 'speed_m_per_s = 1\ntracker = "si
 _SHOWN_S = 4.5
 """When the running swarm is looked at."""
 
-Run = tuple[str, Scenario, Callable[[Simulation], None]]
+Run = tuple[str, Scenario, Callable[[OrderedSimulation], None]]
 
 
 def _scenario(text: str = _BASE, **changes: Any) -> Scenario:
     return msgspec.structs.replace(parse_scenario(text), **changes)
 
 
-def _crashes(*when: tuple[float, str, bool]) -> Callable[[Simulation], None]:
-    def plan(simulation: Simulation) -> None:
+def _crashes(*when: tuple[float, str, bool]) -> Callable[[OrderedSimulation], None]:
+    def plan(simulation: OrderedSimulation) -> None:
         for at_s, name, for_good in when:
             simulation.scheduler.at(
                 EPOCH_NS + int(at_s * NS_PER_S),
@@ -75,19 +75,19 @@ def _crashes(*when: tuple[float, str, bool]) -> Callable[[Simulation], None]:
     return plan
 
 
-def _guest(simulation: Simulation) -> None:
+def _guest(simulation: OrderedSimulation) -> None:
     guest = added_agent(simulation.scenario, "g", simulation.scenario.groups[0].name, 1, "cell:12,12")
     simulation.scheduler.at(EPOCH_NS + NS_PER_S, lambda: simulation.add(guest) and None)
     _crashes((3.5, "agent-g", True))(simulation)
 
 
-def _orders(simulation: Simulation) -> None:
+def _orders(simulation: OrderedSimulation) -> None:
     simulation.order(0.8, GiveOrder(subject="target", name="x", new=True, cell=12 * _SIDE + 12))
     simulation.order(2.0, GiveOrder(subject="target", name="t1", off=True))
     simulation.order(1.5, GiveOrder(subject="vehicle", name="a0-00"))
 
 
-def _zone(simulation: Simulation) -> None:
+def _zone(simulation: OrderedSimulation) -> None:
     simulation.order(1.0, ZoneOrder(action="add", name="mine", polygon=[(4, 4), (4, 9), (9, 9), (9, 4)]))
     _crashes((3.0, "agent-a1", True))(simulation)
 
@@ -154,7 +154,7 @@ class Watched:
 
     def __init__(self, scenario: Scenario) -> None:
         terrain = terrain_of_pace(np.full((_SIDE, _SIDE), 0.3, np.float32), 10.0)
-        self.simulation = simulation = Simulation(scenario, terrain=terrain)
+        self.simulation = simulation = OrderedSimulation(scenario, terrain=terrain)
         self.logged = Logged()
         setup = RoleSetup(scenario, simulation.run_id, "monitor", "0", EPOCH_NS + 1, EPOCH_NS)
         bus = simulation.network.bus("monitor-0", scenario.network.namespace, simulation.authenticator)
@@ -247,7 +247,7 @@ def table_of(state: RunState) -> str:
 
 @pytest.mark.parametrize(("scenario", "plan"), [run[1:] for run in RUNS], ids=[run[0] for run in RUNS])
 def test_no_fact_that_is_shown_in_two_places_differs(
-    scenario: Scenario, plan: Callable[[Simulation], None]
+    scenario: Scenario, plan: Callable[[OrderedSimulation], None]
 ) -> None:
     watched = Watched(scenario)
     simulation = watched.simulation

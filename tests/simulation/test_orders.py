@@ -6,12 +6,12 @@ import random
 from typing import Any
 
 import pytest
+from support.ordered_simulation import OrderedSimulation
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
-from launch_scripts.simulation.laws import LawBook, Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.world.service import TargetsService
 from launch_scripts.simulation.worlds import SMALL, seeded
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -27,24 +27,24 @@ def terrain() -> Terrain:
     return build_terrain(SMALL)
 
 
-def simulated(terrain: Terrain, faults: FaultPlan | None = None, seed: int = 1) -> Simulation:
-    return Simulation(seeded(seed), faults=faults, terrain=terrain)
+def simulated(terrain: Terrain, faults: FaultPlan | None = None, seed: int = 1) -> OrderedSimulation:
+    return OrderedSimulation(seeded(seed), faults=faults, terrain=terrain)
 
 
-def agents(simulation: Simulation) -> list[AgentService]:
+def agents(simulation: OrderedSimulation) -> list[AgentService]:
     found = [node.service for node in simulation.nodes.values()]
     return [service for service in found if isinstance(service, AgentService)]
 
 
-def vehicles(simulation: Simulation) -> dict[str, Any]:
+def vehicles(simulation: OrderedSimulation) -> dict[str, Any]:
     return {id: vehicle for each in agents(simulation) for id, vehicle in each.agent.vehicles.items()}
 
 
-def cells(simulation: Simulation) -> dict[str, int]:
+def cells(simulation: OrderedSimulation) -> dict[str, int]:
     return {id: vehicle.cell for id, vehicle in vehicles(simulation).items()}
 
 
-def target_cells(simulation: Simulation) -> dict[str, int]:
+def target_cells(simulation: OrderedSimulation) -> dict[str, int]:
     (service,) = [n.service for n in simulation.nodes.values() if isinstance(n.service, TargetsService)]
     return {id: target.walker.cell for id, target in service._world._targets.items()}
 
@@ -67,7 +67,7 @@ def test_a_pause_stops_everything_and_a_resume_lets_it_go_on(terrain: Terrain) -
 
 def test_a_stopped_vehicle_stands_and_the_others_drive_on(terrain: Terrain) -> None:
     simulation = simulated(terrain)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.order(4.0, GiveOrder(subject="vehicle", name="a0-01"))
     simulation.run_until(7.0)
     before = cells(simulation)
@@ -92,7 +92,7 @@ def test_a_group_chases_what_it_is_told_and_then_again_all(terrain: Terrain) -> 
 
 def test_an_added_target_is_chased_and_a_removed_one_leaves_nobody_lost(terrain: Terrain) -> None:
     simulation = simulated(terrain)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     (row, col) = divmod(
         terrain.random_place() if hasattr(terrain, "random_place") else _open(terrain), terrain.grid.cols
     )

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Node, Simulation
 from launch_scripts.simulation.worlds import SMALL, seeded
 from planner_service.service import PlannerService
@@ -35,7 +35,7 @@ class Asker:
         self.answered_s: dict[str, list[float]] = {id: [] for id in simulation.scenario.target_ids}
         self.bus = simulation.network.bus("asker-0", simulation.scenario.network.namespace)
         for n in range(int(until_s / ASK_S)):
-            simulation._at(n * ASK_S, self.ask)
+            simulation.at(n * ASK_S, self.ask)
 
     def ask(self) -> None:
         for target in self.answered_s:
@@ -69,7 +69,7 @@ def test_the_leader_of_each_target_dies_for_good_and_every_query_is_answered_aga
     crashes = tuple(Crash(8 + 2.3 * n, f"planner-t{n}", for_good=True) for n in range(2))
     plan = FaultPlan(drop=0.02, jitter_ms=10, crashes=crashes)
     simulation = Simulation(seeded(seed, STANDING_BY), faults=plan)
-    laws, asker = Laws(simulation), Asker(simulation, 20)
+    laws, asker = LawBook(simulation), Asker(simulation, 20)
     simulation.run_until(7)
     assert [leaders(simulation, id) for id in ("t0", "t1")] == [["planner-t0"], ["planner-t1"]]
     simulation.run_until(20)

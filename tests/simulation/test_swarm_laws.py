@@ -11,7 +11,7 @@ import pytest
 from launch_scripts.simulation import simulate as simulate_module
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
-from launch_scripts.simulation.laws import LawBook, Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation, simulate
 from launch_scripts.simulation.worlds import SMALL, seeded
 from swarm.config.load import load_scenario
@@ -28,7 +28,7 @@ def agent_of(simulation: Simulation, name: str) -> Agent:
     return service.agent
 
 
-def check_all(simulation: Simulation) -> Laws:
+def check_all(simulation: Simulation) -> LawBook:
     """Run to the end; every law holds."""
     trial = LawBook(simulation)
     assert trial.run(SECONDS) == []
@@ -38,7 +38,7 @@ def check_all(simulation: Simulation) -> Laws:
     ]
     np.testing.assert_array_equal(*planners)
     simulation.finish()
-    return trial.laws
+    return trial
 
 
 def test_a_run_in_which_nothing_goes_wrong_keeps_every_law_and_does_its_work():
@@ -84,7 +84,7 @@ def test_agents_that_die_again_and_again_collide_with_nobody():
 def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), quiet_s=16)
     simulation = Simulation(seeded(2), faults=plan)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(4)
     agent = agent_of(simulation, "agent-a1")
     simulation.run_until(4.2)  # what was on its way before the cut may still be granted
@@ -99,7 +99,7 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
 def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_vehicles_stood():
     plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), crashes=(Crash(9, "agent-a1"),), quiet_s=16)
     simulation = Simulation(seeded(1), faults=plan)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(8.9)
     stood = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
     simulation.run_until(12)
@@ -114,7 +114,7 @@ def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_v
 
 def test_a_planner_killed_under_way_serves_routes_again_within_three_seconds():
     simulation = Simulation(seeded(3), faults=FaultPlan(crashes=(Crash(8, "planner-t0"),)))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(8 - 0.001)
     simulation.run_until(11)
     service = simulation.nodes["planner-t0"].service
@@ -145,7 +145,7 @@ def test_targets_that_evade_jump_or_stand_still_are_caught():
 def test_the_demo_on_real_terrain_routes_everybody_and_captures():
     scenario = load_scenario(SCENARIOS / "jacksboro.toml")
     simulation = Simulation(scenario)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(10)
     simulation.finish()
     report = simulation.report(10)

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import EPOCH_NS
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.world.service import TargetsService
@@ -58,7 +58,7 @@ class OutsideTracker:
         self.bus = self.simulation.network.bus(f"{self.name}-{self.from_s}", EXTERNAL.network.namespace)
         times = [self.from_s + n / 5 for n in range(int(5 * (self.until_s - self.from_s)))]
         for at_s in times:
-            self.simulation._at(at_s, lambda last=at_s == times[-1]: self.tell(last and self.hands_over))  # type: ignore[misc]
+            self.simulation.at(at_s, lambda last=at_s == times[-1]: self.tell(last and self.hands_over))  # type: ignore[misc]
 
     def tell(self, over: bool) -> None:
         grid = self.simulation.terrain.grid
@@ -164,7 +164,7 @@ def states(simulation: Simulation) -> set[VehicleState]:
 @pytest.mark.parametrize("clock_off_s", [0.0, HOUR_S, -HOUR_S])
 def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clock_off_s: float) -> None:
     simulation = Simulation(seeded(1, EXTERNAL), faults=LOSSY)
-    laws, ear = Laws(simulation), Ear(simulation)
+    laws, ear = LawBook(simulation), Ear(simulation)
     OutsideTracker(simulation, "radar", 20, 3, 12, clock_off_s)
     simulation.run_until(2.5)
     assert ear.status is not None
@@ -207,7 +207,7 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
 
 def test_a_target_whose_tracker_stays_lost_is_searched_for_until_it_or_a_vehicle_tells_where_it_is() -> None:
     simulation = Simulation(seeded(1, EXTERNAL))
-    laws, ear = Laws(simulation), Ear(simulation)
+    laws, ear = LawBook(simulation), Ear(simulation)
     OutsideTracker(simulation, "radar", 20, 3, 12)
     simulation.run_until(30)
     assert states(simulation) == {VehicleState.OUTDATED}

@@ -9,12 +9,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from support.ordered_simulation import OrderedSimulation
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
-from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL, crowd, seeded
 from shared_map.terrain.terrain import build_terrain
 from swarm.bus.bus import Event
@@ -184,7 +184,7 @@ class Interplay:
                 from_s = chance.uniform(4.0, quiet_s - 3.0)
                 cuts.append(Partition(from_s, from_s + chance.choice((0.7, 3.0)), (name,), chance.random() < 0.4))
         self.plan = plan = dataclasses.replace(plan, partitions=tuple(cuts))
-        self.simulation = simulation = Simulation(scenario, faults=plan, terrain=terrain)
+        self.simulation = simulation = OrderedSimulation(scenario, faults=plan, terrain=terrain)
         self.grid = terrain.grid
         self.open = np.isfinite(terrain.pace_s_per_m).ravel() & np.isfinite(simulation.truth).ravel()
         self.free = [int(cell) for cell in np.flatnonzero(self.open)]
@@ -275,9 +275,7 @@ class Interplay:
             *(ZoneOrder(action="remove", name=name) for name in "abc"),
         ]
         for order in ends:
-            self.calls += [
-                (quiet_s + 1.5 + again, lambda o=order: simulation._give(o)) for again in (0.0, 0.4, 0.8)
-            ]
+            self.calls += [(quiet_s + 1.5 + again, lambda o=order: simulation.give(o)) for again in (0.0, 0.4, 0.8)]
         self.calls.append((quiet_s + 1.5, self._end_guests))
         self.calls.sort(key=lambda call: call[0])
 
@@ -349,20 +347,20 @@ class Interplay:
             ZoneOrder(action="add", name=chance.choice("abc"), polygon=corners, lasts_s=chance.choice([1.0, 4.0])),
             ZoneOrder(action="remove", name=chance.choice("abc")),
         ])  # fmt: skip
-        simulation._give(order)
+        simulation.give(order)
 
     # --- laws -------------------------------------------------------------------------------------------------
 
     def _forget_removed(self, node: Node) -> None:
         """What has left by its agent's word stands nowhere."""
         if isinstance(node.service, AgentService):
-            bodies = self.trial.laws._bodies.get(node.name, {})
+            bodies = self.trial._cells.get(node.name, {})
             gone = node.service._removed | (bodies.keys() & node.service.agent.holdings._away)
             for id in gone:
                 bodies.pop(id, None)
             self.removed |= gone
         for robot in self.robots:
-            self.trial.laws._bodies[robot.name] = {} if robot.on is None else {robot.name: robot.on}
+            self.trial._cells[robot.name] = {} if robot.on is None else {robot.name: robot.on}
 
     def _look(self, node: Node) -> None:
         if not isinstance(node.service, AgentService):
@@ -407,18 +405,17 @@ class Interplay:
         broken += self._orders_obeyed()
         for text in map(str, self.trial.run(self.seconds)):
             if "vehicles have no route any more" in text:
-                lost = [id for id in self.trial.routed.missing() if id not in self.removed]
+                lost = [id for id in self.trial.never_routed() if id not in self.removed]
                 if lost:
                     broken.append(f"no route any more: {lost}")
                 continue
             if text.startswith("driven into body"):
                 continue
             broken.append(text)
-        broken += [str(law) for law in self.trial.bodies.broken if "into body flood-" not in str(law)]
-        routed = self.trial.routed
-        if routed.whole_s is not None:
-            late = max((at for id, at in routed._at_s.items() if id not in self.removed), default=0.0)
-            self.routed_after_s = late - routed.whole_s
+        broken += [str(law) for law in self.trial.driven_into if "into body flood-" not in str(law)]
+        if self.trial.whole_s is not None:
+            late = max((at for id, at in self.trial.routed_s.items() if id not in self.removed), default=0.0)
+            self.routed_after_s = late - self.trial.whole_s
         return broken
 
     def _advance(self, until_s: float) -> None:

@@ -14,11 +14,12 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.simulation import simulate
 from launch_scripts.simulation.campaign import raised, try_seed
 from launch_scripts.simulation.laws import BrokenLaw
+from launch_scripts.simulation.simulate import Simulation
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError
+from swarm.runtime.process import collected_rarely
 
 _PACKAGES = (
     "swarm",
@@ -125,13 +126,16 @@ def numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
 def _plain(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
     """As `swarm simulate SCENARIO --seed N`."""
     assert trial.scenario is not None
-    reached_s = [0.0]
+    simulation = Simulation(msgspec.structs.replace(trial.scenario, seed=trial.seed, seconds=trial.seconds))
     try:
-        report = simulate.simulate(trial.scenario, trial.seed, trial.seconds, progress=reached_s.append).report
+        with collected_rarely():
+            simulation.run_until(trial.seconds)
+            simulation.finish()
     except SwarmError:
         raise
     except Exception as error:
-        return {}, [raised(error, reached_s[-1])]
+        return {}, [raised(error, simulation.now_s)]
+    report = simulation.report(trial.seconds)
     broken = {name: law for name, law in LAWS.items() if report.get(name)}
     return report, [BrokenLaw(law, f"{report[name]} {name.replace('_', ' ')}") for name, law in broken.items()]
 

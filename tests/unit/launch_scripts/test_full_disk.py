@@ -12,28 +12,8 @@ from pathlib import Path
 import pytest
 
 from launch_scripts.observe.run_folder import DiskWatch
-from launch_scripts.simulation.simulate import EventLog
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
-
-
-def test_an_event_log_is_cut_and_the_counting_goes_on() -> None:
-    with Path("/dev/full").open("w", encoding="utf-8") as full:
-        log = EventLog(0, full)
-        for n in range(10_000):
-            log.delivery(n, "a", "b", "pose", b"x")
-        log.flush()
-    assert log.deliveries == 10_000
-    assert log.cut == "No space left on device"
-
-
-def test_an_event_log_that_fits_is_whole(tmp_path: Path) -> None:
-    with (tmp_path / "events.log").open("w", encoding="utf-8") as out:
-        log = EventLog(0, out)
-        log.event(1, "crash", "a")
-        log.flush()
-    assert log.cut is None
-    assert (tmp_path / "events.log").read_text() == "0.000000001 crash a\n"
 
 
 def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so(tmp_path: Path) -> None:

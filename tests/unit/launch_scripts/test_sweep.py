@@ -9,7 +9,6 @@ import signal
 import statistics as plain
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -22,7 +21,7 @@ from support.small_study import STUDY, write_study
 from launch_scripts.commands.simulation_commands import sweep_study
 from launch_scripts.simulation.campaign import try_seed
 from launch_scripts.simulation.laws import BrokenLaw
-from launch_scripts.simulation.simulate import simulate
+from launch_scripts.simulation.simulate import Simulation, simulate
 from launch_scripts.simulation.study import summary as statistics
 from launch_scripts.simulation.study.study import (
     Study,
@@ -233,10 +232,10 @@ def test_a_trial_with_faults_is_that_of_swarm_simulate_seeds():
 def test_a_service_that_raises_is_a_broken_law_and_other_code_is_refused(tmp_path, monkeypatch):
     [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
 
-    def fails(*args: object, **named: object) -> None:
+    def fails(*_: object) -> None:
         raise RuntimeError("it fell over")
 
-    monkeypatch.setattr("launch_scripts.simulation.simulate.simulate", fails)
+    monkeypatch.setattr(Simulation, "run_until", fails)
     [law] = run_trial(case.trials[0]).broken
     assert law.law == "a service raised"
     assert "it fell over" in law.sentence
@@ -248,8 +247,7 @@ def test_figures_that_must_be_zero_are_laws(tmp_path, monkeypatch):
     [case, _] = plan(load_study(write_study(tmp_path)), tmp_path, "x")
 
     report = {"collisions": 2, "lethal_entries": 0, "marks": None, "alarms": ["x"], "simulated": True}
-    done = SimpleNamespace(report=report)
-    monkeypatch.setattr("launch_scripts.simulation.simulate.simulate", lambda *_, **__: done)
+    monkeypatch.setattr(Simulation, "report", lambda *_: report)
     result = run_trial(case.trials[0])
     assert result.broken == [BrokenLaw("no collision", "2 collisions")]
     assert result.figures == {"collisions": 2.0, "lethal_entries": 0.0}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import of_file, seeded
 from shared_map.cost_map import CostMap
@@ -123,7 +123,7 @@ def check_interest(simulation: Simulation) -> tuple[int, int]:
 def test_agents_hold_what_is_near_their_vehicles_and_all_of_it(seed: int) -> None:
     faults = random_plan(seed, nodes_of(NEAR), 20.0)
     simulation = Simulation(seeded(seed, NEAR), faults=faults)
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     simulation.run_until(18)
     for node in simulation.nodes.values():
         if isinstance(node.service, AgentService):

@@ -6,7 +6,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL
 from shared_map.keeper.mark_store import KeeperStore
@@ -151,7 +151,7 @@ UNTRACKED = msgspec.structs.replace(
 
 def test_targets_that_nobody_tracks_are_chased_by_what_vehicles_see() -> None:
     simulation = Simulation(msgspec.structs.replace(UNTRACKED, seed=3))
-    laws = Laws(simulation)
+    laws = LawBook(simulation)
     heard: list[Heard] = []
     ear = simulation.network.bus("ear")
     ear.subscribe(POSE, heard.append)  # type: ignore[arg-type]
