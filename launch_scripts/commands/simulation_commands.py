@@ -292,8 +292,6 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
                 console.print(f"{trial.world} seed {trial.seed} broke a law: {law}")
             if result is None:
                 console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
-            while sweep.warned:
-                console.print(sweep.warned.pop(0))
             tell(f"{done:,} of {sweep.trials:,} trials, {failed:,} broke a law", done / sweep.trials)
             if stops:
                 raise KeyboardInterrupt

@@ -9,10 +9,11 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import os.path
 import re
+import textwrap
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,13 +34,14 @@ from swarm.config.values import Name, Options, Positive, Section
 from swarm.errors import ConfigError
 
 MOST_TRIALS = 1_000_000
-_LONGEST = 200
-"""Letters of a name: pictures are called by it."""
-_LONGEST_PATH = 4096
 SMALL_WORLDS = (MIX, *WORLDS)
-_hash = partial(hashlib.blake2b, digest_size=12)
 STUDIES = Path(__file__).parents[2] / "studies"
 """The project's own."""
+Shown = Annotated[
+    str, Meta(pattern=r"^[^\x00-\x1f\x7f-\x9f]{1,200}\Z", description="1 to 200 characters that print")
+]
+"""A name that tables show and pictures are called by."""
+_hash = partial(hashlib.blake2b, digest_size=12)
 
 
 class Study(Section, frozen=True, kw_only=True):
@@ -59,13 +61,13 @@ class Study(Section, frozen=True, kw_only=True):
 
     name: Name = ""
     about: str = ""
-    scenarios: Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
+    scenarios: Annotated[tuple[Shown, ...], Meta(min_length=1, max_length=1000)]
     seeds: str = "0:10"
     seconds: Positive | None = None
     faults: bool = False
-    outcomes: tuple[str, ...] = ()
+    outcomes: tuple[Shown, ...] = ()
     parameters: Options = msgspec.field(default_factory=dict)
-    variants: dict[str, Options] = msgspec.field(default_factory=dict)
+    variants: dict[Shown, Options] = msgspec.field(default_factory=dict)
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,25 +86,16 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     variant: str
     label: str
     settings: dict[str, Any]
-    path: str = ""
-    given: Scenario | None = None
-    trials: tuple[Trial, ...] = ()
-
-    @property
-    def is_own(self) -> bool:
-        """Whether no file says what the case is: its scenario is changed."""
-        return self.given is not None and bool(self.settings)
+    path: str
+    given: Scenario | None
+    trials: tuple[Trial, ...]
 
 
 def study_path(name: str) -> Path:
     """The file of a study of the project by its name, or the one named. Raises ConfigError where there is none."""
-    built_in = STUDIES / f"{name}.toml"
-    if "/" in name or is_file(Path(name)) or not is_file(built_in):
-        if not name.endswith(".toml"):
-            names = study_names()
-            raise ConfigError(f"no study {quoted(name)}{choice(name, names, ' give a .toml file or one of: ')}")
-        return Path(name)
-    return built_in
+    if not name.endswith(".toml") and name not in study_names():
+        raise ConfigError(f"no study {quoted(name)}{choice(name, study_names(), ' give a .toml file or one of: ')}")
+    return Path(name) if name.endswith(".toml") else STUDIES / f"{name}.toml"
 
 
 def study_names() -> list[str]:
@@ -114,13 +107,6 @@ def load_study(path: Path) -> Study:
     """Reads and checks a study. Raises ConfigError that names the file and the key."""
     name = re.sub("[^A-Za-z0-9_.-]+", "-", path.stem).lstrip(".-")[:41]
     return parse_study(read_text(path, FileKind.STUDY), str(path), name or "study")
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is such a file; no file has a name that the system refuses."""
-    with suppress(OSError, ValueError):
-        return path.is_file()
-    return False
 
 
 def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
@@ -140,109 +126,81 @@ def parse_study(text: str, source: str = "study", name: str = "study") -> Study:
     return study
 
 
-def cases_of(study: Study) -> list[Case]:
-    """Every scenario with every variant and every combination of parameters, in the order of the file."""
-    parameters = dict(flat(study.parameters))
-    variants: Mapping[str, dict[str, Any]] = {name: dict(flat(of)) for name, of in study.variants.items()}
-    names = _short_names(parameters)
-    return [
-        Case(
-            scenario=scenario,
-            variant=variant,
-            label=_label(variant, {names[key]: value for key, value in varied.items()}),
-            settings={**settings, **varied},
-        )
-        for scenario in study.scenarios
-        for variant, settings in (variants or {"": {}}).items()
-        for values in itertools.product(*parameters.values())
-        for varied in [dict(zip(parameters, values, strict=True))]
-    ]
-
-
 def _faults(study: Study, seeds: int) -> Iterator[str]:
     """What is wrong with a study beyond what its types say, the most important first."""
     varied = dict(flat(study.parameters))
     settings = [(name, key) for name, of in study.variants.items() for key, _ in flat(of)]
+    settled = {key for _, key in settings} | varied.keys()
     for key, values in varied.items():
         if not isinstance(values, list) or not values:
             yield f"parameters.{key}: found {quoted(values)}, expected a list of values"
-    lists = {"scenarios": study.scenarios, "outcomes": study.outcomes}
-    for what, given in (lists | {f"parameters.{key}": values for key, values in varied.items()}).items():
-        # 1, 1.0 and true are three values in TOML, as they are written.
-        for text, many in Counter(map(repr, given)).items():
-            if many > 1:
-                yield f"{what}: found {quoted(next(each for each in given if repr(each) == text))} twice"
     cases = math.prod(map(len, varied.values())) * len(study.scenarios) * max(1, len(study.variants))
     if cases * seeds > MOST_TRIALS:
         yield f"it has {cases * seeds:,} trials, expected at most {MOST_TRIALS:,}"
-    for what, names in (lists | {"variants": tuple(study.variants)}).items():
-        longest = _LONGEST_PATH if what == "scenarios" else _LONGEST
-        for name in names:
-            if not name.isprintable() or not 0 < len(name) <= longest:
-                yield f"{what}: found {quoted(name)}, expected 1 to {longest} characters that print"
-    if not study.about.replace("\n", "").isprintable():
-        yield f"about: found {quoted(study.about)}, expected printable text"
     for name, key in settings:
         if key in varied:
             yield f"variants.{name}.{key}: it is one of the parameters, too"
     for name in study.scenarios:
         if name in SMALL_WORLDS and not study.faults:
             yield f"scenarios: {name!r} is a small world, which goes with faults = true"
-        if name in SMALL_WORLDS and (varied or settings):
+        if name in SMALL_WORLDS and settled:
             yield f"scenarios: {name!r} is a small world, which takes no parameters and no variants"
-    settled = {key for _, key in settings} | varied.keys()
     if "seed" in settled:
         yield "seed: it is no setting of a study, whose `seeds` are those of each case"
     if "seconds" in settled and (study.faults or study.seconds is not None):
         yield "seconds: it does nothing where `faults` or `seconds` of the study say how long trials are"
 
 
-def _short_names(keys: Iterable[str]) -> dict[str, str]:
-    """The last part of each key, as far as that is no part of two."""
-    last = {key: key.rpartition(".")[2] for key in keys}
-    many = Counter(last.values())
-    return {key: name if many[name] == 1 else key for key, name in last.items()}
-
-
-def _label(variant: str, varied: Mapping[str, Any]) -> str:
-    parts = [variant] if variant else []
-    for name, value in varied.items():
-        text = value if isinstance(value, str) and value.isprintable() else quoted(value)
-        parts.append(f"{name} = {text if len(text) <= 40 else f'{text[:37]}...'}")
-    return ", ".join(parts) or "as it is"
+def combinations(study: Study) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
+    """Scenario, variant, label and settings of every case, in the order of the file."""
+    parameters = dict(flat(study.parameters))
+    last = Counter(key.rpartition(".")[2] for key in parameters)
+    for scenario, (variant, of) in itertools.product(study.scenarios, (study.variants or {"": {}}).items()):
+        for values in itertools.product(*parameters.values()):
+            varied = dict(zip(parameters, values, strict=True))
+            parts = [variant] if variant else []
+            for key, value in varied.items():
+                short = key.rpartition(".")[2]
+                text = value if isinstance(value, str) and value.isprintable() else quoted(value)
+                parts.append(f"{short if last[short] == 1 else key} = {textwrap.shorten(text, 40)}")
+            yield scenario, variant, ", ".join(parts) or "as it is", {**dict(flat(of)), **varied}
 
 
 def plan(study: Study, base: Path, source: str) -> list[Case]:
     """The cases of a study, with their trials. Raises ConfigError on a scenario that cannot be read, or not with
     these settings.
 
-    base    folder of the study, beside which its scenarios lie
+    base    folder of the study; a scenario that lies there goes before a built-in one
     source  what errors call the study
     """
-    return [_planned(study, case, base, source) for case in cases_of(study)]
+    return [_planned(study, base, source, *each) for each in combinations(study)]
 
 
-def _planned(study: Study, case: Case, base: Path, source: str) -> Case:
-    path, given = (case.scenario, None) if case.scenario in SMALL_WORLDS else _scenario(case, base, source)
+def _planned(
+    study: Study, base: Path, source: str, name: str, variant: str, label: str, settings: dict[str, Any]
+) -> Case:
+    path, given, settled = name, None, ""
+    if name not in SMALL_WORLDS:
+        file = base / name if os.path.isfile(base / name) else scenario_path(name)
+        path = name if file.parent == SCENARIOS else str(file)
+        where = f"{source}: {path} with {label}" if settings else path
+        given = parse_scenario(read_text(file, FileKind.SCENARIO), where, file.parent.absolute(), settings)
+        settled = _digest(_settings(given))
     seconds = study.seconds or (SECONDS if study.faults or given is None else given.seconds)
-    version = code_version()
-    settled = "" if given is None else _digest(_settings(given))
     trials = []
     for seed in parse_seeds(study.seeds, "seeds"):
-        world = world_of(case.scenario, seed) if given is None else given.name
-        key = _digest([version, world, settled, seed, seconds, study.faults])
-        trials.append(Trial(key, world, given, seed, seconds, study.faults, version))
-    return msgspec.structs.replace(case, path=path, given=given, trials=tuple(trials))
-
-
-def _scenario(case: Case, base: Path, source: str) -> tuple[str, Scenario]:
-    """Path or name of a case's scenario, and the scenario. One beside the study goes before a built-in one."""
-    beside = base / case.scenario
-    path = beside if is_file(beside) else scenario_path(case.scenario)
-    name = case.scenario if path.parent == SCENARIOS else str(path)
-    where = f"{source}: {name} with {case.label}" if case.settings else name
-    text = read_text(path, FileKind.SCENARIO)
-    return name, parse_scenario(text, where, path.parent.absolute(), case.settings)
+        world = world_of(name, seed) if given is None else given.name
+        key = _digest([code_version(), world, settled, seed, seconds, study.faults])
+        trials.append(Trial(key, world, given, seed, seconds, study.faults, code_version()))
+    return Case(
+        scenario=name,
+        variant=variant,
+        label=label,
+        settings=settings,
+        path=path,
+        given=given,
+        trials=tuple(trials),
+    )
 
 
 def _settings(scenario: Scenario) -> Any:

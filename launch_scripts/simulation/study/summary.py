@@ -41,9 +41,11 @@ class Estimate(msgspec.Struct, frozen=True):
     high: float | None = None
 
 
-def mean(values: Sequence[float]) -> Estimate:
-    """The mean. The bootstrap draws by a fixed seed: the same values give the same interval."""
+def mean(values: Sequence[float]) -> Estimate | None:
+    """The mean; None of no values. The bootstrap draws by a fixed seed: the same values give the same interval."""
     data = np.asarray(values, np.float64)
+    if not len(data):
+        return None
     middle = float(data.mean())
     if len(data) < 3:
         return Estimate(middle)
@@ -60,9 +62,12 @@ def mean(values: Sequence[float]) -> Estimate:
     return Estimate(middle, low, high) if math.isfinite(low) and math.isfinite(high) else Estimate(middle)
 
 
-def median(values: Sequence[float]) -> Estimate:
-    """The median, between two of the values: so many ranks from either end that the binomial law says."""
+def median(values: Sequence[float]) -> Estimate | None:
+    """The median, between two of the values: so many ranks from either end that the binomial law says; None of no
+    values."""
     data = np.sort(np.asarray(values, np.float64))
+    if not len(data):
+        return None
     middle = float(np.median(data))
     # Below the rank r lie r values or more, if r of n coins show heads.
     rank = int(stats.binom.ppf((1 - LEVEL) / 2, len(data), 0.5))
@@ -132,26 +137,27 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     failing: list[Failure]
 
 
-def summarise(
-    study: Study, cases: Sequence[Case], results: Mapping[str, Result], files: Mapping[int, str]
-) -> Summary:
+def name_of(case: Case, trial: Trial) -> str:
+    """The scenario of a trial, or its small world."""
+    return trial.world if case.given is None else case.scenario
+
+
+def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]) -> Summary:
     """The summary of all results that are there.
 
     results  key of a trial -> result
-    files    number of a case -> what `swarm simulate` is to run instead of the scenario that the study names
     """
     told: list[CaseSummary] = []
     failing: list[Failure] = []
     first: dict[str, dict[str, dict[int, float]]] = {}
-    for number, case in enumerate(cases):
+    for case in cases:
         pairs = [(trial, results[trial.key]) for trial in case.trials if trial.key in results]
         values = {
             name: {trial.seed: result.figures[name] for trial, result in pairs if name in result.figures}
             for name in study.outcomes or OUTCOMES[study.faults]
         }
         base = first.setdefault(case.scenario, values)
-        runs = files.get(number, case.path)
-        failures = [_failure(case, trial, result, runs) for trial, result in pairs if result.broken]
+        failures = [_failure(case, trial, result) for trial, result in pairs if result.broken]
         failing += failures
         told.append(
             CaseSummary(
@@ -182,24 +188,19 @@ def summarise(
 def _outcome(values: dict[int, float], base: Mapping[int, float]) -> Outcome:
     numbers = list(values.values())
     differences = [value - base[seed] for seed, value in values.items() if seed in base]
-    return Outcome(
-        values=values,
-        mean=mean(numbers) if numbers else None,
-        median=median(numbers) if numbers else None,
-        difference=mean(differences) if differences else None,
-    )
+    return Outcome(values=values, mean=mean(numbers), median=median(numbers), difference=mean(differences))
 
 
-def _failure(case: Case, trial: Trial, result: Result, runs: str) -> Failure:
-    name = trial.world if case.given is None else shlex.quote(runs)
+def _failure(case: Case, trial: Trial, result: Result) -> Failure:
     usual_s = SECONDS if trial.faults or case.given is None else case.given.seconds
+    runs = trial.world if case.given is None else shlex.quote(case.path)
     return Failure(
-        scenario=trial.world if case.given is None else case.scenario,
+        scenario=name_of(case, trial),
         label=case.label,
         seed=trial.seed,
         laws=list(dict.fromkeys(law.law for law in result.broken)),
         sentences=[law.sentence for law in result.broken],
-        replay=replay_of(name, trial.seed, trial.seconds, usual_s, "seeds" if trial.faults else "seed"),
+        replay=replay_of(runs, trial.seed, trial.seconds, usual_s, "seeds" if trial.faults else "seed"),
     )
 
 

@@ -16,9 +16,8 @@ import pyarrow.parquet as pq
 from launch_scripts.observe.run_folder import write_file
 from launch_scripts.simulation.study.cluster import client_of, local_client, run_trials
 from launch_scripts.simulation.study.study import Case, load_study, plan
-from launch_scripts.simulation.study.summary import Summary, document, pictures_of, summarise
+from launch_scripts.simulation.study.summary import Summary, document, name_of, pictures_of, summarise
 from launch_scripts.simulation.study.trials import Result, Trial
-from swarm.config.explain import nearest
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
 
@@ -68,21 +67,23 @@ class ResultStore:
 RESULTS, PAGE, NUMBERS, SCENARIOS = "results.parquet", "summary.md", "summary.json", "scenarios"
 SETTING = "set."
 """Begins the name of a column that holds a setting of a case."""
-_SCHEMA = {
-    "scenario": pa.string(),
-    "variant": pa.string(),
-    "seed": pa.int64(),
-    "seconds": pa.float64(),
-    "faults": pa.bool_(),
-    "law": pa.string(),  # the first that broke
-    "law_at_s": pa.float64(),
-    "sentence": pa.string(),
-    "broken": pa.int64(),
-    "wall_s": pa.float64(),
-    "cpu_s": pa.float64(),
-    "version": pa.string(),
-    "key": pa.string(),
+_Told = Callable[[Case, Trial, Result], Any]
+_COLUMNS: dict[str, tuple[pa.DataType, _Told]] = {
+    "scenario": (pa.string(), lambda case, trial, result: name_of(case, trial)),
+    "variant": (pa.string(), lambda case, trial, result: case.variant or None),
+    "seed": (pa.int64(), lambda case, trial, result: trial.seed),
+    "seconds": (pa.float64(), lambda case, trial, result: trial.seconds),
+    "faults": (pa.bool_(), lambda case, trial, result: trial.faults),
+    "law": (pa.string(), lambda case, trial, result: result.first and result.first.law),
+    "law_at_s": (pa.float64(), lambda case, trial, result: result.first and result.first.at_s),
+    "sentence": (pa.string(), lambda case, trial, result: result.first and result.first.sentence),
+    "broken": (pa.int64(), lambda case, trial, result: len(result.broken)),
+    "wall_s": (pa.float64(), lambda case, trial, result: result.wall_s),
+    "cpu_s": (pa.float64(), lambda case, trial, result: result.cpu_s),
+    "version": (pa.string(), lambda case, trial, result: trial.version),
+    "key": (pa.string(), lambda case, trial, result: trial.key),
 }
+"""Column -> its type, and what it holds of a trial; a column for each setting and each figure follows."""
 
 
 class Sweep:
@@ -90,7 +91,6 @@ class Sweep:
 
     cases    of it, with their trials
     missing  the trials that have no result yet
-    warned   what a person should know about it
     """
 
     def __init__(self, path: Path, out: Path | None) -> None:
@@ -102,8 +102,6 @@ class Sweep:
         unique = {trial.key: trial for case in self.cases for trial in case.trials}
         self.trials = len(unique)
         self.missing = [trial for key, trial in unique.items() if key not in self.store.results]
-        self.warned: list[str] = []
-        self._looked = False
 
     def run(self, workers: int, scheduler: str | None, told: Callable[[Trial, Result | None], None]) -> None:
         """Simulate what is missing. Results are kept as they come, whatever ends this.
@@ -116,21 +114,21 @@ class Sweep:
         with local_client(workers) if scheduler is None else client_of(scheduler) as client:
             for trial, result in run_trials(client, self.missing):
                 if result is not None:
-                    self._look(result)
                     self.store.add(result)
                 told(trial, result)
 
     def finish(self) -> Summary:
         """Writes the results, scenarios and summary. Raises StoreError."""
-        files = {number: self._scenario_file(number) for number, case in enumerate(self.cases) if case.is_own}
-        runs = {number: str(path) for number, path in files.items()}
-        summary = summarise(self.study, self.cases, self.store.results, runs)
+        cases, folder = [], self.folder / SCENARIOS
         try:
-            (self.folder / SCENARIOS).mkdir(exist_ok=True)
-            for number, path in files.items():
-                case = self.cases[number]
-                assert case.given is not None
-                write_file(path, f"# {case.label}\n{scenario_text(case.given, Path.cwd())}".encode())
+            folder.mkdir(exist_ok=True)
+            for number, case in enumerate(self.cases):
+                if case.given is not None and case.settings:  # no file says yet what it is
+                    path = folder / f"{number}-{re.sub('[^A-Za-z0-9_.]+', '-', case.label)[:60]}.toml"
+                    write_file(path, f"# {case.label}\n{scenario_text(case.given, Path.cwd())}".encode())
+                    case = msgspec.structs.replace(case, path=str(path))
+                cases.append(case)
+            summary = summarise(self.study, cases, self.store.results)
             write_file(self.folder / RESULTS, self._table())
             pictures = pictures_of(summary)
             for name, file in pictures.items():
@@ -144,50 +142,16 @@ class Sweep:
             raise StoreError(f"cannot write to {self.folder}: {error.strerror or error}") from error
         return summary
 
-    def _scenario_file(self, number: int) -> Path:
-        label = re.sub("[^A-Za-z0-9_.]+", "-", self.cases[number].label)[:60]
-        return self.folder / SCENARIOS / f"{number}-{label}.toml"
-
-    def _look(self, result: Result) -> None:
-        """Warns of outcomes that the first report does not have."""
-        if self._looked or not result.figures:
-            return
-        self._looked, names = True, sorted(result.figures)
-        for name in self.study.outcomes:
-            if name not in result.figures:
-                self.warned.append(f"outcomes: no figure {name!r} in the first report{nearest(name, names)}")
-
     def _table(self) -> bytes:
         """A row for each trial that has a result, as Parquet."""
-        rows = [
-            self._row(case, trial, self.store.results[trial.key])
-            for case in self.cases
-            for trial in case.trials
-            if trial.key in self.store.results
-        ]
-        settings = (f"{SETTING}{key}" for case in self.cases for key in case.settings)
-        figures = sorted({name for row in rows for name in row if name.startswith(FIGURE)})
-        schema = _SCHEMA | dict.fromkeys(settings, pa.string()) | dict.fromkeys(figures, pa.float64())
+        told = [(case, trial) for case in self.cases for trial in case.trials if trial.key in self.store.results]
+        rows, types = [], {name: kind for name, (kind, _) in _COLUMNS.items()}
+        for case, trial in told:
+            result = self.store.results[trial.key]
+            settings = {f"{SETTING}{key}": json.dumps(value) for key, value in case.settings.items()}
+            figures = {f"{FIGURE}{name}": value for name, value in sorted(result.figures.items())}
+            rows.append({name: of(case, trial, result) for name, (_, of) in _COLUMNS.items()} | settings | figures)
+            types |= dict.fromkeys(settings, pa.string()) | dict.fromkeys(figures, pa.float64())
         content = io.BytesIO()
-        pq.write_table(pa.Table.from_pylist(rows, pa.schema(schema.items())), content, compression="zstd")
+        pq.write_table(pa.Table.from_pylist(rows, pa.schema(types.items())), content, compression="zstd")
         return content.getvalue()
-
-    def _row(self, case: Case, trial: Trial, result: Result) -> dict[str, Any]:
-        first = result.broken[0] if result.broken else None
-        return {
-            "scenario": trial.world if case.given is None else case.scenario,
-            "variant": case.variant or None,
-            "seed": trial.seed,
-            "seconds": trial.seconds,
-            "faults": trial.faults,
-            "law": first and first.law,
-            "law_at_s": first and first.at_s,
-            "sentence": first and first.sentence,
-            "broken": len(result.broken),
-            "wall_s": result.wall_s,
-            "cpu_s": result.cpu_s,
-            "version": trial.version,
-            "key": trial.key,
-            **{f"{SETTING}{key}": json.dumps(value) for key, value in case.settings.items()},
-            **{f"{FIGURE}{name}": value for name, value in result.figures.items()},
-        }

@@ -89,6 +89,11 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     cpu_s: float
 
+    @property
+    def first(self) -> BrokenLaw | None:
+        """The first law that broke."""
+        return self.broken[0] if self.broken else None
+
 
 def run_trial(trial: Trial) -> Result:
     """Simulate. A service that raises is a broken law; raises SwarmError on what the study, its files or this
