@@ -13,16 +13,15 @@ from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
 from shared_map.class_grounds import load_classes
 from shared_map.terrain.store import kept_key, load_terrain
-from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import MonotonicClock
+from swarm.bus.bus import Bus
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.recording.recording import recorded
+from swarm.recording.boundary import Boundary
+from swarm.recording.role_process import run_role
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.job_slots import JobSlots
-from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
+from swarm.runtime.process import ThreadWorker, tick_phase
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.run_secret import authenticator_of
 
 log = logging.getLogger(__name__)
 
@@ -39,18 +38,13 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     kernels = KernelLoader(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
     prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, lambda: kept_key(scenario))
-    clock = MonotonicClock()
     inbox = Inbox()
-    network = scenario.network
-    with (
-        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
-        closing(ThreadWorker("grow-tree", inbox, JobSlots(setup.run_dir))) as worker,
-        recorded(setup, terrain.digest) as boundary,
-    ):
-        service = PlannerService(
+
+    def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> PlannerService:
+        return PlannerService(
             setup,
             terrain,
-            boundary.bus(bus),
+            bus,
             inbox.post,
             boundary.worker(worker),
             boundary.function("stopwatch", time.thread_time_ns, int),
@@ -58,10 +52,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.function("kernels of classes", lambda: kernels.classes_complete, bool),
             boundary.external(prepared, PREPARED_COSTS),
         )
-        process = Process(
-            boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id), setup.health
-        )
-        process.stop_on_signals()
-        if stop_when is not None:
-            end_with(stop_when, process.stop)
-        process.run()
+
+    with closing(ThreadWorker("grow-tree", inbox, JobSlots(setup.run_dir))) as worker:
+        tick_hz = scenario.planner.tick_hz
+        run_role(setup, terrain.digest, stop_when, make, inbox, tick_hz, tick_phase(setup.id))

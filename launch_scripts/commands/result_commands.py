@@ -191,7 +191,6 @@ def replay(
     until    Only so many seconds from the start of the run, by its own clock.
     keep     Copy what is replayed into a folder: a test case.
     """
-    from launch_scripts.launcher.console import progress
     from launch_scripts.observe.run_folder import find_run
     from launch_scripts.simulation.replay import keep as keep_recorded
     from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
@@ -211,11 +210,10 @@ def replay(
             typer.echo(f"recorded with {package} {then}, replayed with {now}")
         typer.echo(_ROW.format("process", "life", "events", "outputs", "seconds", "result"))
     rows: list[Replayed] = []
-    with progress() as tell:
-        for row in replay_run(folder, process, until, progress=lambda share: tell("replaying", share)):
-            rows.append(row)
-            if not as_json:
-                typer.echo(_line(row))
+    for row in replay_run(folder, process, until):
+        rows.append(row)
+        if not as_json:
+            typer.echo(_line(row))
     if as_json:
         told = {
             "run": str(folder),
@@ -280,7 +278,7 @@ def _fields(row: Replayed) -> dict[str, Any]:
         "process": recorded.process,
         "life": recorded.life,
         "incarnation": recorded.head.incarnation,
-        "bytes": recorded.bytes,
+        "bytes": recorded.path.stat().st_size,
         "same": row.same,
         "why": row.why,
         **({} if row.outcome is None else dataclasses.asdict(row.outcome)),

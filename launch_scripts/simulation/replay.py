@@ -5,13 +5,11 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
-
-import msgspec
 
 from launch_scripts.observe.run_folder import SCENARIO_FILE
 from launch_scripts.process_table import SIMULATED_ROLES
@@ -32,31 +30,6 @@ from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.wire.codec import decode
 from swarm.wire.messages.processes import Stats
-
-
-class _Grounds:
-    """Terrain and truth of recordings, built once for all that have the same.
-
-    What is prepared in a run's folder is taken, if it is of the same scenario.
-    """
-
-    def __init__(self) -> None:
-        self._built: dict[bytes, tuple[Terrain, Floats]] = {}
-
-    def of(self, setup: RoleSetup, digest: str) -> tuple[Terrain, Floats]:
-        """Raises TerrainError where this build makes another of the same scenario."""
-        scenario = setup.scenario
-        key = msgspec.msgpack.encode((scenario.terrain, scenario.cost, scenario.classes, scenario.seed))
-        if key not in self._built:
-            terrain = load_terrain(setup)
-            load_classes(setup, terrain)
-            self._built[key] = terrain, load_truth(setup, terrain)
-        if (here := self._built[key][0].digest) != digest:
-            raise TerrainError(
-                f"{setup.role} {setup.id} was recorded on terrain {digest}, but its scenario makes terrain "
-                f"{here} here: terrain files or the rules of cost have changed"
-            )
-        return self._built[key]
 
 
 def setup_of(head: Head, folder: Path) -> RoleSetup:
@@ -81,28 +54,28 @@ class _Costs:
     """What planners of a machine share that follows from scenario and terrain."""
 
     def __init__(self, terrain: Terrain, scenario: Scenario) -> None:
-        self._terrain = terrain
-        self._scenario = scenario
+        self._of = terrain, scenario.planner
 
     @property
     def cell_cost(self) -> Floats:
         with tempfile.TemporaryDirectory() as folder:
-            return PreparedCosts(Path(folder), self._terrain, self._scenario.planner).cell_cost
+            return PreparedCosts(Path(folder), *self._of).cell_cost
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
     """One life of a process, in a file.
 
-    life   which of its lives it is, from 1
-    bytes  of the file
+    life  which of its lives it is, from 1
     """
 
     path: Path
-    process: str
     life: int
     head: Head
-    bytes: int
+
+    @property
+    def process(self) -> str:
+        return f"{self.head.role}-{self.head.id}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,18 +112,16 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
         roles = (*SIMULATED_ROLES, head.role)  # one that this build does not know is last
         return roles.index(head.role), len(head.id), head.id, head.incarnation  # t2 before t10
 
-    found.sort(key=order)
-    lives: Counter[str] = Counter()
+    lives: Counter[tuple[str, str]] = Counter()
     recorded: list[Recorded] = []
-    for head, path in found:
-        name = f"{head.role}-{head.id}"
-        lives[name] += 1
-        if process in (None, name):
-            size = path.stat().st_size
-            recorded.append(Recorded(path=path, process=name, life=lives[name], head=head, bytes=size))
-    if not recorded:
-        raise ConfigError(f"no process {process!r} is recorded in {folder}; there are {', '.join(lives)}")
-    return recorded
+    for head, path in sorted(found, key=order):
+        lives[head.role, head.id] += 1
+        recorded.append(Recorded(path=path, life=lives[head.role, head.id], head=head))
+    some = [each for each in recorded if process in (None, each.process)]
+    if not some:
+        there = ", ".join(dict.fromkeys(each.process for each in recorded))
+        raise ConfigError(f"no process {process!r} is recorded in {folder}; there are {there}")
+    return some
 
 
 def unreadable(folder: Path, process: str | None = None) -> list[str]:
@@ -172,42 +143,42 @@ def _heads(folder: Path) -> tuple[list[tuple[Head, Path]], list[tuple[Path, str]
     return found, refused
 
 
-def replay_run(
-    folder: Path,
-    process: str | None = None,
-    until_s: float | None = None,
-    progress: Callable[[float], None] = lambda share: None,
-) -> Iterator[Replayed]:
-    """Feed the recordings of a run to the services of this build, one after the other. Raises as `recordings_of`.
-
-    progress  takes the share of all bytes that is replayed
-    """
-    grounds = _Grounds()
-    recordings = recordings_of(folder, process)
-    whole, before = sum(each.bytes for each in recordings), 0
-    for recorded in recordings:
-
-        def share(read: int, before: int = before) -> None:
-            progress((before + read) / whole)
-
-        before += recorded.bytes
-        outcome, why = None, None
+def replay_run(folder: Path, process: str | None = None, until_s: float | None = None) -> Iterator[Replayed]:
+    """Feed the recordings of a run to the services of this build, each in turn. Raises as `recordings_of`."""
+    grounds: dict[str, tuple[Terrain, Floats]] = {}
+    for recorded in recordings_of(folder, process):
+        outcome, why, head = None, None, recorded.head
         try:
+            setup = setup_of(head, folder)
+            if head.scenario not in grounds:
+                grounds[head.scenario] = _ground(setup)
+            if (here := grounds[head.scenario][0].digest) != head.terrain:
+                raise TerrainError(
+                    f"{recorded.process} was recorded on terrain {head.terrain}, but its scenario makes terrain "
+                    f"{here} here: terrain files or the rules of cost have changed"
+                )
+            make = partial(_rebuilt, setup, grounds[head.scenario])
             with RecordReader(recorded.path) as reader:
-                setup = setup_of(reader.head, folder)
-                make = partial(_rebuilt, setup, grounds.of(setup, reader.head.terrain))
-                outcome = replay(reader, make, setup.scenario.network.namespace, until_s, share)
+                outcome = replay(reader, make, setup.scenario.network.namespace, until_s)
         except SwarmError as error:
             why = str(error)
         yield Replayed(recorded=recorded, outcome=outcome, why=why)
 
 
+def _ground(setup: RoleSetup) -> tuple[Terrain, Floats]:
+    """Terrain and truth of a scenario; what is prepared of them in the run's folder is taken."""
+    terrain = load_terrain(setup)
+    load_classes(setup, terrain)
+    return terrain, load_truth(setup, terrain)
+
+
 def _rebuilt(setup: RoleSetup, ground: tuple[Terrain, Floats], boundary: Replaying) -> Service:
     """The service of a recorded process. What it tells itself is in the recording, too."""
+    terrain, truth = ground
     nobody: Any = boundary.nobody
-    prepared = cast(PreparedCosts, _Costs(ground[0], setup.scenario))
+    prepared = cast(PreparedCosts, _Costs(terrain, setup.scenario))
     outside = Outside(bus=nobody, worker=nobody, prepared=prepared)
-    return built(setup, *ground, boundary, outside, lambda event: None)
+    return built(setup, terrain, truth, boundary, outside, lambda event: None)
 
 
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:

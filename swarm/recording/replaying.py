@@ -20,8 +20,6 @@ from swarm.runtime.process import Service, collected_rarely
 
 T = TypeVar("T")
 MAKING = "making the service"
-Progress = Callable[[int], None]
-"""Takes how many bytes of the recording are replayed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,14 +151,13 @@ def replay(
     make: Callable[[Replaying], Service],
     namespace: str,
     until_s: float | None = None,
-    progress: Progress = lambda read: None,
 ) -> Outcome:
     """Feed a recording to a service until its outputs differ. Raises StoreError on records that make no sense.
 
     make  makes the service behind a boundary
     """
     with collected_rarely():
-        return _Replay(reader, make, Replaying(namespace), until_s, progress).run()
+        return _Replay(reader, make, Replaying(namespace), until_s).run()
 
 
 @dataclass
@@ -171,7 +168,6 @@ class _Replay:
     make: Callable[[Replaying], Service]
     boundary: Replaying
     until_s: float | None
-    progress: Progress
     service: Service | None = None
     events: int = 0
     outputs: int = 0
@@ -197,7 +193,7 @@ class _Replay:
 
     def _steps(self) -> Iterator[_Step]:
         """The calls in the recording that are whole: the last one of a process that was killed may not be."""
-        step, at = _Step(None), 0
+        step = _Step(None)
         until_ns = None if self.until_s is None else self.reader.head.started_ns + int(self.until_s * NS_PER_S)
         for record in self.reader:
             if isinstance(record, Read):
@@ -206,9 +202,6 @@ class _Replay:
                 step.outputs += record.outputs
             elif isinstance(record, Called | Handled):
                 yield step
-                if self.reader.at != at:  # a block further
-                    at = self.reader.at
-                    self.progress(at)
                 if until_ns is not None and record.now_ns > until_ns:
                     self.ended = f"replayed until {self.until_s:g} s"
                     return

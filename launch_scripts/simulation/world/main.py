@@ -7,13 +7,11 @@ from collections.abc import Callable
 from launch_scripts.simulation.world.service import TICK_HZ, TargetsService
 from shared_map.class_grounds import load_classes
 from shared_map.terrain.store import load_terrain, load_truth
-from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import MonotonicClock
-from swarm.recording.recording import recorded
+from swarm.bus.bus import Bus
+from swarm.recording.boundary import Boundary
+from swarm.recording.role_process import run_role
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.run_secret import authenticator_of
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
@@ -22,14 +20,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     load_classes(setup, terrain)
     truth = load_truth(setup, terrain)
     inbox = Inbox()
-    network = setup.scenario.network
-    with (
-        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
-        recorded(setup, terrain.digest) as boundary,
-    ):
-        service = TargetsService(setup, terrain, truth, boundary.bus(bus), inbox.post)
-        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ, health=setup.health)
-        process.stop_on_signals()
-        if stop_when is not None:
-            end_with(stop_when, process.stop)
-        process.run()
+
+    def make(boundary: Boundary, bus: Bus, stop: Callable[[], None]) -> TargetsService:
+        return TargetsService(setup, terrain, truth, bus, inbox.post)
+
+    run_role(setup, terrain.digest, stop_when, make, inbox, TICK_HZ)

@@ -82,6 +82,7 @@ class Stay:
     """A vehicle on a cell, from the first to the last time at which it is known to be there.
 
     since_ns  the earliest time at which it may have come there
+    author    of the last report of it, which has the number `seq`
     """
 
     vehicle: str
@@ -89,14 +90,8 @@ class Stay:
     begin_ns: int
     end_ns: int
     since_ns: int
-
-
-@dataclass(slots=True)
-class _Vehicle:
-    stay: Stay
     author: str
     seq: int
-    stamp_ns: int
 
 
 Encounters = dict[tuple[str, str], int]
@@ -132,7 +127,8 @@ class Referee:
         self._air = Referee(truths, grid) if aloft else None
         self._truths = {name: truth.reshape(-1) for name, truth in truths.items()}
         self._cells = grid.cells
-        self._vehicles: dict[str, _Vehicle] = {}
+        self._vehicles: dict[str, Stay] = {}
+        """Vehicle -> where it is: its newest stay, which ends with its newest report."""
         self._stays: dict[int, list[Stay]] = {}
         self._encounters: Encounters = {}
         self._swept_ns = 0
@@ -141,7 +137,7 @@ class Referee:
     @property
     def cells(self) -> NDArray[np.int64]:
         """Last known cell of every vehicle."""
-        own = np.array([each.stay.cell for each in self._vehicles.values()], np.int64)
+        own = np.array([stay.cell for stay in self._vehicles.values()], np.int64)
         return own if self._air is None else np.concatenate((own, self._air.cells))
 
     def hear_body(self, body: Body, now_ns: int) -> None:
@@ -160,16 +156,15 @@ class Referee:
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
             if cell >= self._cells:
                 continue
-            known = vehicles.get(id)
-            if known is None:
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0), fleet, None, broken)
+            stay = vehicles.get(id)
+            if stay is None:
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0, author, seq), fleet, broken)
                 continue
-            before_ns = known.stamp_ns
+            before_ns = stay.end_ns
             if stamp_ns <= before_ns:
                 continue
-            gapless = author == known.author and seq <= known.seq + 1
-            known.author, known.seq, known.stamp_ns = author, seq, stamp_ns
-            stay = known.stay
+            gapless = author == stay.author and seq <= stay.seq + 1
+            stay.author, stay.seq = author, seq
             stands = cell == stay.cell
             if stands or gapless:
                 stay.end_ns = stamp_ns
@@ -177,18 +172,15 @@ class Referee:
                     broken.extend(self._meetings(stay))
             if not stands:
                 since_ns = stamp_ns if gapless else before_ns
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns), fleet, known, broken)
+                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, author, seq), fleet, broken)
         if stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(stamp_ns)
         return broken
 
-    def _enter(self, entered: Stay, fleet: Fleet, known: _Vehicle | None, broken: list[Broken]) -> None:
+    def _enter(self, entered: Stay, fleet: Fleet, broken: list[Broken]) -> None:
         """A vehicle comes onto a cell."""
         self._stays.setdefault(entered.cell, []).append(entered)
-        if known is None:
-            self._vehicles[entered.vehicle] = _Vehicle(entered, fleet.author, fleet.seq, fleet.stamp_ns)
-        else:
-            known.stay = entered
+        self._vehicles[entered.vehicle] = entered
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
         if not truth.item(entered.cell) < math.inf:
             broken.append(LethalEntry(entered.vehicle, entered.cell, fleet.stamp_ns))
@@ -210,7 +202,7 @@ class Referee:
         vehicles = self._vehicles
         _forget(
             self._stays,
-            lambda stay: now_ns - stay.end_ns > _REMEMBER_NS and vehicles[stay.vehicle].stay is not stay,
+            lambda stay: now_ns - stay.end_ns > _REMEMBER_NS and vehicles[stay.vehicle] is not stay,
         )
 
 

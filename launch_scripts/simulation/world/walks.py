@@ -28,10 +28,6 @@ from swarm.plugins.guard import Guard, Nonsense, Tell
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-STANDING: frozenset[str] = frozenset(("still", "external"))
-"""Walks by which a simulated target takes no step."""
-FLEEING: frozenset[str] = frozenset(("evade",))
-"""Walks that depend on where vehicles are."""
 WAY_HALF_CELLS = 96
 """Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
 _TURN_SHARE = 1 / 20

@@ -1,0 +1,46 @@
+"""The process of a recorded role, from its bus to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from swarm.bus.bus import Bus
+from swarm.bus.zenoh_bus import open_bus
+from swarm.clock import MonotonicClock
+from swarm.recording.boundary import Boundary
+from swarm.recording.recording import recorded
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, Service, end_with
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
+
+Make = Callable[[Boundary, Bus, Callable[[], None]], Service]
+"""Makes a service, given its boundary, its bus, which is behind that, and what ends the process."""
+
+
+def run_role(
+    setup: RoleSetup,
+    terrain: str,
+    stop_when: Callable[[], None] | None,
+    make: Make,
+    inbox: Inbox,
+    tick_hz: float,
+    phase: float | None = None,
+) -> None:
+    """Runs a role's service until SIGTERM, SIGINT or the end of the launcher.
+
+    terrain    digest
+    stop_when  blocks until the process has to end; None to run until a signal comes
+    phase      as of `Process`
+    """
+    network = setup.scenario.network
+    with (
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
+        recorded(setup, terrain) as boundary,
+    ):
+        service = make(boundary, boundary.bus(bus), lambda: process.stop())
+        process = Process(boundary.service(service), inbox, MonotonicClock(), tick_hz, phase, setup.health)
+        process.stop_on_signals()
+        if stop_when is not None:
+            end_with(stop_when, process.stop)
+        process.run()
