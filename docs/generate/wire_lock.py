@@ -13,18 +13,18 @@ import msgspec
 
 from docs.generate.wire_page import messages, parts, rows
 from swarm.wire.messages import WIRE_VERSION, Message
-from swarm.wire.topics import ALIVE_KEY, TOPICS
+from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 from swarm.wire.versions import are_neighbours, name_and_version, read_schemas, written_schema
 
 PATH = Path(__file__).parents[2] / "docs" / "wire.lock"
-REQUIRED = "refused"
-"""The default of a field without one, as on the page of the wire."""
+REQUIRED = " | refused"
+"""The end of a field without a default, as on the page of the wire."""
 NEVER_STEP = ("run", "nothing")
 """Messages by which builds of any two versions say which they are."""
 
 Lock = Mapping[str, Any]
-"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes`, `structs`,
-each of which is a list of fields: name, type, default, `layouts` of these, and `values` of enumerations."""
+"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes`, `structs`, each a
+list of fields "name | type | default", `layouts` of these, and `values` of enumerations."""
 
 
 def lock() -> Lock:
@@ -32,32 +32,26 @@ def lock() -> Lock:
     return {
         "wire_version": WIRE_VERSION,
         "token": ALIVE_KEY,
-        "keys": {
-            topic.name: {
-                "key": topic.key,
-                "message": topic.message.__name__,
-                "request": None if topic.request is None else topic.request.__name__,
-                "bulk": None if topic.bulk is None else topic.bulk.__name__,
-                "trusted": topic.trusted,
-            }
-            for topic in TOPICS
-        },
+        "keys": {topic.name: _key(topic) for topic in TOPICS},
         "messages": {name_and_version(read_schemas(kind)[0])[0]: _locked(kind) for kind in messages()},
     }
 
 
+def _key(topic: Topic) -> str:
+    kinds = (topic.message, topic.request, topic.bulk)
+    names = ["none" if kind is None else kind.__name__ for kind in kinds]
+    return " | ".join([topic.key, *names, "trusted" if topic.trusted else "open"])
+
+
 def _locked(kind: type[Message]) -> dict[str, Any]:
     structs = (kind, *parts(kind))
+    enums = [each for struct in structs for each in parts(struct, enum.Enum)]
     return {
         "reads": sorted(name_and_version(schema)[1] for schema in read_schemas(kind)),
         "writes": name_and_version(written_schema(kind))[1],
-        "structs": {struct.__name__: rows(struct) for struct in structs},
+        "structs": {struct.__name__: [" | ".join(row) for row in rows(struct)] for struct in structs},
         "layouts": {struct.__name__: _layout(struct) for struct in structs},
-        "values": {
-            each.__name__: [member.value for member in each]
-            for struct in structs
-            for each in parts(struct, enum.Enum)
-        },
+        "values": {each.__name__: [member.value for member in each] for each in enums},
     }
 
 
@@ -69,18 +63,7 @@ def _layout(struct: type[msgspec.Struct]) -> str:
 
 def document() -> str:
     """The lock as text: a topic a line, a field a line, so that a change shows where it is."""
-    return _text(lock(), "")
-
-
-def _text(value: Any, margin: str) -> str:
-    """JSON in which only maps and lists of lists take more than one line."""
-    inner = margin + " "
-    if isinstance(value, dict) and any(isinstance(each, dict | list) for each in value.values()):
-        lines = [f"{inner}{json.dumps(name)}: {_text(each, inner)}" for name, each in value.items()]
-        return "{\n" + ",\n".join(lines) + f"\n{margin}}}"
-    if isinstance(value, list) and any(isinstance(each, list) for each in value):
-        return "[\n" + ",\n".join(inner + json.dumps(each) for each in value) + f"\n{margin}]"
-    return json.dumps(value)
+    return json.dumps(lock(), indent=1)
 
 
 def faults() -> list[str]:
@@ -90,21 +73,21 @@ def faults() -> list[str]:
 
 def broken(before: Lock, now: Lock) -> Iterator[str]:
     """The rules that a change from one lock to another breaks."""
+    was, is_now = before["wire_version"], now["wire_version"]
     if before["token"] != now["token"]:
         yield f"the key of liveliness tokens was {before['token']} and is {now['token']}: it never changes"
-    if not 0 <= now["wire_version"] - before["wire_version"] <= 1:
-        versions = f"was {before['wire_version']} and is {now['wire_version']}"
-        yield f"the wire version {versions}: it rises by one at a time"
-    if not are_neighbours(before["wire_version"], now["wire_version"]):
+    if not 0 <= is_now - was <= 1:
+        yield f"the wire version was {was} and is {is_now}: it rises by one at a time"
+    if not are_neighbours(was, is_now):
         return
-    moved = now["wire_version"] != before["wire_version"]
-    for name, topic in before["keys"].items():
-        if topic != now["keys"].get(name) and not moved:
-            yield f"the key of topic {name} has changed: the wire version has to rise"
+    if was == is_now:
+        for name, topic in before["keys"].items():
+            if topic != now["keys"].get(name):
+                yield f"the key of topic {name} has changed: the wire version has to rise"
     for name, message in before["messages"].items():
         if name in now["messages"]:
-            yield from _broken_message(name, message, now["messages"][name], moved)
-        elif not moved:
+            yield from _broken_message(name, message, now["messages"][name], was != is_now)
+        elif was == is_now:
             yield f"the message {name} is gone: the wire version has to rise"
 
 
@@ -114,31 +97,29 @@ def _broken_message(name: str, before: Lock, now: Lock, moved: bool) -> Iterator
     if now["writes"] not in before["reads"]:
         yield f"{name} is written in version {now['writes']}, which the build before does not read"
     if max(now["reads"]) == max(before["reads"]):
-        yield from _broken_fields(name, before["structs"], now["structs"])
-        for what in ("layouts", "values"):
-            for part, was in before.get(what, {}).items():
-                is_now = now[what].get(part)
-                if is_now != was and (what == "values" or is_now is not None):
-                    yield (
-                        f"{part} was {json.dumps(was)} and is {json.dumps(is_now)}: {name} needs a step to its "
-                        "next version (swarm/wire/versions.py)"
-                    )
+        for sentence in _changed(before, now):
+            yield f"{sentence}: {name} needs a step to its next version (swarm/wire/versions.py)"
+        for struct, fields in before["structs"].items():
+            for field in now["structs"].get(struct, [])[len(fields) :]:
+                if field.endswith(REQUIRED):
+                    added = f"{struct}.{field.partition(' | ')[0]} is added without a default"
+                    yield f"{added}: builds before this one do not send it"
     elif name in NEVER_STEP:
         yield f"{name} has taken a step: it never does"
     elif not moved:
         yield f"{name} has taken a step: the wire version has to rise"
 
 
-def _broken_fields(name: str, before: Lock, now: Lock) -> Iterator[str]:
-    for struct, fields in before.items():
-        kept = now.get(struct, [])
+def _changed(before: Lock, now: Lock) -> Iterator[str]:
+    """What is written otherwise in one version of a message. Fields may be added behind the others."""
+    for struct, fields in before["structs"].items():
+        kept = now["structs"].get(struct, [])
         for index, field in enumerate(fields):
-            if index >= len(kept) or kept[index] != field:
-                is_now = f"is {' | '.join(kept[index])}" if index < len(kept) else "is gone"
-                yield (
-                    f"{struct}.{field[0]} was {' | '.join(field)} and {is_now}: {name} needs a step to its next "
-                    "version (swarm/wire/versions.py)"
-                )
-        for field in kept[len(fields) :]:
-            if field[2] == REQUIRED:
-                yield f"{struct}.{field[0]} is added without a default: builds before this one do not send it"
+            if kept[index : index + 1] != [field]:
+                is_now = f"is {kept[index]}" if index < len(kept) else "is gone"
+                yield f"{struct}.{field.partition(' | ')[0]} was {field} and {is_now}"
+    for what in ("layouts", "values"):
+        for part, was in before[what].items():
+            is_now = now[what].get(part)
+            if is_now != was and (what == "values" or is_now is not None):
+                yield f"{part} was {json.dumps(was)} and is {json.dumps(is_now)}"

@@ -16,7 +16,6 @@ from support.fields import FIELDS, Field, make_field
 
 from bench.harness import FieldOption, Lines, Seed, benchmark, names_of, numbers_of, track
 from bench.planning.chase import Plan, Tally, chase
-from launch_scripts.simulation.world.walks import FLEEING, STANDING
 from planner_service.kernel_build import load_all
 from planner_service.strategy import ROWS
 from swarm.config.scenario import PlannerConfig
@@ -35,7 +34,7 @@ _NOT_STATED = (
     "The paper does not state all of its motion, its k_min and its block rule: here each target moves a cell a "
     "frame, k_min is {k_min}, and a block is crossed in row or column."
 )
-WALKS: tuple[Walk, ...] = tuple(walk for walk in get_args(Walk) if walk not in STANDING)
+WALKS: tuple[Walk, ...] = tuple(walk for walk in get_args(Walk) if walk not in ("still", "external"))
 Point = tuple[int, int, int]
 """Cells a side, targets, vehicles."""
 
@@ -222,7 +221,7 @@ def gap(
     load_all()
     tallies = {(path, name): Tally() for path in walks for name in chosen}
     entrants = {name: PlannerConfig(strategy=name, k_min=k_min, cpu_budget=cpu_budget) for name in chosen}
-    drives = {path: int(path in FLEEING) if speed is None else speed for path in walks}
+    drives = {path: int(path == "evade") if speed is None else speed for path in walks}
     for path, run in track(list(itertools.product(walks, range(runs)))):
         plan = Plan(
             vehicles=vehicles, frames=frames, walk=path, speed=drives[path], probes=vehicles, seed=seed + run

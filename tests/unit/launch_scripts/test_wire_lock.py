@@ -16,7 +16,7 @@ from docs.generate.wire_lock import broken, lock
 Change = Callable[[Any], object]
 
 
-def fields(now: Any, name: str = "fleet", struct: str = "Fleet") -> list[list[str]]:
+def fields(now: Any, name: str = "fleet", struct: str = "Fleet") -> list[str]:
     return now["messages"][name]["structs"][struct]
 
 
@@ -24,15 +24,15 @@ def stepped(
     now: Any, name: str = "fleet", *, reads: tuple[int, ...] = (8, 9), writes: int = 8, wire: int = 9
 ) -> None:
     """A message takes a step, with another type of a field."""
-    fields(now, name, {"fleet": "Fleet", "run": "RunInfo"}[name])[0][1] = "text"
+    fields(now, name, {"fleet": "Fleet", "run": "RunInfo"}[name])[0] += ", text"
     now["messages"][name] |= {"reads": list(reads), "writes": writes}
     now["wire_version"] = wire
 
 
 ALLOWED: dict[str, Change] = {
     "nothing": lambda now: None,
-    "a field is added": lambda now: fields(now).append(["colour", "id", "`None`"]),
-    "a field of a part is added": lambda now: fields(now, "standing", "Stand").append(["colour", "id", "`None`"]),
+    "a field is added": lambda now: fields(now).append("colour | id | `None`"),
+    "a field of a part is added": lambda now: fields(now, "standing", "Stand").append("colour | id | `None`"),
     "a message and its key are added": lambda now: (
         now["messages"].update(new=copy.deepcopy(now["messages"]["fleet"])),
         now["keys"].update(new=copy.deepcopy(now["keys"]["fleet"])),
@@ -41,25 +41,29 @@ ALLOWED: dict[str, Change] = {
     "a message takes a step": stepped,
     "a key changes with the wire version": lambda now: (
         now.update(wire_version=9),
-        now["keys"]["fleet"].update(key="fleets/{author}"),
+        now["keys"].update(fleet="fleets/{author}"),
     ),
 }  # fmt: skip
 
 REFUSED: dict[str, tuple[Change, str]] = {
     "a field goes": (lambda now: fields(now).pop(), "Fleet.vehicle_class was .* and is gone: fleet needs a step"),
     "bounds change": (
-        lambda now: fields(now)[3].__setitem__(1, "int 0 ... 7"),
+        lambda now: fields(now).__setitem__(3, "seq | int 0 ... 7 | refused"),
         r"Fleet.seq was seq \| int 0 ... 2\^62 - 1 \| refused and is seq \| int 0 ... 7 \| refused: fleet needs",
     ),
-    "a default changes": (lambda now: fields(now)[-1].__setitem__(2, "`'air'`"), "Fleet.vehicle_class was"),
-    "a field has another name": (lambda now: fields(now)[0].__setitem__(0, "writer"), "Fleet.author was"),
-    "a field is put in between": (lambda now: fields(now).insert(1, ["x", "id", "`None`"]), "Fleet.group was"),
+    "a default changes": (
+        lambda now: fields(now).__setitem__(-1, "vehicle_class | id | `'air'`"), "Fleet.vehicle_class was",
+    ),
+    "a field has another name": (
+        lambda now: fields(now).__setitem__(0, "writer | id | refused"), "Fleet.author was",
+    ),
+    "a field is put in between": (lambda now: fields(now).insert(1, "x | id | `None`"), "Fleet.group was"),
     "an added field has no default": (
-        lambda now: fields(now).append(["colour", "id", "refused"]), "Fleet.colour is added without a default",
+        lambda now: fields(now).append("colour | id | refused"), "Fleet.colour is added without a default",
     ),
     "a part loses a field": (lambda now: fields(now, "standing", "Stand").pop(), "Stand.age_ms was"),
     "a key changes": (
-        lambda now: now["keys"]["fleet"].update(key="fleets/{author}"), "topic fleet has changed: the wire version",
+        lambda now: now["keys"].update(fleet="fleets/{author}"), "topic fleet has changed: the wire version",
     ),
     "a key goes": (lambda now: now["keys"].pop("fleet"), "topic fleet has changed"),
     "a message goes": (lambda now: now["messages"].pop("fleet"), "the message fleet is gone"),
@@ -109,7 +113,7 @@ def test_the_reference_is_not_written_over_a_change_that_is_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "wire.lock"
-    path.write_text(wire_lock.document().replace('["author", ', '["writer", ', 1))
+    path.write_text(wire_lock.document().replace('"author | ', '"writer | ', 1))
     monkeypatch.setattr(wire_lock, "PATH", path)
     monkeypatch.setattr(reference, "PAGES", {path: wire_lock.document})
     before = path.read_text()
