@@ -23,8 +23,8 @@ NEVER_STEP = ("run", "nothing")
 """Messages by which builds of any two versions say which they are."""
 
 Lock = Mapping[str, Any]
-"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes`, `structs`, each a
-list of fields "name | type | default", `layouts` of these, and `values` of enumerations."""
+"""`wire_version`, `token`; `keys`: name -> what a topic is; `messages`: name -> `reads`, `writes`, `structs`: each
+a list of fields "name | type | default", `layouts` of these, and `values` of enumerations."""
 
 
 def lock() -> Lock:

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -31,6 +32,7 @@ from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.classes import flies
+from swarm.errors import ProtocolError
 from swarm.wire.codec import decode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest
 from swarm.wire.messages.vehicles import Body, VehicleState
@@ -163,7 +165,8 @@ class LawBook:
         if self._trace is not None:
             self._trace(now_ns, source, destination, topic, payload)
         if topic == BODY.name and destination.startswith("agent-"):
-            self._lives.setdefault(destination, _Life()).take(decode(payload, Body), now_ns)
+            with contextlib.suppress(ProtocolError):  # what is no report closes nothing
+                self._lives.setdefault(destination, _Life()).take(decode(payload, Body), now_ns)
 
     def _take_digest(self, event: Event) -> None:
         if isinstance(event, Heard) and isinstance(event.message, Digest) and event.message.role == "keeper":
