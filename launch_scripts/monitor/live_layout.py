@@ -7,7 +7,6 @@ neither colours nor pictures.
 
 from __future__ import annotations
 
-import functools
 import io
 import math
 from collections.abc import Sequence
@@ -20,7 +19,6 @@ from PIL import Image, ImageDraw, ImageFont
 from rerun.blueprint.encodings import TextLogColumn
 
 from launch_scripts.monitor.ground import ground_colours as colours
-from launch_scripts.monitor.ground.ground_colours import unit_of
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Look, level_for
 from launch_scripts.monitor.sinks import Colour, Pen, in_markdown, screen, shown
@@ -37,7 +35,7 @@ WIDTH_PX, HEIGHT_PX = 1840, 156
 _TEXT = (223, 227, 232)
 _ROWS = ((4, 25), (5, 21))
 """Rows, and how large their text is: more and smaller ones where columns would not fit."""
-_SIZE_PX, _SWATCH_PX, _GAP_PX = 21, (40, 18), 30
+_SIZE_PX, _SWATCH_PX, _TEXT_PX, _GAP_PX = 20, (40, 18), 52, 30
 _LEFT_PX, _SCALE_PX = 14, 420
 _FINE = 4
 """Shapes are drawn so many times as large, and then made smaller, so that their edges are smooth."""
@@ -52,58 +50,45 @@ _SHOWN_TARGETS = 12
 _SHOWN_ALARMS = 8
 
 
+_CLOSED = (Look("hatch", colours.HATCH, "known to be lethal"), Look("hatch", colours.NO_GO, "no-go zone"))
+
+
 class Layer(NamedTuple):
     """A tab of the view.
 
     name    of its legend
     entity  which has the ground of this layer
+    looks   what its legend says of the ground
     target  whose routes alone it shows; None for all
     """
 
     name: str
     title: str
     entity: str
+    looks: tuple[Look, ...]
     target: str | None = None
 
 
-PHOTO = Layer("photo", "Photo", "world/ground")
-COST = Layer("cost", "Cost", "world/layers/cost")
-KNOWN = Layer("known", "Known and true", "world/layers/known")
-LEARNED = Layer("learned", "Learned", "world/layers/learned")
-NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest")
-
-
-class Scale(NamedTuple):
-    """A bar of colours, evenly between those named, and texts evenly along it."""
-
-    colours: tuple[str, ...]
-    title: str
-    texts: tuple[str, ...]
-
-
-_WINDOW = Look("line", colours.WINDOW, "part grown last")
-_CLOSED = (Look("hatch", colours.HATCH, "known to be lethal"), Look("hatch", colours.NO_GO, "no-go zone"))
-_ENTRIES = {
-    PHOTO: (
-        *_CLOSED,
-        Look("fill", colours.LETHAL_MARK, "found lethal"),
-        Look("fill", colours.SLOW_MARK, "found slow"),
-        Look("fill", colours.FAST_MARK, "found quick"),
-    ),
-    COST: (*_CLOSED, Look("fill", colours.LETHAL_PRIOR, "found lethal")),
-    KNOWN: (
-        Look("fill", colours.FOUND, "hidden, and found"),
-        Look("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
-        Look("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
-        Look("fill", colours.OVERRULED, "marked or ordered, yet not so"),
-    ),
-    LEARNED: _CLOSED,
-}
-_TO_TARGET = (
-    Look("line", colours.TREE, "where the cost falls most"),
-    Look("fill", colours.UNREACHED, "no way from here"),
-    Look("fill", colours.LETHAL_PRIOR, "lethal"),
-)
+PHOTO = Layer(
+    "photo", "Photo", "world/ground",
+    (*_CLOSED, Look("fill", colours.LETHAL_MARK, "found lethal"), Look("fill", colours.SLOW_MARK, "found slow"),
+     Look("fill", colours.FAST_MARK, "found quick")),
+)  # fmt: skip
+COST = Layer("cost", "Cost", "world/layers/cost", (*_CLOSED, Look("fill", colours.LETHAL_PRIOR, "found lethal")))
+KNOWN = Layer(
+    "known", "Known and true", "world/layers/known",
+    (Look("fill", colours.FOUND, "hidden, and found"),
+     Look("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
+     Look("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
+     Look("fill", colours.OVERRULED, "marked or ordered, yet not so")),
+)  # fmt: skip
+LEARNED = Layer("learned", "Learned", "world/layers/learned", _CLOSED)
+TO_TARGET = Layer(
+    "to_target", "To", "world/layers/to_target",
+    (Look("line", colours.TREE, "where the cost falls most"), Look("fill", colours.UNREACHED, "no way from here"),
+     Look("fill", colours.LETHAL_PRIOR, "lethal")),
+)  # fmt: skip
+NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest", ())
 
 
 def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
@@ -116,42 +101,22 @@ def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
         shown.append(LEARNED)
     if targets:
         target = scenario.monitor.show_target or targets[0]
-        shown.append(Layer("to_target", f"To {target}", "world/layers/to_target", target))
+        shown.append(TO_TARGET._replace(title=f"To {target}", target=target))
     if len(targets) > 1:
-        shown.append(NEAREST)
+        nearest = (Look("fill", hue, f"nearest: {id}") for id, hue in zip(targets, HUES, strict=False))
+        shown.append(NEAREST._replace(looks=tuple(nearest)))
     return shown
 
 
-def still_legend(
-    layer: Layer, ground: colours.GroundColours, targets: Sequence[str], movers: Sequence[Look]
-) -> bytes | None:
-    """PNG of the legend of a layer which stays as it is; None where it changes with the costs.
+class Scale(NamedTuple):
+    """A bar of colours, evenly between those named, and texts evenly along it."""
 
-    targets  in order of their colours, of which as many are named as there are
-    movers   what it says of all that moves
-    """
-    scale = None
-    if layer == COST:  # from dear to cheap, evenly in the logarithm of the pace
-        paces = np.geomspace(ground.slowest_s_per_m, ground.quickest_s_per_m, 5)
-        scale = Scale(colours.COST_COLOURS, "seconds a kilometre", tuple(f"{pace * 1000:.3g}" for pace in paces))
-    if layer == LEARNED:
-        scale = Scale(colours.LEARNED_COLOURS, "times the prior pace", ("1/4", "1/2", "1", "2", "4"))
-    entries = _ENTRIES.get(layer)
-    if layer == NEAREST:
-        entries = tuple(Look("fill", hue, f"nearest: {id}") for id, hue in zip(targets, HUES, strict=False))
-    return None if entries is None else legend_picture((*entries, _WINDOW, *movers), scale)
+    colours: Sequence[str]
+    title: str
+    texts: Sequence[str]
 
 
-def to_target_legend(target: str, full_s: float, movers: Sequence[Look] = ()) -> bytes:
-    """PNG of the legend of a cost-to-go, of which so much is at the end of the scale."""
-    unit, unit_s = unit_of(full_s)
-    texts = tuple(f"{full_s * n / 5 / unit_s:.3g}" for n in range(6))
-    scale = Scale(colours.COST_TO_GO_COLOURS, f"{unit} to {target}", texts)
-    return legend_picture((*_TO_TARGET, _WINDOW, *movers), scale)
-
-
-@functools.lru_cache(maxsize=16)
-def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> bytes:
+def legend_picture(looks: Sequence[Look], scale: Scale | None = None) -> bytes:
     """A PNG of `WIDTH_PX` x `HEIGHT_PX`."""
     image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), BACKGROUND)
     draw = ImageDraw.Draw(image)
@@ -161,31 +126,27 @@ def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> byt
         left += _SCALE_PX + 2 * _GAP_PX
     for rows, size in _ROWS:
         font = ImageFont.load_default(size)
-        columns = [entries[first : first + rows] for first in range(0, len(entries), rows)]
-        widths = [
-            _SWATCH_PX[0] + 12 + max(font.getlength(entry.meaning) for entry in column) + _GAP_PX
-            for column in columns
-        ]
+        columns = [looks[first : first + rows] for first in range(0, len(looks), rows)]
+        widths = [_TEXT_PX + max(font.getlength(look.meaning) for look in column) + _GAP_PX for column in columns]
         if left + sum(widths) <= WIDTH_PX:
             break
     for column, width in zip(columns, widths, strict=True):
-        for row, entry in enumerate(column):
+        for row, look in enumerate(column):
             middle = round((row + 0.5) * HEIGHT_PX / rows)
-            image.paste(_swatch(entry), (round(left), middle - _SWATCH_PX[1] // 2))
-            draw.text((left + _SWATCH_PX[0] + 12, middle), entry.meaning, _TEXT, font, anchor="lm")
+            image.paste(_swatch(look), (round(left), middle - _SWATCH_PX[1] // 2))
+            draw.text((left + _TEXT_PX, middle), look.meaning, _TEXT, font, anchor="lm")
         left += width
     file = io.BytesIO()
     image.save(file, "PNG", compress_level=1)  # of a scale that changes all the time most of the work is to pack it
     return file.getvalue()
 
 
-@functools.cache
 def _swatch(look: Look) -> Image.Image:
     width, height = (_FINE * side for side in _SWATCH_PX)
     image = Image.new("RGB", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(image)
-    middle, radius, colour, thick = width // 2, height // 2, look.colour, 2 * _FINE
-    square, whole = (middle - radius, 0, middle + radius - 1, height - 1), (0, 0, width - 1, height - 1)
+    middle, colour, thick = width // 2, look.colour, 2 * _FINE
+    square, whole = (middle - height // 2, 0, middle + height // 2 - 1, height - 1), (0, 0, width - 1, height - 1)
     match look.shape:
         case "fill":
             draw.rectangle(whole, colour, _TEXT, _FINE // 2)
@@ -194,31 +155,23 @@ def _swatch(look: Look) -> Image.Image:
                 draw.line((start, height, start + height, 0), colour, thick)
             draw.rectangle(whole, None, colour, _FINE)
         case "line":
-            draw.line((0, radius, width, radius), colour, 2 * thick)
+            draw.line((0, height // 2, width, height // 2), colour, 2 * thick)
         case "ball":
             draw.ellipse(square, colour, _TEXT, _FINE // 2)
         case "ring":
             draw.ellipse(square, None, colour, thick)
-        case "box":
-            draw.rectangle(square, None, colour, thick)
-        case "disc":
-            draw.ellipse((middle - 3 * radius // 2, radius // 2, middle + 3 * radius // 2, 3 * radius // 2), colour)
-        case "pin":
-            draw.line((middle, radius // 2, middle, height), colour, thick)
-            draw.ellipse((middle - radius // 2, 0, middle + radius // 2, radius), colour)
     return image.resize(_SWATCH_PX, Image.Resampling.LANCZOS)
 
 
 def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, scale: Scale) -> None:
-    small, font = ImageFont.load_default(_SIZE_PX - 2), ImageFont.load_default(_SIZE_PX)
-    top = HEIGHT_PX // 2 - 42
+    font, top = ImageFont.load_default(_SIZE_PX), HEIGHT_PX // 2 - 42
     draw.text((_LEFT_PX, top), scale.title, _TEXT, font, anchor="lm")
     bar = colours.between(scale.colours, _SCALE_PX).astype(np.uint8)
     image.paste(Image.fromarray(np.repeat(bar[None], 28, axis=0)), (_LEFT_PX, top + 20))
     last = len(scale.texts) - 1
     for n, text in enumerate(scale.texts):
         anchor = {0: "lm", last: "rm"}.get(n, "mm")
-        draw.text((_LEFT_PX + n / last * _SCALE_PX, top + 66), text, _TEXT, small, anchor=anchor)
+        draw.text((_LEFT_PX + n / last * _SCALE_PX, top + 66), text, _TEXT, font, anchor=anchor)
 
 
 def make_blueprint(
@@ -298,7 +251,7 @@ def _sizes(level: Level) -> dict[Any, Any]:
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-level.trail_s),
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
-    px = {"vehicles": level.radius_px, "guests": 0.8 * level.radius_px, "targets/balls": 8.5, "bodies/names": 3.0}
+    px = {"vehicles": level.radius_px, "targets/balls": 8.5}
     radii = {f"/world/{entity}": rr.Points3D.from_fields(radii=[screen(radius)]) for entity, radius in px.items()}
     trails = {f"/world/trails/{whose}": rrb.VisibleTimeRanges([trail]) for whose in ("vehicles", "targets")}
     return {**radii, **trails}

@@ -39,7 +39,7 @@ from swarm.config.ground import HiddenConfig
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import ENDED, Counters
+from swarm.runtime.stats import Counters
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
@@ -58,10 +58,7 @@ _UNSEEN = 2
 """While nobody looks each frame but the second is left out: what is drawn is for the recording only."""
 _ANEW_NS = 10 * NS_PER_S
 """For viewers that come, what is drawn on change only is drawn anew, but not more often than this."""
-_ENDED_KEPT = 4096
 _ANSWER_S = 5.0
-_LAST_WORD_NS = NS_PER_S // 2
-"""So long after a process went its last figures are waited for, which say whether it was asked to end."""
 
 
 class MonitorService:
@@ -112,10 +109,6 @@ class MonitorService:
         """Ticks so far, and those in which something was drawn."""
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
-        self._gone: dict[Peer, int] = {}
-        """Processes that went and that nobody was told of yet, and when."""
-        self._ended: set[Peer] = set()
-        """Processes which said in their last figures that they end as they were asked to."""
         self._last_sample_s = -1.0
         self._figures_due_ns = 0
         self._member.needs("the shared map", lambda: self._sync.joined)
@@ -162,7 +155,6 @@ class MonitorService:
     def stop(self, now_ns: int) -> None:
         for heard in self._observer.due(now_ns, all=True):
             self._hear(heard, now_ns)
-        self._tell_gone(now_ns)
         self.figures.finish(now_ns)
         self._figures_due_ns = now_ns
         self._ground.finish()
@@ -185,28 +177,13 @@ class MonitorService:
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case PlannerStatus() as status:
                 self._ground.hear_status(status)
-            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
-                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
             case Note() as note:
                 self._panel.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.figures.alive(peer, up, now_ns)
-        if now_ns - self._started_ns <= 2 * NS_PER_S:  # those that were there before are not news
-            return
-        if up:
-            self._gone.pop(peer, None)
-            self._panel.note(f"{peer.role} {peer.id} is up", "INFO")
-        else:
-            self._gone[peer] = now_ns
-
-    def _tell_gone(self, until_ns: int) -> None:
-        """Tells who went: a moment later, as a process's last word may come after it."""
-        for peer in [peer for peer, at_ns in self._gone.items() if at_ns <= until_ns]:
-            del self._gone[peer]
-            ended = peer in self._ended
-            text = f"{peer.role} {peer.id} {'has ended as asked' if ended else 'is gone'}"
-            self._panel.note(text, "INFO" if ended else "WARN")
+        if now_ns - self._started_ns > 2 * NS_PER_S:  # those that were there before are not news
+            self._panel.note(f"{peer.role} {peer.id} is {'up' if up else 'gone'}", "INFO")
 
     def _watch_recording(self, now_ns: int) -> None:
         if self._recording is None:
@@ -232,7 +209,6 @@ class MonitorService:
         self._sync.tick(now_ns)
         for heard in self._observer.due(now_ns):
             self._hear(heard, now_ns)
-        self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
         self._pen.set_time(self._frame, self.at_s)
         self._watch_recording(now_ns)
@@ -241,8 +217,7 @@ class MonitorService:
             self._pen.forget()
             self._ground.draw_anew()
             self._movers.draw_anew()
-        self._ground.tick(now_ns, self._watched)
-        if (target := self._ground.next_target(now_ns, self._watched)) is not None:
+        if (target := self._ground.tick(now_ns, self._watched)) is not None:
             request = self._ground.samples.request
             self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
         self._movers.tick(now_ns, self._watched)

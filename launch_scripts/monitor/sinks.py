@@ -17,9 +17,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -70,8 +69,7 @@ def in_markdown(text: str) -> str:
     return _MARKDOWN.sub(r"\\\1", shown(text))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Strips:
+class Strips(NamedTuple):
     """Lines of several points each, as rerun keeps them: of a list of lines it makes an array each, which took a
     third of a frame.
 
@@ -81,21 +79,6 @@ class Strips:
 
     points: Floats
     offsets: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.offsets) - 1
-
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Strips)
-            and np.array_equal(self.offsets, other.offsets)
-            and np.array_equal(self.points, other.points)
-        )
-
-    def line(self, n: int) -> Floats:
-        """float32 (k, 3)."""
-        points: Floats = self.points[self.offsets[n] : self.offsets[n + 1]]
-        return points
 
 
 def ragged(points: Floats, lengths: Sequence[int]) -> Strips:
@@ -194,7 +177,7 @@ class Pen:
 
     def lines(self, entity: str, strips: Strips, colours: Bytes | None = None) -> None:
         """Lines; colours are those of each, uint8 (n, 3), or stay as they are."""
-        if self.news(entity, strips=strips, colours=colours):
+        if self.news(entity, points=strips.points, offsets=strips.offsets, colours=colours):
             self.trail(entity, strips, colours)
 
     def trail(self, entity: str, strips: Strips, colours: Bytes | None) -> None:

@@ -294,15 +294,10 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     told = [(each["kind"], each["about"], each["over_s"]) for each in values["report"]["alarms"]]
     assert told == [(each["kind"], each["about"], each["over_s"]) for each in values["status as JSON"]["alarms"]]
 
-    vehicles = watched.logged.details("world/vehicles", "world/guests")
+    vehicles = watched.logged.details("world/vehicles")
     does = {each.name.lower(): sum(f": {words}" in text for text in vehicles) for each, words in _DOES.items()}
     assert len(vehicles) == state.vehicles
     assert does == state.states
-    always = [column for column in facts.TARGET_FACTS if column.always]
-    for text in watched.logged.details("world/targets/balls"):
-        title, _, rest = text.partition(": ")
-        line = next(line for line in state.targets if line.title == title)
-        assert rest == ", ".join(f"{column.label} {column.shown(line)}" for column in always[1:])
 
     # The end: what the recording shows last is what the report says.
     simulation.finish()

@@ -10,6 +10,7 @@ the costs of at most `_MOST_SAMPLES` cells, of one target at a time.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -34,7 +35,7 @@ LETHAL_MARK, SLOW_MARK, FAST_MARK = (98, 30, 165), (235, 150, 0), (90, 200, 250)
 LETHAL_PRIOR, HATCH, NO_GO, ROAD = (12, 14, 20), (200, 200, 212), rgb(palette.RED), (232, 222, 196)
 STILL_HIDDEN_LETHAL, STILL_HIDDEN_SLOW = rgb(palette.RED), rgb(palette.ORANGE)
 FOUND, OVERRULED = rgb(palette.SKY), rgb(palette.PINK)
-WINDOW, TREE = (255, 200, 60), (255, 255, 255)
+TREE = (255, 255, 255)
 UNREACHED = (70, 60, 66)
 _HATCH_TEXELS = 7
 _CIVIDIS = "#00224e #1a386f #434e6c #61656f #7d7c78 #9b9476 #bcae6c #dec958 #fee838"
@@ -53,7 +54,6 @@ _ASK_NS = 2 * NS_PER_S
 _BESIDE = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 _ON_THE_WAY = np.linspace(0, 1, 9)[1:-1]
 """Where between two samples it is looked for lethal cells."""
-_STEPS = (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10)
 _LEAST_BRANCH = 3
 """Samples whose way leads through one from which a line is drawn."""
 _PIXELS = 160
@@ -222,7 +222,7 @@ def _mixed(pixels: Bytes, colour: Colour, share: float) -> Bytes:
 
 
 class CostSamples:
-    """Asks for the cost-to-go of the shown target every other time, of all others in turn between.
+    """Asks for the cost-to-go of the shown target every other time, of all in turn between.
 
     rows, cols  of the samples, int64 (n,) and (m,)
     costs_s     target -> float32 (n, m), inf where there is no way
@@ -239,35 +239,33 @@ class CostSamples:
         self.request = CostRequest(cells=cells.reshape(-1).tolist())
         self.costs_s: dict[str, Floats] = {}
         self._shown = shown
-        self._targets: list[str] = []
+        self.targets: deque[str] = deque()
         """Targets with a planner, the one that was asked least lately first."""
         self._due_ns, self._asked = 0, 0
 
     def hear_target(self, target: str) -> None:
         """A planner told its state."""
-        if target not in self._targets:
-            self._targets.append(target)
+        if target not in self.targets:
+            self.targets.append(target)
 
     def next_target(self, now_ns: int, slower: int = 1) -> str | None:
         """The target to ask about now, if it is time.
 
         slower  by how many times as seldom as somebody needs who looks
         """
-        if now_ns < self._due_ns or not self._targets:
+        if now_ns < self._due_ns or not self.targets:
             return None
         self._due_ns = now_ns + slower * _ASK_NS
         self._asked += 1
-        others = [target for target in self._targets if target != self._shown]
-        if self._shown in self._targets and (self._asked % 2 or not others):
+        if self._asked % 2 and self._shown in self.targets:
             return self._shown
-        self._targets.remove(others[0])
-        self._targets.append(others[0])
-        return others[0]
+        self.targets.rotate(-1)
+        return self.targets[-1]
 
     def hear(self, reply: CostReply) -> bool:
         """Takes an answer in. Returns whether it says something."""
         costs = column(reply.cost_to_go_s, "<f4")
-        if reply.target not in self._targets or len(costs) != len(self.request.cells):
+        if reply.target not in self.targets or len(costs) != len(self.request.cells):
             return False
         if not np.isfinite(costs).any():
             return self.costs_s.pop(reply.target, None) is not None
@@ -329,20 +327,6 @@ def nearest_target(costs: dict[str, Floats], order: Sequence[str]) -> Ints:
     return np.where(np.isfinite(stacked.min(axis=0)), stacked.argmin(axis=0), -1)
 
 
-def unit_of(seconds: float) -> tuple[str, float]:
-    """The unit in which people say a time, and its seconds."""
-    return next(
-        (each for each in (("hours", 3600.0), ("minutes", 60.0)) if seconds >= 2 * each[1]), ("seconds", 1.0)
-    )
-
-
-def full_scale_s(seconds: float) -> float:
-    """The end of a scale for costs up to this: few digits in their unit."""
-    unit_s = unit_of(seconds)[1]
-    power = 10.0 ** math.floor(math.log10(max(seconds / unit_s, 1e-3)))
-    return float(min(step * power * unit_s for step in _STEPS if step * power * unit_s >= seconds * 0.9999))
-
-
 class TargetPictures:
     """Draws samples of cost-to-go on the relief.
 
@@ -366,7 +350,7 @@ class TargetPictures:
         reached = np.isfinite(costs)
         most = float(np.percentile(costs[reached], _SHOWN_PERCENT)) if reached.any() else 0.0
         if not 0.6 * self.full_s <= most <= 1.1 * self.full_s:
-            self.full_s = full_scale_s(most)
+            self.full_s = max(most, 1e-3)
         share = np.where(reached, costs, 0) / self.full_s
         pixels = self._palette[np.clip(share * 255, 0, 255).astype(np.intp)]
         band = np.floor(share * _BANDS)

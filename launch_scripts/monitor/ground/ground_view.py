@@ -1,4 +1,4 @@
-"""Draws what lies still: decides which tiles, zones and windows are drawn again, and when.
+"""Draws what lies still: decides which tiles and zones are drawn again, and when.
 
 Zones are those of the scenario, those that its files draw, and those that operators ordered. Few entities, style
 logged once: see docs/decisions/0008-the-live-view.md.
@@ -16,12 +16,29 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from launch_scripts.monitor import live_layout
-from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW, CostSamples, GroundColours, TargetPictures
+from launch_scripts.monitor.ground.ground_colours import (
+    COST_COLOURS,
+    COST_TO_GO_COLOURS,
+    LEARNED_COLOURS,
+    TREE,
+    CostSamples,
+    GroundColours,
+    TargetPictures,
+)
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
-from launch_scripts.monitor.live_layout import COST, KNOWN, LEARNED, NEAREST, PHOTO, Layer
+from launch_scripts.monitor.live_layout import (
+    COST,
+    KNOWN,
+    LEARNED,
+    NEAREST,
+    PHOTO,
+    ZONE_COLOURS,
+    Layer,
+    Scale,
+    legend_picture,
+)
 from launch_scripts.monitor.movers.styles import Look
-from launch_scripts.monitor.sinks import Pen, even, screen
+from launch_scripts.monitor.sinks import Pen, screen
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones
@@ -46,15 +63,11 @@ _RULES: dict[str, Rule] = {
 _MOST_EDGES = 20_000
 """Sides of texels along a border that is drawn. A zone with more is named, and hatched if closed."""
 _LARGEST_FILE = 1 << 25
-_WINDOWS_NS = NS_PER_S
 _LAYER_NS = 5 * NS_PER_S
 _NEAREST_NS = 8 * NS_PER_S
 _UNSEEN = 4
 """While nobody looks the ground is drawn so many times as seldom, for the recording."""
 _TILES_AT_ONCE = 80
-_ALL_NAMED, _NAMED_SHARE = 4, 0.12
-"""So many windows all have names. Of more, those of a share of the terrain's width: in a small one stands its
-target, which has a name."""
 _NAMES_SHOWN = 40
 _MOST_TARGETS = 256
 """Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""
@@ -63,8 +76,6 @@ _LINE_PX = 1.3
 _WHOLE_SIDE = 112
 _BAR_SHARE = 0.25
 """Of the terrain's width, at most."""
-SIDE_POINTS = 33
-"""Points along each side of a window: its outline follows the terrain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +128,7 @@ class Scene:
 
 
 class GroundView:
-    """Draws terrain, layers, zones and windows on a recording stream.
+    """Draws terrain, layers and zones on a recording stream.
 
     movers  what the legends say of all that moves
     """
@@ -144,15 +155,13 @@ class GroundView:
             _Tiles(LEARNED, colours.learned_of, _LAYER_NS),
         )
         self._layers = [each for each in tiled if each.layer in scene.layers]
+        self._entities = {layer.entity for layer in scene.layers}
         self._targets = [layer for layer in scene.layers if layer.target is not None]
         self.samples = CostSamples(terrain.grid, next((layer.target for layer in self._targets), None))
         self._pictures = TargetPictures(self._mesh, colours, self.samples)
         self._nearest_due_ns = 0
         self._ordered: list[Area] = []
         self._zones_version = 0
-        self._windows: dict[str, tuple[int, ...]] = {}
-        """Target -> the window that its planner grew last."""
-        self._windows_due_ns = 0
 
     def begin(self) -> None:
         """Draws all of it. What never changes is static: the shape of the ground, legends, the scenario's zones."""
@@ -163,12 +172,9 @@ class GroundView:
         for layer in self._shown:
             for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in tiled else whole):
                 self._pen.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
-            self._legend(layer, live_layout.still_legend(layer, self._colours, self._target_ids, self._movers))
-        self._pen.style("world/windows", _LINE_PX, WINDOW)
-        self._pen.label_style("world/windows/names", WINDOW)
+            self._legend(layer)
         self._draw_margin()
         self._draw_zones("planned", self._zones, static=True)
-        self._pictures.full_s = 0.0  # so that the next answer draws a legend
         self.draw_anew()
         self.finish()
 
@@ -185,11 +191,9 @@ class GroundView:
             self._draw_tiles(layer, self._mesh.tiles)
 
     def hear_status(self, status: PlannerStatus) -> None:
-        """Takes in which window a planner grew last."""
-        if status.target not in self._windows and len(self._windows) >= _MOST_TARGETS + len(self._target_ids):
-            return
-        self.samples.hear_target(status.target)
-        self._windows[status.target] = tuple(status.window)
+        """Takes in that a target has a planner, which can be asked for costs."""
+        if len(self.samples.targets) < _MOST_TARGETS + len(self._target_ids):
+            self.samples.hear_target(status.target)
 
     def hear_costs(self, reply: CostReply, now_ns: int) -> None:
         """Draws what a planner answered."""
@@ -198,12 +202,12 @@ class GroundView:
         for layer in self._targets:
             if layer.target == reply.target and reply.target in self.samples.costs_s:
                 self._draw_to_target(layer, reply.target)
-        if NEAREST in self._shown and now_ns >= self._nearest_due_ns and self.samples.costs_s:
+        if NEAREST.entity in self._entities and now_ns >= self._nearest_due_ns and self.samples.costs_s:
             self._nearest_due_ns = now_ns + _NEAREST_NS
             self._texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
-    def tick(self, now_ns: int, watched: bool) -> None:
-        """Draws what has changed, now and then."""
+    def tick(self, now_ns: int, watched: bool) -> str | None:
+        """Draws what has changed, now and then. Returns the target whose planner is to be asked for costs now."""
         slower = 1 if watched else _UNSEEN
         self._take_changes()
         if self._zones_version != self._replica.zones_version:
@@ -215,13 +219,7 @@ class GroundView:
             if now_ns >= layer.due_ns:
                 layer.due_ns = now_ns + slower * layer.every_ns
                 self._draw_tiles(layer, _TILES_AT_ONCE)
-        if self._windows and now_ns >= self._windows_due_ns:
-            self._windows_due_ns = now_ns + _WINDOWS_NS
-            self._draw_windows()
-
-    def next_target(self, now_ns: int, watched: bool) -> str | None:
-        """The target whose planner is to be asked for costs now, if it is time."""
-        return self.samples.next_target(now_ns, 1 if watched else _UNSEEN)
+        return self.samples.next_target(now_ns, slower)
 
     def _take_changes(self) -> None:
         for window in self._cost_map.take_dirty():
@@ -244,10 +242,20 @@ class GroundView:
         texture = rr.Mesh3D.from_fields(albedo_texture_buffer=pixels, albedo_texture_format=form)
         self._pen.log(f"{entity}/{tile}", texture)
 
-    def _legend(self, layer: Layer, picture: bytes | None) -> None:
-        if picture is not None:
-            image = rr.EncodedImage(contents=picture, media_type="image/png")
-            self._pen.log(f"legend/{layer.name}", image, static=True)
+    def _legend(self, layer: Layer) -> None:
+        """Draws what stands below a layer: once, but for a cost-to-go whenever its scale changes."""
+        scale, pictures = None, self._pictures
+        if layer == COST:  # from dear to cheap, evenly in the logarithm of the pace
+            paces = np.geomspace(self._colours.slowest_s_per_m, self._colours.quickest_s_per_m, 5)
+            scale = Scale(COST_COLOURS, "seconds a kilometre", [f"{pace * 1000:.3g}" for pace in paces])
+        elif layer == LEARNED:
+            scale = Scale(LEARNED_COLOURS, "times the prior pace", ["1/4", "1/2", "1", "2", "4"])
+        elif layer.target is not None and pictures.full_s:
+            seconds = [float(f"{each:.3g}") for each in np.linspace(0, pictures.full_s, 6)]
+            scale = Scale(COST_TO_GO_COLOURS, f"seconds to {layer.target}", [f"{each:g}" for each in seconds])
+        picture = legend_picture((*layer.looks, *self._movers), scale)
+        image = rr.EncodedImage(contents=picture, media_type="image/png")
+        self._pen.log(f"legend/{layer.name}", image, static=True)
 
     def _draw_to_target(self, layer: Layer, target: str) -> None:
         before_s = self._pictures.full_s
@@ -255,12 +263,12 @@ class GroundView:
         lines, radii = self._pictures.tree(target)
         self._pen.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
         if self._pictures.full_s != before_s:
-            self._legend(layer, live_layout.to_target_legend(target, self._pictures.full_s, self._movers))
+            self._legend(layer)
 
     def _draw_zones(self, whose: str, zones: Sequence[Area], *, static: bool) -> None:
         parts = [borders(self._mesh, area) for area in zones]
         strips = np.concatenate([np.empty((0, 2, 3), np.float32), *parts])
-        per_zone = np.array([live_layout.ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
+        per_zone = np.array([ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         path = f"world/zones/{whose}"
         self._pen.log(path, rr.LineStrips3D(strips, colors=colours, radii=[screen(_LINE_PX)]), static=static)
@@ -273,51 +281,22 @@ class GroundView:
         """Draws what a map has south of it, level with its lowest ground: a bar of known length in the west, an
         arrow to the north in the east, and how much heights are stretched."""
         mesh, unit = self._mesh, self._mesh.scale_m
-        length_m = round_length(_BAR_SHARE * mesh.width_m)
-        south, beneath = -mesh.depth_m - 3 * unit, -mesh.depth_m - 4.5 * unit
-        east = mesh.width_m - unit
-        shapes = [[(0, south), (length_m, south)]]
-        shapes += [[(x, south - unit / 2), (x, south + unit / 2)] for x in (0, length_m / 2, length_m)]
-        tip = (east, south + 1.5 * unit)
-        shapes += [[(east, south - 2.5 * unit), tip], [(east - 0.8 * unit, south), tip, (east + 0.8 * unit, south)]]
-        lines = [np.pad(np.array(shape, np.float32), ((0, 0), (0, 1))) for shape in shapes]
-        margin = rr.LineStrips3D(lines, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
+        length_m, east = round_length(_BAR_SHARE * mesh.width_m), mesh.width_m - unit
+        south, north = -mesh.depth_m - 4 * unit, -mesh.depth_m - 1.5 * unit
+        shapes = [
+            [(0, north, 0), (0, south, 0), (length_m, south, 0), (length_m, north, 0)],
+            [(east, south, 0), (east, north, 0)],
+            [(east - unit, north - unit, 0), (east, north, 0), (east + unit, north - unit, 0)],
+        ]
+        margin = rr.LineStrips3D(shapes, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
         self._pen.log("world/margin", margin, static=True)
         texts = {
-            "0": (0, beneath),
-            said_length(length_m): (length_m, beneath),
-            mesh.said_heights: (mesh.width_m / 2, beneath),
-            "N": (east - 2.2 * unit, south),
+            said_length(length_m): (length_m / 2, south, 0),
+            mesh.said_heights: (mesh.width_m / 2, south, 0),
+            "N": (east - 2.2 * unit, north, 0),
         }
-        places = np.array([(*place, 0) for place in texts.values()], np.float32)
+        places = np.array(list(texts.values()), np.float32)
         self._pen.texts("world/margin/texts", places, list(texts), [_MARGIN_COLOUR], static=True)
-
-    def _draw_windows(self) -> None:
-        """Draws the window that each planner grew last, unless it is the whole terrain."""
-        grid = self._mesh.grid
-        told = [(target, Window(*window)) for target, window in sorted(self._windows.items()) if window]
-        parts = [(target, w) for target, w in told if not w.empty and w.cells < grid.cells]
-        outlines = window_outlines(self._mesh, [window for _, window in parts])
-        least = 0.0 if len(parts) <= _ALL_NAMED else _NAMED_SHARE * max(grid.rows, grid.cols)
-        named = [n for n, (_, w) in enumerate(parts) if max(w.row1 - w.row0, w.col1 - w.col0) >= least]
-        named = named[:_NAMES_SHOWN]
-        names = [f"window of {parts[n][0]}" for n in named]
-        south = outlines[named, 5 * SIDE_POINTS // 2]
-        self._pen.lines("world/windows", even(outlines))
-        self._pen.points("world/windows/names", positions=south, labels=names)
-
-
-def window_outlines(mesh: TerrainMesh, windows: Sequence[Window]) -> Floats:
-    """The border of each window, laid over the terrain: float32 (n, 4 * SIDE_POINTS, 3)."""
-    sides = np.array([(w.row0, w.row1 - 1, w.col0, w.col1 - 1) for w in windows], np.int64).reshape(-1, 4).T
-    north, south = np.clip(sides[:2], 0, mesh.grid.rows - 1)[..., None]
-    west, east = np.clip(sides[2:], 0, mesh.grid.cols - 1)[..., None]
-    along = np.linspace(0, 1, SIDE_POINTS)
-    down, across = (north + (south - north) * along).astype(int), (west + (east - west) * along).astype(int)
-    flat = np.zeros(SIDE_POINTS, int)
-    rows = np.concatenate([north + flat, down, south + flat, down[:, ::-1]], axis=1)
-    cols = np.concatenate([across, east + flat, across[:, ::-1], west + flat], axis=1)
-    return mesh.place_cells(rows * mesh.grid.cols + cols, 0.25 * mesh.scale_m)
 
 
 def _mesh(tile: MeshTile) -> rr.Mesh3D:

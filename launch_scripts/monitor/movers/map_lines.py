@@ -3,24 +3,20 @@ No rerun."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.sinks import Strips, even, ragged
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.grid import GridSpec, walk
+from swarm.wire.messages.vehicles import Followed
 
 Cells = NDArray[np.int64]
-Corners = NDArray[np.float64]
-"""(n, 2): rows and cols of the places between which a line is straight; whole numbers are middles of cells."""
 
 _CIRCLE_POINTS = 33
-_STEP_ROW, _STEP_COL = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
 
 
 def feet(mesh: TerrainMesh, positions: Floats) -> Floats:
@@ -63,118 +59,74 @@ class Trails:
         return even(np.stack([last[drawn], positions[drawn]], axis=1)), drawn
 
 
-def cell_at(grid: GridSpec, east_m: float, south_m: float) -> int:
-    """The cell at a place, the nearest one if it is outside."""
-    row = min(max(int(south_m // grid.resolution_m), 0), grid.rows - 1)
-    col = min(max(int(east_m // grid.resolution_m), 0), grid.cols - 1)
-    return row * grid.cols + col
-
-
-def cells_along(grid: GridSpec, start: int, directions: bytes) -> Cells | None:
-    """The cells of a route, as `swarm.grid.walk`; None where that raises."""
-    codes = np.frombuffer(directions, np.uint8)
-    if not 0 <= start < grid.cells or int(codes.max(initial=0)) >= len(STEP_ROW):
-        return None
-    rows = start // grid.cols + np.cumsum(_STEP_ROW[codes])
-    cols = start % grid.cols + np.cumsum(_STEP_COL[codes])
-    if not ((rows >= 0) & (rows < grid.rows) & (cols >= 0) & (cols < grid.cols)).all():
-        return None
-    return np.concatenate([np.array([start], np.int64), rows * grid.cols + cols])
+def cells_at(grid: GridSpec, east_m: Floats, south_m: Floats) -> Cells:
+    """The cells at places, the nearest ones if they are outside."""
+    rows, cols = np.floor_divide((south_m, east_m), grid.resolution_m).astype(np.int64)
+    cells: Cells = np.clip(rows, 0, grid.rows - 1) * grid.cols + np.clip(cols, 0, grid.cols - 1)
+    return cells
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteNow:
-    """A route that a vehicle has begun.
+    """A route that a vehicle has begun, or what is left of it.
 
+    cells     int64 (n,)
+    places    float64 (n, 2)  rows and columns that it leads over, whole numbers in the middles of cells; those of a
+              pulled route lie on the straight lines between the cells in which it turns
     gap       its cost over its proven lower bound; None if nothing is proven
     begun_ns  when that was heard
-    turns     of a pulled route the indices of the cells in which it turns, its first and last included; else None
     """
 
     target: str
     cells: Cells
+    places: NDArray[np.float64]
     gap: float | None = None
     begun_ns: int = 0
-    turns: Cells | None = None
 
-    def ahead_of(self, cell: int) -> Cells:
+    @classmethod
+    def of(cls, followed: Followed, grid: GridSpec, now_ns: int) -> RouteNow:
+        """The route that a vehicle told. Raises ValueError or OutsideGridError where it leaves the grid."""
+        cells = np.array(walk(grid, followed.start, followed.directions), np.int64)
+        places = np.stack(np.divmod(cells, grid.cols), axis=1).astype(np.float64)
+        turns = np.cumsum([0, *np.frombuffer(followed.legs, "<u4")])
+        if turns[-1] == len(cells) - 1:
+            at = np.arange(len(cells))
+            places = np.stack([np.interp(at, turns, places[turns, axis]) for axis in (0, 1)], axis=1)
+        gap = followed.cost_s / followed.lower_bound_s if followed.lower_bound_s > 0 else None
+        return cls(followed.target, cells, places, gap, now_ns)
+
+    def ahead_of(self, cell: int) -> RouteNow:
         """The route from a cell on; the whole route if the cell is not on it."""
         found = np.flatnonzero(self.cells == cell)
-        return self.cells[found[-1] :] if len(found) else self.cells
+        return self.part(slice(found[-1], None)) if len(found) else self
 
-    def corners_ahead(self, grid: GridSpec, east_m: float, south_m: float) -> Corners:
-        """Of a pulled route: from where the vehicle is to where it turns, and on to the end; the whole route if
-        that place is not on it."""
-        assert self.turns is not None
-        corners = self.cells[self.turns]
-        found = np.flatnonzero(self.cells == cell_at(grid, east_m, south_m))
-        if not len(found):
-            return np.stack(np.divmod(corners, grid.cols), axis=1).astype(np.float64)
-        ahead = corners[self.turns > found[-1]]
-        place = south_m / grid.resolution_m - 0.5, east_m / grid.resolution_m - 0.5
-        return np.vstack([place, np.stack(np.divmod(ahead, grid.cols), axis=1)])
+    def part(self, which: slice | NDArray[np.intp]) -> RouteNow:
+        """Some of its places."""
+        return RouteNow(self.target, self.cells[which], self.places[which], self.gap, self.begun_ns)
 
 
 class RouteLines:
     """Routes to one target as lines in which no part of the ground is drawn twice.
 
     Routes to one target join, as the branches of its tree do: a thousand of them have few cells more than the tree.
-    Pulled ones meet where they turn.
     """
 
     def __init__(self, mesh: TerrainMesh, stride: int) -> None:
+        """stride  a line has a point for so many cells"""
         self._mesh = mesh
         self._stride = stride
         self._drawn = np.zeros(mesh.grid.cells, np.bool_)
 
-    def lines(self, routes: Iterable[Cells], pulled: Iterable[Corners] = ()) -> Strips:
-        """Each route up to where it meets one that is drawn already, the longest first; of pulled ones each segment
-        once."""
-        pieces = list(self._pieces(sorted(routes, key=len, reverse=True)))
-        for piece in pieces:
-            self._drawn[piece] = False
-        thin = [thinned(piece, self._stride) for piece in pieces]
-        cols = self._mesh.grid.cols
-        along = [np.stack(np.divmod(piece, cols), axis=1).astype(np.float64) for piece in thin]
-        along += [filled(piece, self._stride) for piece in _segments_once(pulled)]
-        rows_cols = np.concatenate(along) if along else np.empty((0, 2))
-        south_m, east_m = ((rows_cols + 0.5) * self._mesh.grid.resolution_m).astype(np.float32).T
-        return ragged(self._mesh.place(east_m, south_m, 0.2 * self._mesh.scale_m), list(map(len, along)))
-
-    def _pieces(self, routes: Iterable[Cells]) -> Iterator[Cells]:
-        drawn = self._drawn
-        for cells in routes:
-            met = np.flatnonzero(drawn[cells])
-            piece = cells[: met[0] + 1] if len(met) else cells
-            if len(piece) > 1:
-                drawn[piece] = True
-                yield piece
-
-
-def thinned(cells: Cells, stride: int) -> Cells:
-    """Every so many cells of a line, with both of its ends."""
-    kept = cells[::stride]
-    return kept if (len(cells) - 1) % stride == 0 else np.append(kept, cells[-1])
-
-
-def _segments_once(routes: Iterable[Corners]) -> Iterator[Corners]:
-    """Parts of routes of which no segment is in another one."""
-    drawn: set[tuple[float, ...]] = set()
-    for corners in routes:
-        known = []
-        for start, end in pairwise(corners.tolist()):
-            segment = (*start, *end)
-            known.append(segment in drawn)
-            drawn.add(segment)
-        borders = np.flatnonzero(np.diff(known, prepend=True, append=True))
-        for begin, end in zip(borders[::2].tolist(), borders[1::2].tolist(), strict=True):
-            yield corners[begin : end + 1]
-
-
-def filled(corners: Corners, stride: int) -> Corners:
-    """A line with a point for so many cells at least, so that it lies on the ground; its corners are among them."""
-    parts = [corners[:1]]
-    for start, end in pairwise(corners):
-        many = max(math.ceil(np.abs(end - start).max() / stride), 1)
-        parts.append(start + (end - start) * (np.arange(1, many + 1) / many)[:, None])
-    return np.concatenate(parts)
+    def lines(self, routes: Iterable[RouteNow]) -> Strips:
+        """Each route up to where it meets one that is drawn already, the longest first."""
+        parts, drawn = [np.empty((0, 2))], self._drawn
+        for route in sorted(routes, key=lambda route: len(route.cells), reverse=True):
+            met = np.flatnonzero(drawn[route.cells])
+            end = int(met[0]) if len(met) else len(route.cells) - 1
+            if end > 0:
+                drawn[route.cells[: end + 1]] = True
+                parts.append(route.places[np.append(np.arange(0, end, self._stride), end)])
+        drawn[:] = False
+        south_m, east_m = ((np.concatenate(parts) + 0.5) * self._mesh.grid.resolution_m).astype(np.float32).T
+        lengths = [len(part) for part in parts[1:]]
+        return ragged(self._mesh.place(east_m, south_m, 0.2 * self._mesh.scale_m), lengths)

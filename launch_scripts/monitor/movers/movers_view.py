@@ -7,8 +7,7 @@ opaque the likelier a target is there, alarms poles with their words.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -16,38 +15,33 @@ import rerun as rr
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.movers import styles
 from launch_scripts.monitor.movers.map_lines import feet, poles, rings
-from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY, mixed
+from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.sinks import LABEL_COLOUR, Colour, Pen, screen, shown
-from launch_scripts.observe.facts import TARGET_FACTS
+from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, screen, shown
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.state import RunState, TargetLine
+from launch_scripts.observe.state import RunState
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import column
 from swarm.wire.messages import Message
 from swarm.wire.messages.planning import Believed, Sighted
-from swarm.wire.messages.vehicles import Body, Fleet, Followed, VehicleState
+from swarm.wire.messages.vehicles import Body, Fleet, Followed
 from vehicle_agent.bodies import Bodies
 
 MOST_LABELS = 40
 """With more labels nothing can be read."""
-FADES_S = 8.0
-"""An alarm that is over is seen for so long, ever greyer."""
-_FADED: Colour = (96, 100, 106)
+OVER_S = 8.0
+"""An alarm that is over is seen for so long."""
 _MOST_MARKS = 24
 """The serious come first, as in the list of alarms."""
 _UNSEEN = 2
 """While nobody looks pins, routes and sentences are drawn so many times as seldom, for the recording."""
-_AGE_NS = 2 * NS_PER_S
-"""How old a sighting is is said in these steps."""
 SILENT_NS = 5 * NS_PER_S
 """A planner that searches tells its belief once a second: what is older is drawn no more."""
 _FAINT, _FULL = 40, 235
@@ -63,7 +57,7 @@ Place = tuple[float, float]
 
 
 class MoversView:
-    """Vehicles, guests, targets, sightings, bodies, routes and trails.
+    """Vehicles, targets, sightings, bodies, routes and trails.
 
     figures  have heard each message before `hear`
     filter   whose sightings count
@@ -84,23 +78,16 @@ class MoversView:
         self._follow = scenario.monitor.follow
         self._trails = trails_of(scenario, pen.mesh, level)
         self._sightings = Sightings(filter)
-        self._seen: Mapping[str, Sighted] = {}
-        self._seen_ns: dict[str, int] = {}
-        """Target -> when its newest sighting was heard."""
         self._believed: dict[str, tuple[Believed, int]] = {}
         """Target that nobody sees -> where it is believed to be, and when that was heard."""
         self._bodies = Bodies(pen.mesh.grid)
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
-        self._details: dict[str, str] = {}
-        """Target -> a sentence about it."""
-        self._posed: set[str] = set()
-        """Targets with a pin."""
+        self._targets: set[str] = set()
+        """Those of the table of figures: one that an operator removed is not there."""
         self._crew: frozenset[tuple[str, str]] = frozenset()
         """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
         self._fleets_new = False
-        self._told_anew = True
-        """True if sentences about targets are told, whether it is time or not."""
-        self._limit = styles.RateLimit({"pins": 0.2, "details": 1.0, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
+        self._limit = styles.RateLimit({"pins": 0.2, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
 
     def begin(self) -> None:
         """Logs styles; all else is drawn anew."""
@@ -108,8 +95,8 @@ class MoversView:
         self._pen.style("world/trails/targets", 1.6 * self._level.line_px)
         self._pen.style("world/targets/poles", 2.2)
         self._pen.style("world/targets/sighted", 1.2, styles.SIGHTED_COLOUR)
-        self._pen.style("world/alarms/poles", 1.8)
-        balls = rr.Points3D.from_fields(radii=[screen(5.0)], show_labels=True)
+        self._pen.style("world/alarms/poles", 1.8, ALARM_COLOUR)
+        balls = rr.Points3D.from_fields(radii=[screen(5.0)], colors=[ALARM_COLOUR], show_labels=True)
         self._pen.log("world/alarms/marks", balls, static=True)
         for entity in ("world/targets/names", "world/targets/sighted/names"):
             self._pen.label_style(entity)
@@ -123,7 +110,7 @@ class MoversView:
     def draw_anew(self) -> None:
         """All is drawn once more when it is due, as the pen has forgotten it."""
         self._vehicles.draw_anew()
-        self._told_anew = True
+        self._limit.all_due()
 
     def hear(self, message: Message, now_ns: int) -> None:
         """Takes a message in."""
@@ -137,22 +124,20 @@ class MoversView:
             case Body() as body:
                 self._bodies.hear(body, now_ns)
             case Followed() as followed:
-                if not self._vehicles.begun(followed, now_ns):
+                try:
+                    self._vehicles.begun(followed, now_ns)
+                except ValueError:
                     self._counters.count("routes_unreadable")
 
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say, so that all places say the same; draws alarms where they are."""
-        self._details = {line.id: target_details(line) for line in summary.targets}
+        self._targets = {line.id for line in summary.targets}
         observed = self._figures.observed
         self._crew = frozenset(observed.plan.crew_now(observed.plan.targets_now(observed.book)))
-        marks = alarm_marks(
-            summary.alarms, summary.elapsed_s, observed.targets(), observed.vehicles(), self._mesh.grid
-        )
-        tops = self._pen.placed([mark.place_m for mark in marks], _ALARM)
-        colours = np.array([mark.colour for mark in marks], np.uint8).reshape(-1, 3)
-        self._pen.lines("world/alarms/poles", poles(self._mesh, tops), colours)
-        texts = [shown(mark.text, 60) for mark in marks]
-        self._pen.points("world/alarms/marks", positions=tops, colors=colours, labels=texts)
+        marks = alarm_marks(summary.alarms, summary.elapsed_s, observed.targets(), self._mesh.grid)
+        tops = self._pen.placed(list(marks), _ALARM)
+        self._pen.lines("world/alarms/poles", poles(self._mesh, tops))
+        self._pen.points("world/alarms/marks", positions=tops, labels=[shown(text, 60) for text in marks.values()])
 
     def tick(self, now_ns: int, watched: bool) -> None:
         """Draws what is due in one frame."""
@@ -165,9 +150,8 @@ class MoversView:
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
         if self._limit.due("pins", now_ns, slower):
-            # A target that an operator removed is in no table either.
-            places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
-            self._draw_targets(places_m, self._figures.observed.lost(now_ns), now_ns, slower)
+            places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._targets}
+            self._draw_targets(places_m, observed.lost(now_ns), now_ns)
         if self._limit.due("beliefs", now_ns):
             self._draw_beliefs(now_ns)
         self._bodies.tick(now_ns)
@@ -175,32 +159,24 @@ class MoversView:
         self._bodies.complaints.clear()
         self._draw_bodies(self._bodies.reports, now_ns)
 
-    def _draw_targets(self, places_m: Mapping[str, Place], lost: Collection[str], now_ns: int, slower: int) -> None:
+    def _draw_targets(self, places_m: Mapping[str, Place], lost: Collection[str], now_ns: int) -> None:
         """Draws the targets whose trackers told where they are, of which nobody tracks `lost` now, and those that
         vehicles saw."""
         seen = self._sightings.best(now_ns)
-        self._seen_ns = {
-            id: self._seen_ns[id] if self._seen.get(id) == sighted else now_ns for id, sighted in seen.items()
-        }
-        self._seen = seen
-        ages_s = {id: (now_ns - heard_ns) // _AGE_NS * _AGE_NS / NS_PER_S for id, heard_ns in self._seen_ns.items()}
-        pins, labels = target_labels(places_m, lost, ages_s)
+        pins, labels = target_labels(places_m, lost, seen)
         rings_of = [seen[id] for id in labels]
         centres, radii_m = self._discs(rings_of, [each.uncertainty_m for each in rings_of], 0.3)
         self._pen.lines("world/targets/sighted", rings(self._mesh, centres, radii_m))
         self._draw_labels("world/targets/sighted/names", centres, 1.0, list(labels.values()))
         ids, tops = list(places_m), self._pen.placed(list(places_m.values()), _PIN)
         colours = np.array([self.looks.target(id, id in lost) for id in ids], np.uint8).reshape(-1, 3)
-        told = None
-        if self._limit.due("details", now_ns, slower) or self._told_anew or set(ids) != self._posed:
-            told, self._told_anew, self._posed = [self._details.get(id, id) for id in ids], False, set(ids)
-        self._pen.points("world/targets/balls", {"target": told}, positions=tops, colors=colours)
+        self._pen.points("world/targets/balls", {"target": ids}, positions=tops, colors=colours)
         self._pen.lines("world/targets/poles", poles(self._mesh, tops), colours)
         named = [n for n, id in enumerate(ids) if id in pins]
         self._draw_labels("world/targets/names", tops[named], _LABEL - _PIN, [pins[ids[n]] for n in named])
         if self._limit.due("trails", now_ns):
             trails, drawn = self._trails.advance(ids, feet(self._mesh, tops))
-            if len(trails):
+            if drawn.any():
                 self._pen.trail("world/trails/targets", trails, colours[drawn])
 
     def _draw_labels(self, entity: str, places: Floats, above: float, texts: list[str]) -> None:
@@ -214,14 +190,12 @@ class MoversView:
             return
         centres, radii_m = self._discs(bodies, [each.radius_m for each in bodies], 0.2)
         sizes = np.stack([radii_m, radii_m, 0.35 * radii_m], axis=1)
-        if self._pen.news("world/bodies/discs", centres=centres, sizes=sizes):
-            colours = [styles.BODY_COLOUR]
-            discs = rr.Ellipsoids3D(centers=centres, half_sizes=sizes, colors=colours, fill_mode="solid")
-            self._pen.log("world/bodies/discs", discs)
-        tops = centres + sizes * np.array([0, 0, 1], np.float32)
-        white = np.full((len(tops), 3), 225, np.uint8)
-        told = {"body": [body_details(each) for each in bodies]}
-        self._pen.points("world/bodies/names", told, positions=tops, colors=white)
+        if self._pen.news("world/bodies", centres=centres, sizes=sizes):
+            discs = rr.Ellipsoids3D(
+                centers=centres, half_sizes=sizes, colors=[styles.BODY_COLOUR], fill_mode="solid",
+                labels=[f"{each.id} of {each.group}" for each in bodies], show_labels=len(bodies) <= MOST_LABELS,
+            )  # fmt: skip
+            self._pen.log("world/bodies", discs)
 
     def _draw_beliefs(self, now_ns: int) -> None:
         """Draws where targets are believed to be; one without cells is no longer searched."""
@@ -272,74 +246,32 @@ def searched_points(mesh: TerrainMesh, beliefs: Sequence[Believed]) -> tuple[Flo
     return mesh.place_cells(np.concatenate(cells), 0.1 * mesh.scale_m), colours, np.concatenate(radii_m), sentences
 
 
-def body_details(body: Body) -> str:
-    """As `r1 of mowers: radius 2.0 m, 1.5 m/s`."""
-    return f"{body.id} of {body.group}: radius {body.radius_m:.1f} m, {body.speed_m_per_s:.1f} m/s"
-
-
-def target_details(line: TargetLine) -> str:
-    """What the table says of it, as `t3: following 16, nearest 412 m, re-plans 30, certified gap 1.05%`."""
-    title, *others = (fact for fact in TARGET_FACTS if fact.always)
-    return f"{title.shown(line)}: {', '.join(f'{fact.label} {fact.shown(line)}' for fact in others)}"
-
-
 def target_labels(
-    posed: Collection[str], lost: Collection[str], seen_age_s: Mapping[str, float]
+    posed: Iterable[str], lost: Collection[str], seen: Iterable[str]
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Labels at pins and at sightings, by target. No target has two, and none that is drawn has none.
 
-    posed       targets that have a place because a tracker told it
-    lost        those of them that nobody tracks now
-    seen_age_s  targets that vehicles saw -> seconds since then
+    posed  targets that have a place because a tracker told it
+    lost   those of them that nobody tracks now
+    seen   targets that vehicles saw
     """
-    pins = {id: id for id in posed if id not in lost}
-    sightings = {id: f"{id} seen {age_s:.0f} s ago" for id, age_s in seen_age_s.items() if id not in pins}
-    for id in posed:
-        if id in lost and id not in sightings:
-            pins[id] = f"{id} lost"
+    tracked = {id for id in posed if id not in lost}
+    sightings = {id: f"{id} seen" for id in seen if id not in tracked}
+    pins = {id: f"{id} lost" if id in lost else id for id in posed if id not in sightings}
     return pins, sightings
 
 
-class AlarmMark(NamedTuple):
-    """A place, and what happened there."""
-
-    place_m: Place
-    text: str
-    colour: Colour
-
-
 def alarm_marks(
-    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], vehicles: VehicleColumns, grid: GridSpec
-) -> list[AlarmMark]:
-    """The alarms that have a place, and vehicles that are stranded; one at a place.
-
-    An alarm is where it says; or where its target is; or, if it is about an agent, in the middle of its vehicles.
-    """
-    marks: dict[Place, AlarmMark] = {}
-    for place_m, text, age_s in (*_placed(alarms, now_s, places_m, vehicles, grid), *_stranded(vehicles)):
-        if age_s <= FADES_S and len(marks) < _MOST_MARKS:
-            colour = mixed(ALARM_COLOUR, _FADED, max(age_s, 0.0) / FADES_S)
-            marks.setdefault(place_m, AlarmMark(place_m, text, colour))
-    return list(marks.values())
-
-
-def _placed(
-    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], vehicles: VehicleColumns, grid: GridSpec
-) -> Iterator[tuple[Place, str, float]]:
-    """Place, text, and for how many seconds it has been over."""
-    agents = np.array([agent_of(id) for id in vehicles.ids], np.str_)
+    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], grid: GridSpec
+) -> dict[Place, str]:
+    """The alarms that are at a place, or about a target that has one: place -> words, one at a place. One that is
+    over is seen a little longer."""
+    marks: dict[Place, str] = {}
     for alarm in alarms:
-        place_m = None
+        place_m = places_m.get(alarm.target or "")
         if (cell := alarm.place(grid)) is not None:
             place_m = (cell[1] + 0.5) * grid.resolution_m, (cell[0] + 0.5) * grid.resolution_m
-        elif alarm.target is not None:
-            place_m = places_m.get(alarm.target)
-        elif (its := agents == alarm.about.removeprefix("agent-")).any() and alarm.about.startswith("agent-"):
-            place_m = float(np.median(vehicles.east_m[its])), float(np.median(vehicles.south_m[its]))
-        if place_m is not None:
-            yield place_m, f"{alarm.label}: {alarm.about}", 0.0 if alarm.over_s is None else now_s - alarm.over_s
-
-
-def _stranded(vehicles: VehicleColumns) -> Iterator[tuple[Place, str, float]]:
-    for n in np.flatnonzero(vehicles.states == VehicleState.STRANDED)[:_MOST_MARKS].tolist():
-        yield (float(vehicles.east_m[n]), float(vehicles.south_m[n])), f"stranded: {vehicles.ids[n]}", 0.0
+        seen = alarm.over_s is None or now_s - alarm.over_s <= OVER_S
+        if place_m is not None and seen and len(marks) < _MOST_MARKS:
+            marks.setdefault(place_m, f"{alarm.label}: {alarm.about}")
+    return marks

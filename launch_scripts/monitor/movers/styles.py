@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes
-from launch_scripts.monitor.sinks import LABEL_COLOUR, Colour
+from launch_scripts.monitor.sinks import Colour
 from launch_scripts.observe import palette
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.vehicles import VehicleState
 
-Shape = Literal["ball", "box", "pin", "ring", "disc", "line", "fill", "hatch"]
-
+Shape = Literal["ball", "ring", "line", "fill", "hatch"]
 
 HUES: tuple[Colour, ...] = tuple(
     map(
@@ -118,7 +117,7 @@ class Looks:
 
     def legend(self) -> list[Look]:
         """What is drawn of all that moves."""
-        first = next(iter(self._hue.values()), NOBODY)
+        first, target = next(iter(self._hue.values()), NOBODY), next(iter(self.target_ids), "")
         if self.by_target:
             who = [Look("ball", first, "vehicle, hue by target")]
         else:
@@ -131,12 +130,11 @@ class Looks:
         return [
             *who,
             *states,
-            Look("box", LABEL_COLOUR, "around guests"),
-            Look("pin", self.target(next(iter(self.target_ids), "")), "target"),
+            Look("ball", self.target(target), "target on a pole"),
             Look("ring", SIGHTED_COLOUR, "hidden target seen"),
-            Look("disc", BODY_COLOUR, "body to keep off"),
-            Look("line", self.route(next(iter(self.target_ids), "")), "route, trail"),
-            Look("pin", ALARM_COLOUR, "alarm"),
+            Look("ball", BODY_COLOUR, "body to keep off"),
+            Look("line", self.route(target), "route, trail"),
+            Look("ball", ALARM_COLOUR, "alarm on a pole"),
         ]
 
 
@@ -189,7 +187,11 @@ class RateLimit:
 
     def __init__(self, every_s: Mapping[str, float]) -> None:
         self._every_ns = {name: int(seconds * NS_PER_S) for name, seconds in every_s.items()}
-        self._next_ns = dict.fromkeys(every_s, 0)
+        self.all_due()
+
+    def all_due(self) -> None:
+        """Lets each thing be due, whenever it was done last."""
+        self._next_ns = dict.fromkeys(self._every_ns, 0)
 
     def due(self, name: str, now_ns: int, slower: int = 1) -> bool:
         """Whether it is time; if so, the next time is counted from now, and comes so many times as late."""

@@ -1,4 +1,4 @@
-"""Draws vehicles and guests, who they are, their trails and routes, as they are due.
+"""Draws vehicles, who they are, their trails and routes, as they are due.
 
 Few entities with many instances each; of each only what has changed: see docs/decisions/0053-what-moves.md.
 """
@@ -6,21 +6,17 @@ Few entities with many instances each; of each only what has changed: see docs/d
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
-import rerun as rr
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.monitor.movers import map_lines
-from launch_scripts.monitor.movers.map_lines import RouteNow, Trails
+from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
+from launch_scripts.monitor.movers.map_lines import Cells, RouteLines, RouteNow, Trails, cells_at
 from launch_scripts.monitor.movers.styles import Level, Looks, RateLimit, dimmed
-from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, screen
+from launch_scripts.monitor.sinks import Pen
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.latest_state import LatestState, VehicleColumns
 from swarm.clock import NS_PER_S
-from swarm.config.agents import plan_agents
 from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
 from swarm.wire.messages.vehicles import Followed, VehicleState
@@ -37,24 +33,6 @@ _DOES = {
     VehicleState.OUTDATED: "goes by an old pose",
     VehicleState.SEARCHING: "looks for its target",
 }
-_Rows = NDArray[np.intp]
-
-
-class _Roll(NamedTuple):
-    """What is looked up anew only when vehicles come or go.
-
-    who     vehicle -> group, and class where that is not "ground"
-    rows    of `Looks.vehicles`, by group
-    own     places in `ids` of the scenario's vehicles; `guests` those of all others
-    aloft   of each class that flies the places of its vehicles in `ids`, and `TerrainMesh.aloft_m`
-    """
-
-    ids: list[str]
-    who: Mapping[str, str]
-    rows: _Rows
-    own: _Rows
-    guests: _Rows
-    aloft: list[tuple[_Rows, Floats]]
 
 
 def trails_of(scenario: Scenario, mesh: TerrainMesh, level: Level) -> Trails:
@@ -66,17 +44,21 @@ def trails_of(scenario: Scenario, mesh: TerrainMesh, level: Level) -> Trails:
 
 
 class VehiclesView:
-    """Vehicles of the scenario as balls, guests as balls in boxes."""
+    """Vehicles as balls with a sentence each, their trails and routes."""
 
     def __init__(self, pen: Pen, scenario: Scenario, level: Level, looks: Looks) -> None:
         self._pen, self._mesh, self._level, self._looks = pen, pen.mesh, level, looks
         self._target_ids = scenario.target_ids
-        self._own_ids = frozenset(id for plan in plan_agents(scenario) for id in plan.vehicle_ids)
-        self._roll = self._enrolled([], {}, {})
-        self._anew = True
-        """True if all is to be drawn, whatever is due."""
+        self._ids: list[str] = []
+        """Those that were drawn last, and what is looked up anew only when vehicles come or go."""
+        self._who: dict[str, str] = {}
+        """Vehicle -> its group, and its class where that is not "ground"."""
+        self._rows = np.empty(0, np.intp)
+        """Of `Looks.vehicles`, by group."""
+        self._aloft: list[tuple[NDArray[np.intp], Floats]] = []
+        """Of each class that flies the places of its vehicles in `_ids`, and `TerrainMesh.aloft_m`."""
         self._routes: dict[str, RouteNow] = {}
-        self._route_lines = map_lines.RouteLines(self._mesh, level.route_stride)
+        self._route_lines = RouteLines(self._mesh, level.route_stride)
         self._next_target = 0
         self._trails = trails_of(scenario, self._mesh, level)
         self._frame = 0
@@ -92,20 +74,13 @@ class VehiclesView:
 
     def draw_anew(self) -> None:
         """All is drawn once more, as the pen has forgotten it."""
-        self._anew = True
+        self._limit.all_due()
 
-    def begun(self, followed: Followed, now_ns: int) -> bool:
-        """A vehicle begins a route. False if it leaves the grid: its sender's bug."""
-        cells = map_lines.cells_along(self._mesh.grid, followed.start, followed.directions)
-        if cells is None:
-            return False
+    def begun(self, followed: Followed, now_ns: int) -> None:
+        """A vehicle begins a route. Raises ValueError if it leaves the grid: its sender's bug."""
         if len(self._routes) >= _ROUTES_KEPT:
             self._routes.clear()
-        gap = followed.cost_s / followed.lower_bound_s if followed.lower_bound_s > 0 else None
-        legs = np.frombuffer(followed.legs, "<u4").astype(np.int64)
-        turns = np.concatenate([[0], np.cumsum(legs)]) if len(legs) else None
-        self._routes[followed.vehicle] = RouteNow(followed.target, cells, gap, now_ns, turns)
-        return True
+        self._routes[followed.vehicle] = RouteNow.of(followed, self._mesh.grid, now_ns)
 
     def draw(self, vehicles: VehicleColumns, observed: LatestState, now_ns: int, slower: int) -> None:
         """Draws what is due; once for each frame in which something is new.
@@ -114,76 +89,53 @@ class VehiclesView:
         slower    by how many times as seldom as for somebody who looks routes and sentences are drawn
         """
         self._frame += 1
+        if vehicles.ids != self._ids:
+            self._enrol(vehicles.ids, observed.groups(), observed.classes())
         trails_due = self._limit.due("trails", now_ns)
         if self._frame % self._level.frames and not trails_due:
             return
-        if vehicles.ids != self._roll.ids:
-            self._roll = self._enrolled(vehicles.ids, observed.groups(), observed.classes())
-            self._anew = True
-        roll, looks = self._roll, self._looks
+        cells = cells_at(self._mesh.grid, vehicles.east_m, vehicles.south_m)
         positions = self._mesh.place(vehicles.east_m, vehicles.south_m, 0.15 * self._mesh.scale_m)
-        for flying, over_m in roll.aloft:
-            positions[flying, 2] += over_m.reshape(-1)[[self._cell(vehicles, n) for n in flying.tolist()]]
-        rows = roll.rows
-        if looks.by_target:
-            rows = np.array([*looks.rows(vehicles.target_ids), -1], np.intp)[vehicles.targets]
-        colours = looks.vehicles(rows, vehicles.states)
-        self._draw_balls(vehicles, positions, colours, now_ns, slower)
-        if trails_due:
-            strips, moved = self._trails.advance(vehicles.ids, positions)
-            if len(strips):
-                self._pen.trail("world/trails/vehicles", strips, dimmed(colours[moved]))
-        if self._limit.due("routes", now_ns, slower) and self._target_ids:
-            self._draw_routes(vehicles, self._target_ids[self._next_target % len(self._target_ids)])
-            self._next_target += 1
-
-    def _enrolled(self, ids: list[str], groups: Mapping[str, str], classes: Mapping[str, str]) -> _Roll:
-        who = {id: group if classes[id] == GROUND else f"{group}, {classes[id]}" for id, group in groups.items()}
-        own = np.array([id in self._own_ids for id in ids], np.bool_)
-        rows = np.array(self._looks.rows([groups.get(id) for id in ids]), np.intp)
-        aloft = [
-            (np.flatnonzero([classes.get(id) == name for id in ids]), over_m)
-            for name, over_m in self._mesh.aloft_m.items()
-        ]
-        return _Roll(ids, who, rows, np.flatnonzero(own), np.flatnonzero(~own), aloft)
-
-    def _draw_balls(
-        self, vehicles: VehicleColumns, positions: Floats, colours: Bytes, now_ns: int, slower: int
-    ) -> None:
-        roll, details = self._roll, None
-        if self._limit.due("details", now_ns, slower) or self._anew:
-            details = vehicle_details(vehicles, roll.who, self._routes, now_ns)
-        for entity, members in (("world/vehicles", roll.own), ("world/guests", roll.guests)):
-            if len(members) or self._anew:
-                told = None if details is None else [details[n] for n in members.tolist()]
-                its = {"positions": positions[members], "colors": colours[members]}
-                self._pen.points(entity, {"vehicle": told}, **its)
-        guests = positions[roll.guests]
-        if self._pen.news("world/guests/frames", centres=guests):
-            sides, radii = np.full(guests.shape, 0.5 * self._mesh.scale_m, np.float32), [screen(1.0)]
-            boxes = rr.Boxes3D(centers=guests, half_sizes=sides, colors=[LABEL_COLOUR], radii=radii)
-            self._pen.log("world/guests/frames", boxes)
+        for flying, over_m in self._aloft:
+            positions[flying, 2] += over_m.reshape(-1)[cells[flying]]
+        rows = self._rows
+        if self._looks.by_target:
+            rows = np.array([*self._looks.rows(vehicles.target_ids), -1], np.intp)[vehicles.targets]
+        colours, told = self._looks.vehicles(rows, vehicles.states), None
+        if self._limit.due("details", now_ns, slower):
+            told = vehicle_details(vehicles, self._who, self._routes, now_ns)
+        self._pen.points("world/vehicles", {"vehicle": told}, positions=positions, colors=colours)
         if self._level.names and len(positions) <= self._level.most:
             above = np.array([0, 0, 0.8 * self._mesh.scale_m], np.float32)
             self._pen.points("world/vehicles/names", positions=positions + above, labels=vehicles.ids)
-        self._anew = False
+        if trails_due:
+            strips, moved = self._trails.advance(vehicles.ids, positions)
+            if moved.any():
+                self._pen.trail("world/trails/vehicles", strips, dimmed(colours[moved]))
+        if self._limit.due("routes", now_ns, slower) and self._target_ids:
+            self._draw_routes(vehicles, cells, self._target_ids[self._next_target % len(self._target_ids)])
+            self._next_target += 1
 
-    def _draw_routes(self, vehicles: VehicleColumns, target: str) -> None:
+    def _enrol(self, ids: list[str], groups: Mapping[str, str], classes: Mapping[str, str]) -> None:
+        self._ids = ids
+        self._who = {
+            id: group if classes[id] == GROUND else f"{group}, {classes[id]}" for id, group in groups.items()
+        }
+        self._rows = np.array(self._looks.rows([groups.get(id) for id in ids]), np.intp)
+        self._aloft = [
+            (np.flatnonzero([classes.get(id) == name for id in ids]), over_m)
+            for name, over_m in self._mesh.aloft_m.items()
+        ]
+        self._limit.all_due()
+
+    def _draw_routes(self, vehicles: VehicleColumns, cells: Cells, target: str) -> None:
         """Draws what is left of the routes to a target."""
-        ahead, pulled = [], []
-        for n in vehicles.chasing(target).tolist():
-            route = self._routes.get(vehicles.ids[n])
-            if route is None or route.target != target:
-                continue
-            if route.turns is None:
-                ahead.append(route.ahead_of(self._cell(vehicles, n)))
-            else:
-                place_m = float(vehicles.east_m[n]), float(vehicles.south_m[n])
-                pulled.append(route.corners_ahead(self._mesh.grid, *place_m))
-        self._pen.lines(f"world/routes/{target}", self._route_lines.lines(ahead, pulled))
-
-    def _cell(self, vehicles: VehicleColumns, n: int) -> int:
-        return map_lines.cell_at(self._mesh.grid, float(vehicles.east_m[n]), float(vehicles.south_m[n]))
+        chasing = vehicles.chasing(target).tolist()
+        begun = ((n, self._routes.get(vehicles.ids[n])) for n in chasing)
+        ahead = [
+            route.ahead_of(int(cells[n])) for n, route in begun if route is not None and route.target == target
+        ]
+        self._pen.lines(f"world/routes/{target}", self._route_lines.lines(ahead))
 
 
 def vehicle_details(

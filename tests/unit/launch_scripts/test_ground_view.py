@@ -43,11 +43,12 @@ from launch_scripts.monitor.live_layout import (
     HEIGHT_PX,
     KNOWN,
     LEARNED,
-    NEAREST,
     PHOTO,
+    TO_TARGET,
     WIDTH_PX,
-    still_legend,
-    to_target_legend,
+    Scale,
+    legend_picture,
+    shown_layers,
 )
 from launch_scripts.monitor.movers.styles import Looks
 from launch_scripts.monitor.sinks import Pen
@@ -60,7 +61,6 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
 from swarm.wire.messages.map_data import MarkKind, MarkSet
-from swarm.wire.messages.planning import PlannerStatus
 
 ALL = Window(0, 0, 40, 50)
 
@@ -196,12 +196,12 @@ def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: i
     scene = Scene(Pen([rec], TerrainMesh(terrain)))
     GroundView(scene, terrain, CostMap(terrain), MapReplica(terrain.grid), zoned(""))._draw_margin()
     lines = logged["world/margin"].strips.as_arrow_array().to_pylist()
-    start, end = lines[0]
+    _, start, end, _ = lines[0]
     number, unit = text.split()
     texts = logged["world/margin/texts"].labels.as_arrow_array().to_pylist()
     assert {text, "heights to scale"} <= set(texts)
     assert end[0] - start[0] == float(number) * (1000 if unit == "km" else 1)
-    foot, tip = lines[4]
+    foot, tip = lines[1]
     assert (tip[0], tip[2]) == (foot[0], foot[2])
     assert tip[1] > foot[1]
 
@@ -218,41 +218,17 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
 @pytest.mark.parametrize(
     "groups", [["all"], ["reconnaissance", "haulage-trucks", "fire-fighters", "police-cars", "e"]]
 )
-def test_every_layer_has_a_legend(groups: list[str]) -> None:
+def test_no_legend_is_cut_off(groups: list[str]) -> None:
     movers = Looks(groups, ["t0"]).legend()
-    still = (PHOTO, COST, KNOWN, LEARNED, NEAREST)
-    pictures = [still_legend(layer, colours_of(flat()), ["t0", "t1"] * 9, movers) for layer in still]
-    for picture in (*pictures, to_target_legend("t0", 5400, movers)):
-        assert picture is not None
+    nearest = shown_layers(parse_scenario('[[targets]]\nname = "t"\ncount = 18\n'), knows_truth=False)[-1]
+    scale = Scale(("#000000", "#ffffff"), "seconds to t0", [f"{1080 * n}" for n in range(6)])
+    scaled = {COST: scale, LEARNED: scale, TO_TARGET: scale}
+    for layer in (PHOTO, COST, KNOWN, LEARNED, TO_TARGET, nearest):
+        picture = legend_picture((*layer.looks, *movers), scaled.get(layer))
         image = Image.open(io.BytesIO(picture)).convert("RGB")
         assert image.size == (WIDTH_PX, HEIGHT_PX)
         right_edge = np.asarray(image)[:, -4:]
-        assert len(np.unique(right_edge.reshape(-1, 3), axis=0)) == 1, "nothing is cut off"
-
-
-def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
-    terrain = flat()
-    mesh, cost_map, replica = TerrainMesh(terrain), CostMap(terrain), MapReplica(terrain.grid)
-    rec = rr.RecordingStream("names", recording_id="r")
-    rec.set_sinks(rr.FileSink(str(tmp_path / "names.rrd"), write_footer=False))
-    drawn: dict[str, Any] = {}
-    view = GroundView(Scene(Pen([rec], mesh)), terrain, cost_map, replica, zoned(""))
-    rec.log = lambda path, what, static=False: drawn.__setitem__(path, what)  # type: ignore[method-assign]
-    for count, named in ((3, {"t0", "t1", "t2"}), (6, {"t5"})):
-        for n in range(count):
-            window = [0, 0, 30, 30] if n == 5 else [n, n, n + 3, n + 3]
-            view.hear_status(
-                PlannerStatus(
-                    target=f"t{n}", incarnation=1, stamp_ns=0, strategy="auto", target_cell=0, map_version=0,
-                    tree_age_ms=0.0, window=window, growths=0, window_growths=0, growth_ms=1.0, routes_served=0,
-                    following=0, gap_mean=None, gap_p95=None, gap_max=None,
-                )
-            )  # fmt: skip
-        view.tick(2 * count * NS_PER_S, watched=True)
-        labels = drawn["world/windows/names"].labels.as_arrow_array().to_pylist()
-        assert set(labels) == {f"window of {target}" for target in named}
-        assert len(drawn["world/windows"].strips.as_arrow_array()) == count
-    rec.disconnect()
+        assert len(np.unique(right_edge.reshape(-1, 3), axis=0)) == 1, layer.name
 
 
 def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from launch_scripts.monitor.ground.ground_colours import LETHAL_MARK, GroundColours
-from launch_scripts.monitor.ground.ground_view import window_outlines
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.live_layout import level_of, summary_markdown
 from launch_scripts.observe.recorder import Recorder
@@ -108,16 +107,6 @@ def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_othe
     texture = photo(terrain, window, pace)
     mark = texture[64 - window.row0, 10 - window.col0].astype(int)
     assert np.abs(mark - np.array(LETHAL_MARK)).max() < 40
-
-
-def test_the_outline_of_a_window_is_closed_and_runs_along_its_border() -> None:
-    mesh = TerrainMesh(hill(50, 60))
-    outline, _ = window_outlines(mesh, [Window(10, 20, 31, 41), Window(0, 0, 5, 5)])
-    assert outline[0].tolist() == outline[-1].tolist()
-    assert (outline[:, 0].min(), outline[:, 0].max()) == (205.0, 405.0)
-    assert (outline[:, 1].max(), outline[:, 1].min()) == (-105.0, -305.0)
-    steps = np.abs(np.diff(outline[:, :2], axis=0))
-    assert (steps.min(axis=1) == 0).all(), "no side is slanted"
 
 
 def test_the_summary_says_what_is_not_known_yet_with_a_dash() -> None:

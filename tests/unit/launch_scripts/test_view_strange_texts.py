@@ -35,5 +35,5 @@ def test_names_that_planners_make_up_do_not_fill_the_view() -> None:
     )  # fmt: skip
     for n in range(300):
         rig.service._ground.hear_status(msgspec.structs.replace(told, target=f"x{n}"))
-    assert len(rig.service._ground._windows) == 258
+    assert len(rig.service._ground.samples.targets) == 258
     rig.sinks.close()
