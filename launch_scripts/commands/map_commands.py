@@ -154,8 +154,8 @@ def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
 
 
 def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
-    pace, kind, stamps_ns = stored_marks.to_cells(grid, sets, time.time_ns())
-    return mark_layer(grid, kind, pace, stamps_ns)
+    pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+    return mark_layer(grid, kind, pace)
 
 
 @command(app, name="import")

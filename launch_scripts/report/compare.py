@@ -36,20 +36,31 @@ Row = tuple[str, list[Any]]
 
 def settings_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
     """Keys of the scenarios whose values are not the same in all runs that have a scenario."""
-    known = [None if run.settings is None else _flat(run.settings, "") for run in runs]
-    told = [each for each in known if each is not None]
+    found = _that_differ([None if run.settings is None else _flat(run.settings, "") for run in runs])
+    return [row for row in found if not row[0].startswith(_WHERE_ONLY)]
+
+
+def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
+    """Versions and machines that are not the same."""
+    made = [_table(run.report.get("made")) for run in runs]
+    found = _that_differ([_flat({name: each.get(name) for name in ("versions", "machine")}, "") for each in made])
+    return [row for row in found if "." in row[0]]
+
+
+def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
+    """Keys whose values are not the same in all runs of which they are known."""
+    known = [each for each in runs if each is not None]
     return [
-        (key, [None if each is None else each.get(key) for each in known])
-        for key in dict.fromkeys(key for each in told for key in each)
-        if not key.startswith(_WHERE_ONLY) and _differ(each.get(key) for each in told)
+        (key, [None if each is None else each.get(key) for each in runs])
+        for key in dict.fromkeys(key for each in known for key in each)
+        if _differ(each.get(key) for each in known)
     ]
 
 
 def remarks(runs: Sequence[LeftRun]) -> list[str]:
     """What to know before figures are compared, in sentences."""
     terrains = [_table(run.report.get("terrain")).get("digest") for run in runs]
-    seeds, seconds = [run.report.get("seed") for run in runs], [run.report.get("seconds") for run in runs]
-    scales = [run.report.get("time_scale") for run in runs]
+    seeds, seconds, scales = ([run.report.get(name) for run in runs] for name in ("seed", "seconds", "time_scale"))
     simulated = [bool(run.report.get("simulated")) for run in runs]
     lengths = [value for value in seconds if isinstance(value, int | float)]
     said = (
@@ -67,14 +78,6 @@ def remarks(runs: Sequence[LeftRun]) -> list[str]:
 
 def _each(values: Iterable[Any]) -> str:
     return ", ".join(str(value) for value in values)
-
-
-def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
-    """Versions and machines that are not the same."""
-    made = [run.report.get("made") for run in runs]
-    flat = [_flat(each, "") if isinstance(each, Mapping) else {} for each in made]
-    keys = dict.fromkeys(key for each in flat for key in each if key.startswith(("versions.", "machine.")))
-    return [(key, [each.get(key) for each in flat]) for key in keys if _differ(each.get(key) for each in flat)]
 
 
 def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:

@@ -217,56 +217,52 @@ def _gpx_points(layer: Layer) -> Layer:
     """The points of a layer as GDAL's GPX driver wants them: of lines their track points, of points waypoints."""
     names = [str(each.values.get("name") or next(iter(each.values.values()), "")) for each in layer.features]
     if layer.shape == "Point":
-        at = [each.values.get("at", each.values.get("begins")) for each in layer.features]
         features = [
-            Feature(each.parts, {"name": name, "time": time})
-            for each, name, time in zip(layer.features, names, at, strict=True)
+            Feature(each.parts, {"name": name, "time": each.values.get("at", each.values.get("begins"))})
+            for each, name in zip(layer.features, names, strict=True)
         ]
         return Layer("waypoints", "Point", {"name": "text", "time": "time"}, features)
     fields: dict[str, FieldKind] = {
         "track_fid": "int", "track_seg_id": "int", "track_name": "text", "ele": "real", "time": "time",
     }  # fmt: skip
-    points: list[Feature] = []
-    for number, each in enumerate(layer.features):
-        (part,) = each.parts
-        for n, place in enumerate(part):
-            values: dict[str, Value] = {"track_fid": number, "track_seg_id": 0, "track_name": names[number]}
-            values["ele"] = round(float(place[2]), 2) if len(place) == 3 else None
-            values["time"] = None if each.time_ns is None else moment(each.time_ns[n])
-            points.append(Feature([place[None, :2]], values))
-    return Layer("track_points", "Point", fields, points)
+    return Layer("track_points", "Point", fields, [
+        Feature([place[:, :2]], {
+            "track_fid": number, "track_seg_id": 0, "track_name": names[number], "time": time,
+            "ele": round(float(place[0, 2]), 2) if place.shape[1] == 3 else None,
+        })
+        for number, _, place, time in _points_of(layer)
+    ])  # fmt: skip
+
+
+def _points_of(layer: Layer) -> Iterator[tuple[int, Feature, Points, np.datetime64 | None]]:
+    """The points of lines: number of the line, the line, the place, float64 (1, 2) or (1, 3), and its time."""
+    for number, line in enumerate(layer.features):
+        for n, place in enumerate(line.parts[0]):
+            yield number, line, place[None], None if line.time_ns is None else moment(line.time_ns[n])
 
 
 def _places_of(layer: Layer) -> Layer:
     """The points of a layer of lines, each with its time: what a GIS plays back."""
     own = [name for name in layer.fields if name not in TIMED]
     fields: dict[str, FieldKind] = {**{name: layer.fields[name] for name in own}, "at": "time"}
-    points = Layer(layer.name.replace("_tracks", "_places"), "Point", fields)
-    for feature in layer.features:
-        if feature.time_ns is not None:
-            values = {name: feature.values[name] for name in own}
-            points.features.extend(
-                Feature([place[None]], {**values, "at": moment(time_ns)})
-                for place, time_ns in zip(feature.parts[0], feature.time_ns, strict=True)
-            )
-    return points
+    return Layer(layer.name.replace("_tracks", "_places"), "Point", fields, [
+        Feature([place], {**{name: line.values[name] for name in own}, "at": time})
+        for _, line, place, time in _points_of(layer)
+    ])  # fmt: skip
+
+
+_TYPES: Mapping[FieldKind, Any] = {
+    "text": object, "json": object, "int": np.int64, "flag": np.int32, "real": np.float64, "time": "datetime64[ms]"
+}  # fmt: skip
 
 
 def _column(layer: Layer, name: str, kind: FieldKind, default: Value) -> NDArray[Any]:
     values: list[Any] = [feature.values.get(name, default) for feature in layer.features]
     if name == "times":
         values = [None if each.time_ns is None else list(map(iso_time, each.time_ns)) for each in layer.features]
-    match kind:
-        case "text":
-            return np.array(values, object)
-        case "json":  # GDAL writes a text which is JSON as JSON into GeoJSON
-            return np.array([None if value is None else json.dumps(value) for value in values], object)
-        case "int" | "flag":
-            return np.array(values, np.int64 if kind == "int" else np.int32)
-        case "real":
-            return np.array([np.nan if value is None else value for value in values], np.float64)
-        case "time":
-            return np.array(values, "datetime64[ms]")
+    if kind == "json":  # GDAL writes a text which is JSON as JSON into GeoJSON
+        values = [None if value is None else json.dumps(value) for value in values]
+    return np.array(values, _TYPES[kind])
 
 
 # --- as a table ---------------------------------------------------------------------------------------------------

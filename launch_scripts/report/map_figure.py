@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
@@ -28,11 +27,9 @@ from launch_scripts.report.run_layers import groups_of
 from launch_scripts.report.run_plots import halo
 from shared_map.arrays import Floats
 from shared_map.learning.factors import keys_of
-from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
-from shared_map.terrain.terrain import Terrain, build_truth
+from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import zone_mask
-from swarm.config.ground import HiddenConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -90,26 +87,11 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
 
 
 def draw_border(axes: Axes, ground: GroundPicture, tracks: RunTracks) -> None:
-    """Draws the ground of a map, degrees at its corners where the terrain has a place, and a legend below it."""
-    grid = tracks.grid
-    width_km, height_km = size_km(grid)
+    """Draws the ground of a map, and a legend below it."""
+    width_km, height_km = size_km(tracks.grid)
     axes.imshow(ground.pixels, extent=(0, width_km, height_km, 0), interpolation="antialiased", zorder=1)
     axes.set_anchor("NW")
     axes.set(xticks=[], yticks=[])
-    if grid.crs != "local":
-        east_m, south_m = 1000 * np.array([0, width_km]), 1000 * np.array([0, height_km])
-        lat, lon = MapFrame(grid).to_degrees(grid.west_m + east_m, grid.north_m - south_m)
-        axes.set_xticks([0, width_km], [f"{abs(each):.4f}° {'EW'[each < 0]}" for each in lon.tolist()])
-        axes.set_yticks([0, height_km], [f"{abs(each):.4f}° {'NS'[each < 0]}" for each in lat.tolist()])
-        # Towards the middle, so that those of one corner do not meet.
-        west, east = axes.get_xticklabels()
-        north, south = axes.get_yticklabels()
-        west.set_horizontalalignment("left")
-        east.set_horizontalalignment("right")
-        north.set_verticalalignment("top")
-        south.set_verticalalignment("bottom")
-        axes.tick_params(length=2.5, pad=2, labelsize=7.5)
-        axes.tick_params(axis="y", labelrotation=90)
     of_ground = {
         "hidden": Patch(facecolor="none", edgecolor=palette.BLACK, linestyle=":", label="hidden from the map"),
         "lethal": Patch(facecolor="#8b9097", edgecolor="#d7dbe0", hatch="xxxxx", label="lethal ground"),
@@ -259,21 +241,14 @@ def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:
 
 
 def hidden_cells(scenario: Scenario, terrain: Terrain, truth: NDArray[np.float32] | None) -> Bools:
-    """Where the truth differs from what the map knew at the beginning, but for what a whole class of ground is
-    slower or quicker by: that would outline every meadow."""
+    """Where the truth differs from what the map knew at the beginning; only where it is lethal if whole classes of
+    ground are slower or quicker in truth, as every meadow would be outlined."""
     if truth is None:
         return np.zeros(terrain.pace_s_per_m.shape, np.bool_)
-    known = terrain.ground_s_per_m
+    hidden: Bools = (truth != terrain.ground_s_per_m) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
     if scenario.terrain.hidden.class_factor:
-        only_classes = HiddenConfig(class_factor=scenario.terrain.hidden.class_factor)
-        known = build_truth(
-            msgspec.structs.replace(
-                scenario, terrain=msgspec.structs.replace(scenario.terrain, hidden=only_classes)
-            ),
-            terrain,
-        )
-    differs: Bools = (truth != known) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
-    return differs
+        hidden &= np.isinf(truth)
+    return hidden
 
 
 def _photo(seen: Level) -> Pixels:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,37 +43,32 @@ def cards(report: Mapping[str, Any]) -> list[Card]:
     gap = report["certified_gap"]
     unproven = gap.get("unproven") or 0
     not_counted = f" {count(unproven)} had none and are not counted." if unproven else ""
-    times = {
-        "growth_ms": ("growth of a tree, p50", "All cheapest paths to one target"),
-        "route_query_ms": ("route query, p50", "From a vehicle's question to the answer"),
-        "mark_to_tree_ms": ("mark to tree, p50", "From what a sensor sees to a tree's cost"),
-    }
+    proven = (
+        "Routes that vehicles began cost at most so much more than the cheapest that exist: proven, by a lower "
+        f"bound with each.{not_counted}"
+    )
+    best = f"Of 100 routes, 95 are proven to be at least as good as this. The worst: {percent(gap['max'])}."
+    times = (
+        ("growth_ms", "growth of a tree, p50", "All cheapest paths to one target"),
+        ("route_query_ms", "route query, p50", "From a vehicle's question to the answer"),
+        ("mark_to_tree_ms", "mark to tree, p50", "From what a sensor sees to a tree's cost"),
+    )
+
+    def of_facts(*names: str, tone: Callable[[Any], str] = lambda value: "") -> list[Card]:
+        told = [(fact(name), report[name]) for name in names]
+        return [Card(each.label, each.text(value), each.meaning, tone(value)) for each, value in told]
+
     return [
-        *(_of_fact(report, name) for name in ("captures", "marks", "reroute_requests", "routes_served")),
-        Card(
-            "certified gap, mean",
-            percent(gap["mean"]),
-            "Routes that vehicles began cost at most so much more than the cheapest that exist: proven, by a lower "
-            f"bound with each.{not_counted}",
-        ),
-        Card(
-            "certified gap, p95",
-            percent(gap["p95"]),
-            f"Of 100 routes, 95 are proven to be at least as good as this. The worst: {percent(gap['max'])}.",
-        ),
+        *of_facts("captures", "marks", "reroute_requests", "routes_served"),
+        Card("certified gap, mean", percent(gap["mean"]), proven),
+        Card("certified gap, p95", percent(gap["p95"]), best),
         *(
             Card(label, duration(report[name]["p50"]), f"{meaning}; p99 {duration(report[name]['p99'])}.")
-            for name, (label, meaning) in times.items()
+            for name, label, meaning in times
         ),
         Card("messages/s, mean", count(report["messages_per_s"]), "Of all processes, over the whole run."),
-        *(_of_fact(report, name, must_be_zero=True) for name in ("collisions", "lethal_entries")),
+        *of_facts("collisions", "lethal_entries", tone=lambda value: {None: "", 0: "good"}.get(value, "bad")),
     ]
-
-
-def _of_fact(report: Mapping[str, Any], name: str, must_be_zero: bool = False) -> Card:
-    value, told = report[name], fact(name)
-    tone = "" if not must_be_zero or value is None else "bad" if value else "good"
-    return Card(told.label, told.text(value), told.meaning, tone)
 
 
 def headline(report: Mapping[str, Any], run: str | None) -> list[str]:

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,8 +78,6 @@ _COLUMNS: Mapping[str, tuple[str, str]] = {
 A row of vehicles or targets is a piece of a track, and says how many samples it has: all stand track by track.
 A row of routes says how many steps, and legs if it is pulled: these stand route by route.
 """
-_ADDED = ("marks_", "routes_")
-"""Columns that a file of an older build lacks: they are as if nothing was marked, and no route begun or pulled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +116,9 @@ class RunTracks:
     """What moved in a run.
 
     captures  tracks of one point each
-    marks     at the end; none in a file of an older build, as `routes`, which are in order of time
-    began_ns  from when the time of the run counts; an older build did not say it, but began to sample then
+    marks     at the end
+    routes    in order of time
+    began_ns  from when the time of the run counts
     """
 
     grid: GridSpec
@@ -239,14 +239,10 @@ def read_tracks(path: Path) -> RunTracks:
 def tracks_in(content: bytes, path: Path) -> RunTracks:
     """What `packed_tracks` packed. Raises StoreError if it is damaged; `path` is how the sentence calls it."""
     with _arrays_in(content, path) as arrays:
-        grid = _grid(json.loads(str(arrays["grid"])))
-        columns: dict[str, NDArray[Any]] = {}
+        grid = _grid(str(arrays["grid"]))
+        columns = {name: _checked(name, arrays[name], kind) for name, (_, kind) in _COLUMNS.items()}
         rows: dict[str, int] = {}
-        for name, (table, kind) in _COLUMNS.items():
-            if name in arrays or not name.startswith(_ADDED):
-                columns[name] = _checked(name, arrays[name], kind)
-            else:
-                columns[name] = _shaped(np.zeros(rows.get(table, 0)), kind)
+        for name, (table, _) in _COLUMNS.items():
             if rows.setdefault(table, len(columns[name])) != len(columns[name]):
                 raise ValueError(f"the columns of {table} differ in length")
         places = _on_map(columns["captures_place_m"], grid)
@@ -258,9 +254,7 @@ def tracks_in(content: bytes, path: Path) -> RunTracks:
             [Track(id, 0, times_ns[n : n + 1], places[n : n + 1]) for n, id in enumerate(ids)],
             _marks(columns, grid),
             _routes(columns, grid),
-            int(arrays["began_ns"])
-            if "began_ns" in arrays
-            else int(columns["vehicles_time_ns"].min(initial=STAMP_LIMIT_NS)),
+            int(arrays["began_ns"]),
         )
 
 
@@ -285,16 +279,11 @@ def _split(name: str, columns: Mapping[str, NDArray[Any]], counts: str) -> list[
     return np.split(column, np.cumsum(lengths)[:-1])
 
 
-def _grid(fields: dict[str, Any]) -> GridSpec:
-    grid = GridSpec(**fields)
-    lengths = (grid.resolution_m, grid.west_m, grid.north_m)
-    if not (isinstance(grid.rows, int) and isinstance(grid.cols, int) and isinstance(grid.crs, str)):
-        raise ValueError("its grid has no number of cells or no coordinate system")
-    known = all(isinstance(each, int | float) and abs(each) <= _FARTHEST_M for each in lengths)
-    if not known or lengths[0] < _LEAST_M:
-        raise ValueError(
-            f"its grid lies farther than {_FARTHEST_M:g} m away, or nowhere, or has cells without a side"
-        )
+def _grid(text: str) -> GridSpec:
+    grid = msgspec.json.decode(text, type=GridSpec)
+    farthest_m = max(abs(grid.west_m), abs(grid.north_m), grid.resolution_m)
+    if farthest_m > _FARTHEST_M or grid.resolution_m < _LEAST_M:
+        raise ValueError(f"its grid lies farther than {_FARTHEST_M:g} m away, or has cells without a side")
     return grid
 
 

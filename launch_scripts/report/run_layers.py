@@ -17,10 +17,10 @@ from launch_scripts.report.exporter import (
     TIMED,
     Feature,
     Layer,
+    Points,
     Value,
     areas_of,
     moment,
-    transform_of,
     turns_of,
     write_layers,
 )
@@ -49,14 +49,12 @@ def target_tracks(tracks: RunTracks, groups: Groups) -> list[Layer]:
 
 
 def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, Value]]]) -> list[Layer]:
-    """Tracks as lines; of the samples in which something stands still, the first and the last are kept."""
+    """Tracks as lines, or points where they have no length."""
     points = Layer(f"{lines.name.removesuffix('_tracks')}s_standing", "Point", lines.fields)
     for track, whose in tracks:
         if not len(track.time_ns):
             continue
         steps_m = np.hypot(*np.diff(track.xy_m, axis=0).T)
-        still = np.zeros(len(track.time_ns), bool)
-        still[1:-1] = (steps_m[:-1] == 0) & (steps_m[1:] == 0)
         values: dict[str, Value] = {
             **whose,
             "begins": moment(track.time_ns[0]),
@@ -67,7 +65,7 @@ def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, Value]]]) -> li
         if values["length_m"] == 0:
             points.features.append(Feature([track.xy_m[:1]], values))
         else:
-            lines.features.append(Feature([track.xy_m[~still]], values, track.time_ns[~still]))
+            lines.features.append(Feature([track.xy_m], values, track.time_ns))
     return [lines, points] if points.features else [lines]
 
 
@@ -107,57 +105,43 @@ def _routes(tracks: RunTracks, groups: Groups) -> list[Layer]:
 def _marks(tracks: RunTracks, groups: Groups) -> list[Layer]:
     """What was marked at the end, as `mark_layer`."""
     grid, marks = tracks.grid, tracks.marks
-    shape = (grid.rows, grid.cols)
-    kinds, paces, stamps_ns = np.full(shape, 255, np.uint8), np.zeros(shape, np.float32), np.zeros(shape, np.int64)
-    for array, values in ((kinds, marks.kinds), (paces, marks.paces), (stamps_ns, marks.stamps_ns)):
-        array.reshape(-1)[marks.cells] = values
-    return [mark_layer(grid, kinds, paces, stamps_ns)]
+    kinds, paces = np.full((grid.rows, grid.cols), 255, np.uint8), np.zeros((grid.rows, grid.cols), np.float32)
+    kinds.reshape(-1)[marks.cells], paces.reshape(-1)[marks.cells] = marks.kinds, marks.paces
+    return [mark_layer(grid, kinds, paces)]
 
 
-def mark_layer(
-    grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float32], stamps_ns: NDArray[np.int64]
-) -> Layer:
+def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> Layer:
     """Marked cells that touch and say the same, as polygons: lethal ones, and paces of the same two digits.
 
-    kinds      uint8 (rows, cols): a MarkKind where something is marked, any other number elsewhere
-    paces      float32 (rows, cols), s/m, where the kind is PACE
-    stamps_ns  int64 (rows, cols), UNIX time of the mark
+    kinds  uint8 (rows, cols): a MarkKind where something is marked, any other number elsewhere
+    paces  float32 (rows, cols), s/m, where the kind is PACE
     """
-    from rasterio.features import rasterize
-    from scipy import ndimage
-
     layer = Layer(
-        "marks", "Polygon",
-        {"kind": "text", "pace_s_per_m": "real", "cells": "int", "area_m2": "real", "oldest": "time",
-         "newest": "time"}, about="A mark is lethal, or the pace in seconds per metre that was measured.",
+        "marks", "Polygon", {"kind": "text", "pace_s_per_m": "real", "cells": "int", "area_m2": "real"},
+        about="A mark is lethal, or the pace in seconds per metre that was measured.",
     )  # fmt: skip
     lethal, paced = kinds == MarkKind.LETHAL, kinds == MarkKind.PACE
     codes = lethal.astype(np.int32)
     known = np.maximum(paces[paced].astype(np.float64), 1e-30)
     power = 10.0 ** np.floor(np.log10(known) - 1)
-    codes[paced] = 2 + np.unique(np.round(known / power) * power, return_inverse=True)[1]
-    areas = list(areas_of(codes, codes > 0, grid))
-    if not areas:
-        return layer
-    shapes = [({"type": "Polygon", "coordinates": rings}, n) for n, (_, rings) in enumerate(areas, 1)]
-    numbers = rasterize(shapes, kinds.shape, transform=transform_of(grid), dtype=np.int32)
-    each = np.arange(1, len(areas) + 1)
-    cells = np.bincount(numbers.reshape(-1), minlength=len(areas) + 1)[1:].tolist()
-    oldest, newest, mean = (
-        of(values, numbers, each)
-        for of, values in ((ndimage.minimum, stamps_ns), (ndimage.maximum, stamps_ns), (ndimage.mean, paces))
-    )
-    for n, (code, rings) in enumerate(areas):
+    rounded, of_cell = np.unique(np.round(known / power) * power, return_inverse=True)
+    codes[paced] = 2 + of_cell
+    for code, rings in areas_of(codes, codes > 0, grid):
+        border_m2, *holes_m2 = map(_enclosed_m2, rings)
+        area_m2 = border_m2 - sum(holes_m2)
         values: dict[str, Value] = {
             "kind": "lethal" if code == 1 else "pace",
-            "pace_s_per_m": None if code == 1 else float(f"{mean[n]:.4g}"),
-            "cells": cells[n],
-            "area_m2": round(cells[n] * grid.resolution_m**2, 3),
-            "oldest": moment(oldest[n]),
-            "newest": moment(newest[n]),
+            "pace_s_per_m": None if code == 1 else float(f"{rounded[code - 2]:.4g}"),
+            "cells": round(area_m2 / grid.resolution_m**2),
+            "area_m2": round(area_m2, 3),
         }
         layer.features.append(Feature(rings, values))
     return layer
+
+
+def _enclosed_m2(ring: Points) -> float:
+    x_m, y_m = (ring - ring[0]).T
+    return float(abs(np.dot(x_m[:-1], y_m[1:]) - np.dot(x_m[1:], y_m[:-1])) / 2)
 
 
 WHAT: Mapping[str, Callable[[RunTracks, Groups], list[Layer]]] = {

@@ -124,15 +124,14 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
 
 def _left_behind(report: Mapping[str, Any]) -> list[str]:
     """What vehicles did not do, in sentences."""
-    said = [
-        f"{count(report[name])} of {count(report['vehicles'])} vehicles {words}"
-        for name, words in (("lost", "are lost at the end"), ("stranded", "are stranded at the end"))
-        if report.get(name)
-    ]
     vehicles, routed = report["vehicles"], report.get("vehicles_routed")
-    if routed is not None and routed < vehicles:
-        said.append(f"{count(vehicles - routed)} of {count(vehicles)} vehicles never had a route")
-    return said
+    unrouted = 0 if routed is None else vehicles - routed
+    told = (
+        (report.get("lost"), "are lost at the end"),
+        (report.get("stranded"), "are stranded at the end"),
+        (unrouted, "never had a route"),
+    )
+    return [f"{count(number)} of {count(vehicles)} vehicles {words}" for number, words in told if number]
 
 
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,10 +166,6 @@ def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
     tracks = read_tracks(folder / TRACKS_FILE)
     width_km, height_km = size_km(tracks.grid)
     scale = _MAP_IN / max(width_km, height_km)
-
-    def draw(axes: Axes) -> None:
-        draw_map(axes, tracks, report)
-        axes.set_axis_off()
 
     files = {"ground": (GROUND_FILE, "image/webp"), "learned": (LEARNED_FILE, "image/png")}
     return {

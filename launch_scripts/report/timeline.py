@@ -224,19 +224,11 @@ class _Note(msgspec.Struct):
     sender: str = msgspec.field(name="from")
 
 
-class _Alarm(msgspec.Struct):
-    kind: str
-    about: str
-    text: str
-    since_s: float | None
-    over_s: float | None
-
-
 class _Words(msgspec.Struct):
     """The part of report.json that is read here."""
 
     notes: list[_Note] | None = None
-    alarms: list[_Alarm] | None = None
+    alarms: list[Alarm] | None = None
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -271,11 +263,10 @@ def lines_of(report: Mapping[str, Any], path: Path, began_ns: int, captures: lis
     for each in captures:
         if each.time_ns[0] < first_ns - NS_PER_S:
             lines.append(Line(int(each.time_ns[0]), Severity.INFO, "targets", f"{each.id} was captured"))
-    for told in words.alarms or []:
-        alarm = Alarm(told.kind, told.about, told.text, told.since_s, told.over_s)
+    for alarm in words.alarms or []:
         severity = Severity.ERROR if alarm.serious else Severity.WARN
-        if told.since_s is not None:
-            lines.append(Line(at(told.since_s), severity, told.about, f"{alarm.label}: {told.text}"))
-        if told.over_s is not None and told.over_s != told.since_s:
-            lines.append(Line(at(told.over_s), Severity.INFO, told.about, f"{alarm.label} is over: {told.text}"))
+        if alarm.since_s is not None:
+            lines.append(Line(at(alarm.since_s), severity, alarm.about, f"{alarm.label}: {alarm.text}"))
+        if alarm.over_s is not None and alarm.over_s != alarm.since_s:
+            lines.append(Line(at(alarm.over_s), Severity.INFO, alarm.about, f"{alarm.label} is over: {alarm.text}"))
     return sorted(lines)

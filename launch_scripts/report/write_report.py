@@ -9,6 +9,7 @@ import io
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,12 +45,7 @@ def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain
         "version": importlib.metadata.version("terrain-swarm"),
         "terrain": {
             "digest": terrain.digest,
-            "rows": terrain.grid.rows,
-            "cols": terrain.grid.cols,
-            "resolution_m": terrain.grid.resolution_m,
-            "west_m": terrain.grid.west_m,
-            "north_m": terrain.grid.north_m,
-            "crs": terrain.grid.crs,
+            **asdict(terrain.grid),
             **bounds_deg(terrain.grid),
             "notes": list(terrain.notes),
         },
@@ -96,18 +92,14 @@ def write_report(
     if (factors != 1).any():
         contents[LEARNED_FILE] = lambda: image_bytes(learned_pixels(terrain, factors), "PNG")
     for name, content in contents.items():
-        _write(folder / name, content())
+        with _sentence(folder / name):
+            write_file(folder / name, content())
     from launch_scripts.report.picture import save_picture
     from launch_scripts.report.run_page import write_page
 
     with _sentence(folder / PICTURE_FILE), replacing(folder / PICTURE_FILE) as half:
         save_picture(half, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
     write_page(folder)
-
-
-def _write(path: Path, content: bytes) -> None:
-    with _sentence(path):
-        write_file(path, content)
 
 
 @contextlib.contextmanager
@@ -121,7 +113,6 @@ def _sentence(path: Path) -> Iterator[None]:
 TABLES = {"by_target": ("targets.csv", "target"), "by_group": ("groups.csv", "group"),
           "by_vehicle": ("vehicles.csv", "vehicle")}  # fmt: skip
 """Section of the report -> its file, and what its first column is called."""
-_GAP = ("mean", "p95", "max", "unproven")
 
 
 def csv_of(section: str, report: Mapping[str, Any]) -> bytes:
@@ -140,7 +131,7 @@ def flat(id: str, row: Mapping[str, Any]) -> dict[str, Any]:
     values: dict[str, Any] = {"id": id}
     for name, value in row.items():
         if name == "certified_gap":
-            values |= {f"{name}_{part}": (value or {}).get(part) for part in _GAP}
+            values |= {f"{name}_{part}": (value or {}).get(part) for part in ("mean", "p95", "max", "unproven")}
         else:
             values[name] = value
     return values

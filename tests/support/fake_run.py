@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
 
 from launch_scripts.observe.recorder import Recorder
+from launch_scripts.report.write_report import make_report, write_report
 from launch_scripts.simulation.node import EPOCH_NS as BEGAN_NS
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain
+from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.liveness import Peer
 from swarm.wire.messages import Message
@@ -29,6 +34,22 @@ def fake_run(terrain: Terrain, truth: Floats, scenario: Scenario) -> Iterator[tu
     simulation.recorder.heard, simulation.recorder.alive = heard, alive  # type: ignore[method-assign]
     simulation.run_until(scenario.seconds)
     yield from told
+
+
+def little_scenario(seconds: float = 6.0, vehicles: int = 10, time_scale: int = 10, more: str = "") -> Scenario:
+    """Two targets, and vehicles of one group."""
+    return parse_scenario(
+        f'name = "little"\nseed = 3\nseconds = {seconds}\ntime_scale = {time_scale}\n'
+        f'[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = {vehicles}\n{more}'
+    )
+
+
+def leave(folder: Path, recorder: Recorder, terrain: Terrain, truth: Floats) -> None:
+    """Writes what a run leaves into a new folder, but an empty picture: that is another test's."""
+    folder.mkdir(exist_ok=True)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("launch_scripts.report.picture.save_picture", lambda half, *_: half.touch())
+        write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
 
 
 def played(terrain: Terrain, truth: Floats, scenario: Scenario) -> Recorder:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from support import fake_run
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.ground.ground_view import Scene
@@ -18,7 +19,6 @@ from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.liveness import Peer
 from swarm.wire.messages import Message
@@ -35,10 +35,7 @@ NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)
 
 
 def little_scenario() -> Scenario:
-    return parse_scenario(
-        'name = "little"\nseed = 3\nseconds = 6.0\ntime_scale = 10\n[[targets]]\nname = "t"\ncount = 2\n'
-        "[[groups]]\nvehicles = 10\n[monitor]\nlive = false\n"
-    )
+    return fake_run.little_scenario(more="[monitor]\nlive = false\n")
 
 
 def little_terrain() -> Terrain:

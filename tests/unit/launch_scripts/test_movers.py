@@ -18,12 +18,9 @@ from launch_scripts.monitor.movers.map_lines import RouteLines, RouteNow, Trails
 from launch_scripts.monitor.movers.movers_view import OVER_S, alarm_marks, searched_points, target_labels
 from launch_scripts.monitor.movers.styles import (
     HUES,
-    LEVELS,
     LOST_COLOUR,
     Looks,
     RateLimit,
-    level_for,
-    shaded,
 )
 from launch_scripts.monitor.movers.vehicles_view import vehicle_details
 from launch_scripts.monitor.sinks import Pen, Strips
@@ -77,13 +74,6 @@ def many(strips: Strips) -> int:
 # --- looks ----------------------------------------------------------------------------------------------------
 
 
-def lightness(colour: tuple[int, ...]) -> float:
-    """L* of CIELAB: what all people see alike, whatever colours they tell apart."""
-    linear = [value / 255 / 12.92 if value <= 10 else ((value / 255 + 0.055) / 1.055) ** 2.4 for value in colour]
-    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-    return 116 * luminance ** (1 / 3) - 16 if luminance > 0.008856 else 903.3 * luminance
-
-
 # Simulated dichromacy, by Machado, Oliveira and Fernandes (2009), severity 1.
 DICHROMATS = {
     "protan": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
@@ -99,16 +89,6 @@ def test_the_colour_blind_tell_groups_and_targets_apart(who: str) -> None:
 
     for one, other in itertools.combinations(HUES, 2):
         assert np.linalg.norm(seen(one) - seen(other)) > 35, (one, other)
-
-
-@pytest.mark.parametrize("hue", HUES)
-def test_brightness_says_how_a_vehicle_does(hue: tuple[int, int, int]) -> None:
-    light = {state: lightness(shaded(hue, state)) for state in VehicleState}
-    assert light[VehicleState.ARRIVED] > light[VehicleState.FOLLOWING] + 6
-    assert light[VehicleState.FOLLOWING] > light[VehicleState.WAITING] + 15
-    assert light[VehicleState.WAITING] > light[VehicleState.STRANDED] + 10
-    lost = shaded(hue, VehicleState.LOST)
-    assert max(lost) - min(lost) < 45, "grey"
 
 
 def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_groups() -> None:
@@ -358,17 +338,6 @@ def test_the_camera_follows_whom_the_option_names_rather_than_the_scenario() -> 
 
 
 # --- how much and how often -----------------------------------------------------------------------------------
-
-
-def test_the_more_vehicles_the_less_is_drawn_of_each() -> None:
-    assert level_for(0) is LEVELS[0]
-    assert level_for(10**6) is LEVELS[-1]
-    for fine, coarse in itertools.pairwise(LEVELS):
-        assert fine.most < coarse.most
-        for name in ("radius_px", "line_px", "trail_s", "names"):
-            assert getattr(fine, name) >= getattr(coarse, name), name
-        for name in ("frames", "trail_every_s", "details_s", "routes_s", "route_stride"):
-            assert getattr(fine, name) <= getattr(coarse, name), name
 
 
 def test_what_is_due_is_due_once_in_its_time() -> None:

@@ -7,17 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 from numpy.typing import NDArray
 from support import fake_run
 
-from launch_scripts.observe.palette import STATE_COLOURS, STYLE, hillshade
+from launch_scripts.observe.palette import hillshade
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report import picture
 from launch_scripts.report import run_plots as plots
@@ -26,36 +24,38 @@ from launch_scripts.report.run_arrays import packed_tracks, tracks_in
 from launch_scripts.report.run_plots import saved
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 
-ASKED_FOR = (
-    *(
-        "scenario",
-        "seed",
-        "seconds",
-        "vehicles",
-        "targets",
-        "processes",
-        "restarts",
-        "captures",
-        "stranded",
-        "lost",
-    ),
-    *("reroute_requests", "marks", "routes_served", "collisions", "lethal_entries", "startup_s"),
-    *("gap", "growth_ms", "route_query_ms", "mark_to_tree_ms"),
-)
+ASKED_FOR = [
+    "scenario",
+    "seed",
+    "seconds",
+    "vehicles",
+    "targets",
+    "processes",
+    "restarts",
+    "captures",
+    "stranded",
+    "lost",
+    "reroute_requests",
+    "marks",
+    "routes_served",
+    "collisions",
+    "lethal_entries",
+    "startup_s",
+    "gap",
+    "growth_ms",
+    "route_query_ms",
+    "mark_to_tree_ms",
+]
 
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    return parse_scenario(
-        'name = "little"\nseed = 3\nseconds = 12.0\ntime_scale = 10\n[[targets]]\nname = "t"\ncount = 2\n'
-        "[[groups]]\nvehicles = 10\n"
-    )
+    return fake_run.little_scenario(12.0)
 
 
 @pytest.fixture(scope="module")
@@ -141,24 +141,6 @@ def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
         head = [text.get_window_extent(renderer) for text in figure.texts]
         for n, box in enumerate(head):
             assert not any(box.overlaps(other) for other in head[:n]), figure.texts[n].get_text()
-
-
-@pytest.mark.parametrize("states", [2, len(STATE_COLOURS)])
-def test_the_legend_of_states_leaves_the_title_its_room(states: int) -> None:
-    series: dict[str, Any] = {"t_s": [0.0, 1.0]}
-    series |= {state.name.lower(): [n < states] * 2 for n, state in enumerate(STATE_COLOURS)}
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(picture.WIDTH_IN, picture.HEIGHT_IN), dpi=picture.DPI)
-        axes = figure.add_axes((0.655, 0.6, 0.297, 0.1))
-        plots.draw_plot(axes, plots.PLOTS[0], {"series": series})
-        FigureCanvasAgg(figure).draw()
-        legend = axes.get_legend()
-        assert legend is not None
-        assert len(legend.get_texts()) == states
-        title = next(
-            text for text in axes.findobj(Text) if text.get_text() and text.get_text() == axes.get_title("left")
-        )
-        assert title.get_window_extent().x1 < legend.get_window_extent().x0
 
 
 def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenario, tmp_path: Path) -> None:

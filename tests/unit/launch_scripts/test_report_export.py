@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rasterio.features import rasterize
 from rasterio.transform import from_origin
 from support.command import Swarm
-from support.fake_run import BEGAN_NS, played
+from support.fake_run import BEGAN_NS, little_scenario, played
 from support.map_strategies import set_of
 
 from launch_scripts.observe.history import BegunRoute
@@ -31,7 +31,6 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import MarkKind
@@ -42,9 +41,7 @@ LETHAL_CELLS = {(3, 4), (3, 5), (4, 5), (9, 9)}
 
 @pytest.fixture(scope="module")
 def recorder() -> Recorder:
-    scenario = parse_scenario(
-        'name = "little"\nseed = 3\nseconds = 8.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 4\n'
-    )
+    scenario = little_scenario(8.0, vehicles=4, time_scale=1)
     terrain = dataclasses.replace(terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0), grid=GRID)
     truth = np.array(terrain.pace_s_per_m)
     truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
@@ -257,7 +254,7 @@ def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others() -> No
     kinds = chance.choice(np.array([0, 1, 2, 255], np.uint8), (40, 50), p=[0.3, 0.3, 0.1, 0.3])
     paces = chance.choice(np.array([0.1, 0.25, 3.0], np.float32), (40, 50))
     grid = GridSpec(40, 50, 10.0, 100.0, 900.0)
-    layer = mark_layer(grid, kinds, paces, np.full((40, 50), BEGAN_NS))
+    layer = mark_layer(grid, kinds, paces)
     codes = {"lethal": 1, "0.1": 2, "0.25": 3, "3.0": 4}
 
     def code(values: dict[str, Any]) -> int:
@@ -311,25 +308,11 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path
         {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1.0, "crs": 5}')},
     ],
 )
-def test_tracks_that_nothing_could_have_left_are_damaged(changed: dict[str, NDArray[Any]]) -> None:
-    one: dict[str, NDArray[Any]] = {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1.0}')}
-    for name in ("vehicles", "targets"):
-        one |= {
-            f"{name}_id": np.array(["a"]),
-            f"{name}_time_ns": np.array([5]),
-            f"{name}_place_m": np.zeros((1, 2)),
-        }
-        one |= {f"{name}_piece": np.array([0]), f"{name}_samples": np.array([1])}
-    one |= {"captures_id": np.array(["a"]), "captures_time_ns": np.array([5]), "captures_place_m": np.zeros((1, 2))}
-    one |= {"marks_cells": np.array([3]), "marks_kinds": np.array([int(MarkKind.PACE)]), "marks_paces": np.ones(1)}
-    one |= {"marks_stamps_ns": np.array([5]), "routes_vehicle": np.array(["a"]), "routes_target": np.array(["a"])}
-    one |= {"routes_time_ns": np.array([5]), "routes_start": np.array([0]), "routes_cost_s": np.ones(1)}
-    one |= {"routes_bound_s": np.ones(1), "routes_steps": np.array([1]), "routes_directions": np.array([2])}
+def test_tracks_that_nothing_could_have_left_are_damaged(run: Path, changed: dict[str, NDArray[Any]]) -> None:
+    with np.load(run / TRACKS_FILE) as arrays:
+        columns = {**arrays, **changed}
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **one)
-    assert len(tracks_in(file.getvalue(), Path("t.npz")).routes) == 1
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **{**one, **changed})
+    np.savez(file, allow_pickle=False, **columns)
     with pytest.raises(StoreError, match=r"^t\.npz is damaged: "):
         tracks_in(file.getvalue(), Path("t.npz"))
 

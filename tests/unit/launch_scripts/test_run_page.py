@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command import Swarm
-from support.fake_run import played
+from support.fake_run import leave, little_scenario, played
 
 from launch_scripts.observe.counts import percent
-from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.config.load import parse_scenario
 from swarm.config.write import scenario_text
 from swarm.wire.messages.processes import Note
 
@@ -28,11 +26,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's folder with a name in its notes, and in its scenario, that would rather be a script."""
     folder = tmp_path_factory.mktemp("runs") / "r1"
     folder.mkdir()
-    scenario = parse_scenario(
-        'name = "little"\nseed = 3\nseconds = 6.0\ntime_scale = 20\n[[targets]]\nname = "t"\ncount = 2\n'
-        "[[groups]]\nvehicles = 4\n"
-        "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[100, 100], [400, 100], [400, 300], [100, 300]]\n"
-    )
+    zone = "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[100, 100], [400, 100], [400, 300], [100, 300]]\n"
+    scenario = little_scenario(vehicles=4, time_scale=20, more=zone)
     pace = np.full((24, 32), 0.1, np.float32)
     pace[4:12, 4:16] = np.inf
     terrain = terrain_of_pace(pace, 25.0)
@@ -42,9 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
     recorder.heard(note, recorder.observed.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
-    with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
-        patched.setattr("launch_scripts.report.picture.save_picture", lambda half, *_: half.touch())
-        write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
+    leave(folder, recorder, terrain, truth)
     return folder
 
 
