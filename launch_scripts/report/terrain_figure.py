@@ -59,7 +59,7 @@ def _draw_map(
     grid = level.grid
     unit_m, unit = (1000.0, "km") if max(grid.rows, grid.cols) * grid.resolution_m >= 4000 else (1.0, "m")
     side = grid.resolution_m / unit_m
-    place = {"extent": (0.0, grid.cols * side, grid.rows * side, 0.0), "interpolation": "nearest"}
+    place: Any = {"extent": (0.0, grid.cols * side, grid.rows * side, 0.0), "interpolation": "nearest"}
     image = axes.imshow(values, **colours, **place)
     dark = np.zeros((grid.rows, grid.cols, 4), np.float32)
     dark[..., 3] = np.clip(shadow * (1 - hillshade(level.elevation_m, grid.resolution_m) / 0.7), 0, 1)
