@@ -9,7 +9,7 @@ import statistics
 import numpy as np
 import pytest
 from support.class_world import captures_by_class, made
-from support.ordered_simulation import OrderedSimulation
+from support.simulated import OrderedSimulation, agents, cells, vehicles
 
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
@@ -17,7 +17,6 @@ from shared_map.class_grounds import class_grounds
 from shared_map.terrain.air import clearance_floor
 from swarm.config.load import parse_scenario
 from swarm.wire.messages.orders import ZoneOrder
-from vehicle_agent.service import AgentService
 
 SECONDS = 12.0
 _TEXT = """
@@ -61,42 +60,35 @@ routes = "pulled"
 def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(added: str) -> None:
     scenario, terrain = made(_TEXT + added)
     simulation = OrderedSimulation(scenario, terrain=terrain)
-    cells: dict[str, set[int]] = {"ground": set(), "drone": set()}
+    flown: set[int] = set()
     together = 0
-    plots: dict[str, set[bool]] = {"ground": set(), "drone": set()}
 
-    def look(node: object) -> None:
+    def look(node: Node) -> None:
         nonlocal together
-        here: dict[str, set[int]] = {"ground": set(), "drone": set()}
-        for each in simulation.nodes.values():
-            if isinstance(each.service, AgentService):
-                agent = each.service.agent
-                name = agent.plan.group.vehicle_class
-                here[name] |= {vehicle.cell for vehicle in agent.vehicles.values()}
-                numbers = each.service._right_of_way.core.plots.all
-                plots[name] |= {numbers.start > 0}
-        together += len(here["ground"] & here["drone"])
-        for name, found in here.items():
-            cells[name] |= found
+        aloft = set(cells(simulation, "drone").values())
+        flown.update(aloft)
+        together += len(aloft & set(cells(simulation, "ground").values()))
 
     simulation.after_tick.append(look)
-    trial = LawBook(simulation)
-    assert trial.run(SECONDS) == []
+    simulation.run_until(SECONDS - 1.0)
+    plots = {
+        (each.agent.plan.group.vehicle_class, each._right_of_way.core.plots.all.start > 0)
+        for each in agents(simulation).values()
+    }
+    assert plots == {("ground", False), ("drone", True)}
+    assert LawBook(simulation).run(SECONDS) == []
     report = simulation.report(SECONDS)
     assert report["collisions"] == report["lethal_entries"] == 0
     assert together > 0, "nobody flew over anybody"
-    assert plots == {"ground": {False}, "drone": {True}}
-    captures = captures_by_class(simulation)
-    assert min(captures.values()) > 0
+    assert min(captures_by_class(simulation).values()) > 0
     ground = class_grounds(scenario, terrain, simulation.truth)["drone"].terrain
     assert ground.flight_m is not None
-    flown = sorted(cells["drone"])
     floor_m = clearance_floor(terrain.elevation_m, 40.0)
-    assert (ground.flight_m.ravel()[flown] >= floor_m.ravel()[flown]).all()
-    rows, cols = np.divmod(np.array(flown), terrain.grid.cols)
+    assert (ground.flight_m.ravel()[list(flown)] >= floor_m.ravel()[list(flown)]).all()
+    rows, cols = np.divmod(np.array(list(flown)), terrain.grid.cols)
     assert not ((rows >= 7) & (rows < 10) & (cols >= 7) & (cols < 10)).any(), "a drone flew where it must not"
     assert np.isinf(ground.pace_s_per_m[7:10, 7:10]).all()
-    assert np.isinf(terrain.pace_s_per_m.ravel()[flown]).any(), "a drone flies where no rover drives"
+    assert np.isinf(terrain.pace_s_per_m.ravel()[list(flown)]).any(), "a drone flies where no rover drives"
 
 
 _PLAIN = """
@@ -133,10 +125,8 @@ def speed_mps(routes: str, start: tuple[int, int], end: tuple[int, int]) -> floa
     places: list[tuple[float, float, float]] = []
 
     def look(node: Node) -> None:
-        if isinstance(node.service, AgentService):
-            places.extend(
-                (simulation.now_s, *each.motion.place_m()) for each in node.service.agent.vehicles.values()
-            )
+        if node.spec.role == "agent":
+            places.extend((simulation.now_s, *each.motion.place_m()) for each in vehicles(simulation).values())
 
     simulation.after_tick.append(look)
     simulation.run_until(20.0)
@@ -158,11 +148,7 @@ def test_an_operators_zone_for_a_class_that_flies_is_a_no_fly_zone_and_rovers_go
     simulation = OrderedSimulation(scenario, terrain=terrain)
 
     def inside(name: str) -> int:
-        agents = [
-            each.service.agent for each in simulation.nodes.values() if isinstance(each.service, AgentService)
-        ]
-        hosts = [each for each in agents if each.plan.group.vehicle_class == name]
-        return int(zone.ravel()[[vehicle.cell for host in hosts for vehicle in host.vehicles.values()]].sum())
+        return int(zone.ravel()[list(cells(simulation, name).values())].sum())
 
     zone = np.zeros((64, 64), bool)
     zone[20:50, 20:50] = True

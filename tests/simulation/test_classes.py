@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from support.class_world import captures_by_class, made
 from support.effort import few
-from support.ordered_simulation import OrderedSimulation
+from support.simulated import OrderedSimulation, agents, cells, vehicles
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
+from launch_scripts.simulation.node import Node
+from shared_map.arrays import Bools
 from shared_map.class_grounds import ClassGround, class_grounds
 from shared_map.keeper.zone_orders import zones_of
-from shared_map.terrain.terrain import build_truth
 from swarm.config.agents import added_agent
 from swarm.config.classes import ClassConfig, class_numbers
 from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError
 from swarm.wire.messages.orders import ZoneOrder
-from vehicle_agent.placement import spawn_cells
-from vehicle_agent.service import AgentService
 
 SECONDS = 12.0
 LONG_S = 20.0
@@ -56,17 +57,16 @@ capture_range_m = 30.0
 """
 
 
-class Driven:
-    """Where vehicles were, by class."""
+def driven_by(simulation: OrderedSimulation) -> dict[str, set[int]]:
+    """Class -> the cells on which its vehicles are, from now on."""
+    driven: dict[str, set[int]] = {"ground": set(), "walker": set()}
 
-    def __init__(self, simulation: OrderedSimulation) -> None:
-        self.cells: dict[str, set[int]] = {}
-        simulation.after_tick.append(lambda node: self._look(node.service))
+    def look(node: Node) -> None:
+        for name, found in driven.items():
+            found.update(cells(simulation, name).values())
 
-    def _look(self, service: object) -> None:
-        if isinstance(service, AgentService):
-            cells = self.cells.setdefault(service.agent.plan.group.vehicle_class, set())
-            cells.update(vehicle.cell for vehicle in service.agent.vehicles.values())
+    simulation.after_tick.append(look)
+    return driven
 
 
 def grounds_of(simulation: OrderedSimulation) -> dict[str, ClassGround]:
@@ -76,7 +76,7 @@ def grounds_of(simulation: OrderedSimulation) -> dict[str, ClassGround]:
 def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_own() -> None:
     scenario, terrain = made(_TEXT)
     simulation = OrderedSimulation(scenario, terrain=terrain)
-    trial, driven = LawBook(simulation), Driven(simulation)
+    trial, driven = LawBook(simulation), driven_by(simulation)
     assert trial.run(LONG_S) == []
     report = simulation.report(LONG_S)
     assert report["lethal_entries"] == report["collisions"] == 0
@@ -85,10 +85,10 @@ def test_vehicles_of_two_classes_capture_and_none_enters_what_is_lethal_to_its_o
     captures = captures_by_class(simulation)
     assert min(captures["ground"], captures["walker"]) > 0
     grounds = grounds_of(simulation)
-    for name, cells in driven.cells.items():
-        assert np.isfinite(grounds[name].truth.ravel()[sorted(cells)]).all()
+    for name, found in driven.items():
+        assert np.isfinite(grounds[name].truth.ravel()[sorted(found)]).all()
     closed_to_rovers = np.isinf(grounds["ground"].terrain.ground_s_per_m).ravel()
-    assert closed_to_rovers[sorted(driven.cells["walker"])].any(), "a walker goes where no rover could"
+    assert closed_to_rovers[sorted(driven["walker"])].any(), "a walker goes where no rover could"
 
 
 @settings(max_examples=few(6), deadline=None)
@@ -114,16 +114,16 @@ def test_whatever_a_class_may_drive_and_whatever_goes_wrong_it_enters_nothing_el
     scenario = msgspec.structs.replace(scenario, seed=seed)
     simulation = OrderedSimulation(scenario, faults=random_plan(seed, nodes_of(scenario), 6.0))
     try:
-        laws, driven = LawBook(simulation), Driven(simulation)
+        laws, driven = LawBook(simulation), driven_by(simulation)
     except ConfigError:  # there are too few cells that so poor a class can drive
         reject()
     simulation.run_until(6.0)
     assert (laws.lethal, laws.collisions) == ([], [])
     grounds = grounds_of(simulation)
-    for name, cells in driven.cells.items():
+    for name, found in driven.items():
         own = grounds[name]
-        assert np.isfinite(own.truth.ravel()[sorted(cells)]).all()
-        assert np.isfinite(own.terrain.pace_s_per_m.ravel()[sorted(cells)]).all()
+        assert np.isfinite(own.truth.ravel()[sorted(found)]).all()
+        assert np.isfinite(own.terrain.pace_s_per_m.ravel()[sorted(found)]).all()
 
 
 def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None:
@@ -136,7 +136,11 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
         given = msgspec.structs.replace(scenario, classes=(same,), groups=(rovers, own))
         simulation = OrderedSimulation(given, terrain=terrain)
         places: list[tuple[str, int, float]] = []
-        simulation.after_tick.append(lambda node, places=places: places.extend(places_of(node.service)))  # type: ignore[misc]
+        simulation.after_tick.append(
+            lambda node, simulation=simulation, places=places: places.extend(  # type: ignore[misc]
+                (id, each.cell, each.motion.done_m) for id, each in vehicles(simulation).items()
+            )
+        )
         simulation.run_until(6.0)
         tracks.append(places)
         following.append(sum(each.following for each in simulation.recorder.observed.status.values()))
@@ -147,66 +151,47 @@ def test_a_class_with_the_values_of_ground_drives_as_ground_to_the_bit() -> None
     assert len({cell for _, cell, _ in tracks[0]}) > 100
 
 
-def places_of(service: object) -> list[tuple[str, int, float]]:
-    if not isinstance(service, AgentService):
-        return []
-    return [(id, each.cell, each.motion.done_m) for id, each in service.agent.vehicles.items()]
-
-
-def test_walkers_leave_a_zone_over_ground_that_no_rover_could_drive_and_more_of_them_join() -> None:
+def test_walkers_leave_zones_of_all_and_of_their_own_and_more_of_them_join() -> None:
+    """One lies over ground that no rover could drive; what is for walkers says nothing to rovers."""
     scenario, terrain = made(_TEXT)
-    spawns = spawn_cells(scenario, terrain.grid, class_grounds(scenario, terrain, build_truth(scenario, terrain)))
-    steep = np.isinf(terrain.ground_s_per_m).ravel()
-    stands = next(cell for agent in ("a2", "a3") for cell in spawns[agent].values() if steep[cell])
-    row, col = terrain.grid.row_col(stands)
-    corners = [(row + south, col + east) for south, east in ((-5, -5), (-5, 5), (5, 5), (5, -5))]
-    zone = [(min(max(r, 0), 63), min(max(c, 0), 63)) for r, c in corners]
     simulation = OrderedSimulation(scenario, terrain=terrain)
     laws = LawBook(simulation)
-    simulation.order(1.0, ZoneOrder(action="add", name="z", polygon=zone))
+    steep = np.isinf(terrain.ground_s_per_m).ravel()
+    simulation.run_until(1.0)
+    high = next(cell for cell in cells(simulation, "walker").values() if steep[cell])
+    first = around(simulation, high)
+    simulation.order(1.0, ZoneOrder(action="add", name="all", polygon=corners_of(first)))
     simulation.run_until(2.0)
-    walkers = [simulation.nodes[f"agent-{id}"].service for id in ("a2", "a3")]
-    assert all(np.isinf(each._maps.own.pace_s_per_m.item(stands)) for each in walkers)  # type: ignore[union-attr]
     added = simulation.add(added_agent(scenario, "more", "walkers", 3))
-    simulation.run_until(14.0)
-    in_zone = np.zeros((64, 64), bool)
-    in_zone[zone[0][0] + 1 : zone[2][0] - 1, zone[0][1] + 1 : zone[2][1] - 1] = True
-    services = [node.service for node in simulation.nodes.values() if isinstance(node.service, AgentService)]
-    places = {id: each.cell for service in services for id, each in service.agent.vehicles.items()}
-    assert len(places) == 19
-    assert not in_zone.ravel()[list(places.values())].any()
+    second = around(simulation, cells(simulation, "walker")["a3-00"])
+    simulation.order(3.0, ZoneOrder(action="add", name="z", polygon=corners_of(second), vehicle_class="walker"))
+    simulation.order(3.1, ZoneOrder(action="add", name="y", polygon=corners_of(second), vehicle_class="boat"))
+    simulation.run_until(4.0)
+    only_second = second & ~first
+    for id, open in (("a0", True), ("a1", True), ("a2", False), ("a3", False)):
+        own = agents(simulation)[f"agent-{id}"]._maps.own.pace_s_per_m
+        assert np.isfinite(own[only_second]).any() == open
+        assert np.isinf(own.item(high))
+    simulation.run_until(20.0)
+    assert len(cells(simulation)) == 19
+    assert not first.ravel()[list(cells(simulation).values())].any()
+    assert not second.ravel()[list(cells(simulation, "walker").values())].any()
     assert (laws.lethal, laws.collisions) == ([], [])
     assert added.service.agent.plan.group.vehicle_class == "walker"  # type: ignore[union-attr]
+    keeper: Any = simulation.nodes["keeper-0"].service
+    zones = zones_of(keeper.replica, 0, class_numbers(scenario))
+    assert {(each.name, each.vehicle_class) for each in zones} == {("all", None), ("z", "walker")}
 
 
-def test_a_zone_for_walkers_is_left_by_walkers_and_says_nothing_to_rovers() -> None:
-    scenario, terrain = made(_TEXT)
-    simulation = OrderedSimulation(scenario, terrain=terrain)
-    laws = LawBook(simulation)
-    simulation.run_until(3.0)
-    by_class = {"ground": ("a0", "a1"), "walker": ("a2", "a3")}
+def around(simulation: OrderedSimulation, cell: int) -> Bools:
+    """The cells at most five rows or columns from one."""
+    found = np.zeros((64, 64), bool)
+    row, col = divmod(cell, 64)
+    found[max(row - 5, 0) : row + 5, max(col - 5, 0) : col + 5] = True
+    return found
 
-    def cells(name: str) -> list[int]:
-        agents = [simulation.nodes[f"agent-{id}"].service for id in by_class[name]]
-        return [each.cell for agent in agents for each in agent.agent.vehicles.values()]  # type: ignore[union-attr]
 
-    row, col = terrain.grid.row_col(cells("walker")[0])
-    corners = [(row + south, col + east) for south, east in ((-6, -6), (-6, 6), (6, 6), (6, -6))]
-    zone = [(min(max(r, 0), 63), min(max(c, 0), 63)) for r, c in corners]
-    order = ZoneOrder(action="add", name="z", polygon=zone, vehicle_class="walker")
-    simulation.order(3.0, order)
-    simulation.order(3.1, ZoneOrder(action="add", name="y", polygon=zone, vehicle_class="boat"))
-    inside = np.zeros((64, 64), bool)
-    inside[zone[0][0] + 1 : zone[2][0] - 1, zone[0][1] + 1 : zone[2][1] - 1] = True
-    simulation.run_until(4.0)
-    for name, agents in by_class.items():
-        for id in agents:
-            own = simulation.nodes[f"agent-{id}"].service._maps.own.pace_s_per_m  # type: ignore[union-attr]
-            passable = np.isfinite(own[inside])
-            assert not passable.any() if name == "walker" else passable.any()
-    simulation.run_until(20.0)
-    assert not inside.ravel()[cells("walker")].any()
-    assert (laws.lethal, laws.collisions) == ([], [])
-    keeper = next(each.service for id, each in simulation.nodes.items() if id.startswith("keeper"))
-    zones = zones_of(keeper.replica, 0, class_numbers(scenario))  # type: ignore[union-attr]
-    assert [(each.name, each.vehicle_class) for each in zones] == [("z", "walker")]
+def corners_of(zone: Bools) -> Any:
+    rows, cols = np.nonzero(zone)
+    north, south, west, east = rows.min(), rows.max() + 1, cols.min(), cols.max() + 1
+    return [(int(row), int(col)) for row, col in ((north, west), (north, east), (south, east), (south, west))]

@@ -4,6 +4,7 @@ started twice."""
 from __future__ import annotations
 
 import pytest
+from support.simulated import cells
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
@@ -70,14 +71,12 @@ def test_an_agent_that_starts_again_with_another_clock_is_like_any_other(skew_s)
     simulation.run_until(6.1)
     simulation.nodes["agent-a1"].skew_ns = int(skew_s * 1e9)
     simulation.run_until(8)
-    service = simulation.nodes["agent-a1"].service
-    assert isinstance(service, AgentService)
-    before = {id: vehicle.cell for id, vehicle in service.agent.vehicles.items()}
+    before = {id: cell for id, cell in cells(simulation).items() if id.startswith("a1")}
     assert len(before) == 4
     moved: set[str] = set()  # one may be back where it was, after its target was given to another
     while simulation.now_s < 14:
         simulation.run_until(simulation.now_s + 0.5)
-        moved |= {id for id, vehicle in service.agent.vehicles.items() if vehicle.cell != before[id]}
+        moved |= {id for id, cell in before.items() if cells(simulation)[id] != cell}
     assert moved == set(before)
     assert laws.collisions == []
 
@@ -91,9 +90,7 @@ def test_vehicles_that_wait_because_two_of_three_members_are_gone_say_why_and_dr
     notes = [note for _, note in simulation.recorder.notes if note.kind == "waiting"]
     assert [note.id for note in notes] == ["a2"]
     assert "plot 0 has no warden" in notes[0].text
-    service = simulation.nodes["agent-a2"].service
-    assert isinstance(service, AgentService)
-    before = {id: vehicle.cell for id, vehicle in service.agent.vehicles.items()}
+    before = cells(simulation)
     simulation.nodes["agent-a0"].boot()
     simulation.run_until(14)
-    assert any(vehicle.cell != before[id] for id, vehicle in service.agent.vehicles.items())
+    assert any(cells(simulation)[id] != cell for id, cell in before.items())

@@ -5,13 +5,13 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from support.ordered_simulation import OrderedSimulation
+import numpy as np
+from support.simulated import Guest, OrderedSimulation, cells
 
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.worlds import crowd, seeded
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
-from swarm.right_of_way.guest_session import GuestService
 from swarm.right_of_way.incarnations import MemoryLives
 from swarm.wire.messages.orders import ZoneOrder
 from swarm.wire.messages.vehicles import Body, Removed, RemoveVehicles
@@ -20,44 +20,14 @@ from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
 
-class Rover:
-    """Drives about at random on what it is granted, among vehicles that chase targets."""
-
-    def __init__(self, simulation: OrderedSimulation, name: str, lives: MemoryLives, cell: int) -> None:
-        self.simulation = simulation
-        self.grid = simulation.terrain.grid
-        self.pace = simulation.terrain.pace_s_per_m.reshape(-1)
-        self.chance = random.Random(name)
-        self.on: int | None = None
-        self.moves = 0
-        self.warnings: list[str] = []
-        self.bus = simulation.network.bus(name, simulation.scenario.network.namespace, simulation.authenticator)
-        now_ns = simulation.scheduler.clock.now_ns()
-        self.service = GuestService(name, self.grid, now_ns, lives, self.bus, self.hear, self.warnings.append)
-        self.service.start(now_ns)
-        self.service.enter(cell, now_ns)
-
-    def hear(self, event: Event) -> None:
-        self.service.handle(event, self.simulation.scheduler.clock.now_ns())
-
-    def tick(self) -> None:
-        guest = self.service.guest
-        if guest is not None and guest.cells:
-            if len(guest.cells) > 1 and self.chance.random() < 0.5:
-                guest.left(guest.cells[0])
-                self.moves += 1
-            self.on = guest.cells[0]
-            path = list(guest.cells)
-            while len(path) < 5:
-                path.append(self.chance.choice([cell for cell in self.near(path[-1]) if cell not in path[-2:]]))
-            guest.want(path, self.near(self.on))
-        self.service.tick(self.simulation.scheduler.clock.now_ns())
-
-    def near(self, cell: int) -> list[int]:
-        return [other for _, other in self.grid.neighbours(cell) if self.pace[other] < 1e6]
+def guest(simulation: OrderedSimulation, name: str, cell: int, lives: MemoryLives | None = None) -> Guest:
+    open = np.isfinite(simulation.terrain.pace_s_per_m).ravel()
+    found = Guest(simulation, name, cell, random.Random(name), open, lives)
+    found.boot()
+    return found
 
 
-def drive(simulation: OrderedSimulation, rovers: list[Rover], seconds: float) -> None:
+def drive(simulation: OrderedSimulation, rovers: list[Guest], seconds: float) -> None:
     """Drive on, and look that all vehicles are on cells of their own."""
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:
@@ -69,45 +39,41 @@ def drive(simulation: OrderedSimulation, rovers: list[Rover], seconds: float) ->
 
 
 def places(simulation: OrderedSimulation) -> list[int]:
-    agents = [node.service.agent for node in simulation.nodes.values() if isinstance(node.service, AgentService)]
-    return [vehicle.cell for agent in agents for vehicle in agent.vehicles.values()]
+    return list(cells(simulation).values())
 
 
 def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
     simulation = OrderedSimulation(seeded(3))
     simulation.run_until(3)
-    lives = [MemoryLives() for _ in range(3)]
     # Where vehicles stand: they have to leave before it gets in.
-    rovers = [Rover(simulation, f"rover-{n}", lives[n], cell) for n, cell in enumerate(places(simulation)[:3])]
+    rovers = [guest(simulation, f"rover-{n}", cell) for n, cell in enumerate(places(simulation)[:3])]
     drive(simulation, rovers, 12)
     assert all(rover.moves > 5 for rover in rovers)
     assert not any(rover.warnings for rover in rovers)
 
     stands = [rover.on for rover in rovers]
     for rover in rovers:
-        rover.bus.close()  # as a process that dies
+        rover.crash()
     drive(simulation, [], 3)
     assert not set(stands).intersection(places(simulation))
-    rovers = [Rover(simulation, f"rover-{n}", lives[n], on or 0) for n, on in enumerate(stands)]
-    drive(simulation, rovers, 1.0)
-    assert [rover.service.guest is not None and len(rover.service.guest.cells) > 0 for rover in rovers] == [
-        True
-    ] * 3
-    drive(simulation, rovers, 5)
-    assert all(rover.moves > 3 for rover in rovers)
+    moves = [rover.moves for rover in rovers]
+    for rover in rovers:
+        rover.boot()
+    drive(simulation, rovers, 6)
+    assert all(rover.moves > before + 3 for rover, before in zip(rovers, moves, strict=True))
 
     for rover in rovers:
-        rover.service.leave(simulation.scheduler.clock.now_ns())
-        rover.on = None
+        rover.leave()
     drive(simulation, rovers, 1.5)
-    assert all(rover.service.guest is not None and rover.service.guest.gone for rover in rovers)
+    assert all(rover.service and rover.service.guest and rover.service.guest.gone for rover in rovers)
 
 
 def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
     simulation = OrderedSimulation(seeded(3))
     simulation.run_until(2)
-    rover = Rover(simulation, "a0", MemoryLives(), 5)
+    rover = guest(simulation, "a0", 5)
     simulation.run_until(4)
+    assert rover.service is not None
     assert rover.service.guest is None
     assert rover.warnings == ["a0 is an agent of this run's scenario: a guest needs another name"]
 

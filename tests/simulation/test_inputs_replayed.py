@@ -188,35 +188,6 @@ def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.Da
     assert outcome.events == max(event - 1, 0)
 
 
-def test_other_code_is_found_at_the_event_at_which_it_does_something_else(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decide = Agent.decide
-    calls = 0
-
-    def forgets(agent: Agent, now_ns: int) -> list[object]:
-        nonlocal calls
-        calls += 1
-        actions = decide(agent, now_ns)
-        return [] if calls > 30 else list(actions)
-
-    monkeypatch.setattr(Agent, "decide", forgets)
-    first, *_ = replay_run(run, "agent-a1")
-    assert first.outcome is not None
-    difference = first.outcome.difference
-    assert difference is not None
-    assert difference.what == "tick"
-    assert str(difference.recorded).startswith("ask ")
-    assert first.outcome.events == difference.event - 1 > 30
-
-
-def test_an_input_that_is_lost_shows(run: Path, tmp_path: Path) -> None:
-    whole = recorded_of(run, "keeper-0")
-    *_, marks = (each for each in whole if isinstance(each, Handled) and each.kind == "HeardMany")
-    folder = rewritten(run, tmp_path / "lost", "keeper-0", [each for each in whole if each is not marks])
-    assert outcome_of(folder).difference is not None
-
-
 def test_a_recording_that_ends_anywhere_is_replayed_up_to_there(run: Path, tmp_path: Path) -> None:
     source = next(each.path for each in recordings_of(run, "planner-t0") if each.life == 2)
     content = source.read_bytes()

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-from support.ordered_simulation import OrderedSimulation
+from support.simulated import OrderedSimulation
 
 from launch_scripts.commands.status_view import print_status, status_fields, status_of
 from launch_scripts.launcher.tables import live_table

@@ -5,11 +5,12 @@ from __future__ import annotations
 import random
 from typing import Any
 
+import numpy as np
 import pytest
-from support.ordered_simulation import OrderedSimulation
+from support.simulated import OrderedSimulation, agents, cells, vehicles
 
 from launch_scripts.simulation.campaign import nodes_of
-from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
+from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.world.service import TargetsService
@@ -29,19 +30,6 @@ def terrain() -> Terrain:
 
 def simulated(terrain: Terrain, faults: FaultPlan | None = None, seed: int = 1) -> OrderedSimulation:
     return OrderedSimulation(seeded(seed), faults=faults, terrain=terrain)
-
-
-def agents(simulation: OrderedSimulation) -> list[AgentService]:
-    found = [node.service for node in simulation.nodes.values()]
-    return [service for service in found if isinstance(service, AgentService)]
-
-
-def vehicles(simulation: OrderedSimulation) -> dict[str, Any]:
-    return {id: vehicle for each in agents(simulation) for id, vehicle in each.agent.vehicles.items()}
-
-
-def cells(simulation: OrderedSimulation) -> dict[str, int]:
-    return {id: vehicle.cell for id, vehicle in vehicles(simulation).items()}
 
 
 def target_cells(simulation: OrderedSimulation) -> dict[str, int]:
@@ -93,9 +81,7 @@ def test_a_group_chases_what_it_is_told_and_then_again_all(terrain: Terrain) -> 
 def test_an_added_target_is_chased_and_a_removed_one_leaves_nobody_lost(terrain: Terrain) -> None:
     simulation = simulated(terrain)
     laws = LawBook(simulation)
-    (row, col) = divmod(
-        terrain.random_place() if hasattr(terrain, "random_place") else _open(terrain), terrain.grid.cols
-    )
+    row, col = divmod(_open(terrain), terrain.grid.cols)
     simulation.order(4.0, GiveOrder(subject="target", name="x", row=row, col=col, walk="still", new=True))
     simulation.run_until(12.0)
     assert simulation.refused == []
@@ -138,17 +124,15 @@ def test_who_takes_a_zone_for_over_as_its_clock_is_wrong_does_not_say_that_it_ob
     corners: Any = [(5, 5), (5, 20), (20, 20), (20, 5)]
     simulation.order(3.0, ZoneOrder(action="add", name="z", polygon=corners, lasts_s=60.0))
     simulation.run_until(5.0)
-    obey = {each.agent.plan.id: each._obeys(Obey(author="operator.z")) for each in agents(simulation)}
+    obey = {each.agent.plan.id: each._obeys(Obey(author="operator.z")) for each in agents(simulation).values()}
     assert obey == {"a0": False, "a1": True, "a2": True}
     simulation.order(5.0, ZoneOrder(action="remove", name="z"))
     simulation.run_until(7.0)
-    assert all(each._obeys(Obey(author="operator.z")) for each in agents(simulation))
+    assert all(each._obeys(Obey(author="operator.z")) for each in agents(simulation).values())
 
 
 def _open(terrain: Terrain) -> int:
     """A passable cell in the middle of the terrain."""
-    import numpy as np
-
     passable = np.flatnonzero(np.isfinite(terrain.pace_s_per_m))
     return int(passable[len(passable) // 2])
 
@@ -182,51 +166,3 @@ def test_every_process_that_starts_after_an_acknowledged_pause_obeys_it(seed: in
     simulation.order(20.0, RESUME)
     simulation.run_until(26.0)
     assert cells(simulation) != stood
-
-
-def random_orders(seed: int, terrain: Terrain, until_s: float) -> list[tuple[float, GiveOrder | ZoneOrder]]:
-    """Orders of every kind at random times; at the end all that stops vehicles is taken back."""
-    chance = random.Random(f"orders/{seed}")
-    orders: list[tuple[float, GiveOrder | ZoneOrder]] = []
-    for _ in range(12):
-        row, col = chance.randrange(40), chance.randrange(50)
-        corners: Any = [(row, col), (row, col + 6), (row + 5, col + 6), (row + 5, col)]
-        order: GiveOrder | ZoneOrder = chance.choice([
-            PAUSE,
-            RESUME,
-            GiveOrder(subject="vehicle", name=f"a{chance.randrange(3)}-00", off=chance.random() < 0.5),
-            GiveOrder(subject="group", name="all", targets=[chance.choice(["t0", "t1"])]),
-            GiveOrder(subject="target", name="x", cell=_open(terrain), new=True),
-            GiveOrder(subject="target", name=chance.choice(["t0", "x"]), off=True),
-            GiveOrder(subject="target", name="t1", cell=_open(terrain)),
-            GiveOrder(subject="set", name="time_scale", value=chance.choice([1.0, 5.0, 20.0])),
-            ZoneOrder(action="add", name=chance.choice("ab"), polygon=corners),
-            ZoneOrder(action="remove", name=chance.choice("ab")),
-        ])  # fmt: skip
-        orders.append((2.0 + (until_s - 3.0) * chance.random(), order))
-    ends: list[GiveOrder | ZoneOrder] = [
-        RESUME,
-        *(GiveOrder(subject="vehicle", name=f"a{n}-00", off=True) for n in range(3)),
-        GiveOrder(subject="group", name="all", off=True),
-        GiveOrder(subject="set", name="time_scale", off=True),
-        *(ZoneOrder(action="remove", name=name) for name in "ab"),
-    ]
-    return orders + [(until_s, order) for order in ends]
-
-
-@pytest.mark.seeds(3)
-def test_no_law_breaks_whatever_is_ordered_and_whatever_goes_wrong(seed: int, terrain: Terrain) -> None:
-    plan = random_plan(seed, nodes_of(SMALL), 30.0)
-    simulation = simulated(terrain, plan, seed)
-    quiet_s = plan.quiet_s or 18.0
-    for at_s, order in random_orders(seed, terrain, quiet_s + 1.5):
-        simulation.order(at_s, order)
-    trial = LawBook(simulation)
-    assert trial.run(34.0) == []
-    # The agents are dead by now; all others know the same orders, those of the keeper.
-    services: list[Any] = [node.service for node in simulation.nodes.values() if node.service is not None]
-    books = [each._obedience.book for each in services if hasattr(each, "_obedience")]
-    (kept,) = [each._orders.book for each in services if hasattr(each, "_orders")]
-    assert len(books) >= 2
-    assert all(list(book) == list(kept) for book in books)
-    assert len(kept) >= 5

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
+from support.simulated import agents, vehicles
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.simulate import Simulation
@@ -14,7 +16,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.vehicles import VehicleState
-from vehicle_agent.service import AgentService
 
 _SCENARIO = """
 name = "search"
@@ -48,14 +49,12 @@ def test_a_target_that_was_never_seen_is_searched_for_captured_and_searched_for_
     searches = 0
     while simulation.now_s < 240.0 and searches < 2:
         simulation.run_until(simulation.now_s + 1.0)
-        for node in simulation.nodes.values():
-            if isinstance(node.service, AgentService):
-                states.update(vehicle.state for vehicle in node.service.agent.vehicles.values())
-            if isinstance(node.service, PlannerService):
-                target_search = node.service._planner.target_search
-                assert target_search is not None
-                apart |= len(set(target_search.searcher.goals.values())) == 3
-                searches = target_search.searches if simulation.recorder.observed.counts_by("captures_of") else 0
+        states.update(vehicle.state for vehicle in vehicles(simulation).values())
+        planner: Any = simulation.nodes["planner-h"].service
+        if planner is not None:
+            target_search = planner._planner.target_search
+            apart |= len(set(target_search.searcher.goals.values())) == 3
+            searches = target_search.searches if simulation.recorder.observed.counts_by("captures_of") else 0
     assert searches >= 2, "it was not captured, or nobody searched for it after that"
     assert apart, "several vehicles look at one place"
     assert states[VehicleState.SEARCHING] > 10
@@ -70,7 +69,7 @@ def test_a_planner_that_begins_anew_is_told_by_agents_where_its_target_was_last(
         terrain=terrain_of_pace(np.full((60, 60), 0.3, np.float32), 10.0),
     )
     simulation.run_until(7.0)
-    agent = next(node.service for node in simulation.nodes.values() if isinstance(node.service, AgentService))
+    (agent,) = agents(simulation).values()
     now_ns = simulation.scheduler.clock.now_ns()
     seen = Sighted(
         author=agent._author, group=agent.agent.plan.group.name, target="h", seq=1,

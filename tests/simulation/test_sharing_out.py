@@ -7,11 +7,11 @@ from collections import Counter
 
 import msgspec
 import pytest
+from support.simulated import agents, vehicles
 
 from launch_scripts.simulation.simulate import Simulation
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig, VehicleConfig
-from vehicle_agent.service import AgentService
 
 CLUSTERED = Scenario(
     seed=5,
@@ -28,9 +28,8 @@ def run(scenario: Scenario, seconds: float = 6.0) -> tuple[Counter[str | None], 
     simulation = Simulation(scenario, trace=log)
     simulation.run_until(seconds)
     simulation.log.flush()
-    services = [node.service for node in simulation.nodes.values() if isinstance(node.service, AgentService)]
-    assert len(services) == 2
-    return Counter(v.target for each in services for v in each.agent.vehicles.values()), log.getvalue()
+    assert len(agents(simulation)) == 2
+    return Counter(each.target for each in vehicles(simulation).values()), log.getvalue()
 
 
 @pytest.mark.parametrize("pursuers", [1, 2])

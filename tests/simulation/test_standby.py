@@ -180,13 +180,3 @@ def test_a_target_that_nobody_tracks_goes_on_too() -> None:
     assert second._world.leads
     now = second._world._targets["t"].walker.cell
     assert simulation.terrain.grid.distance_cells(was, now) <= 3
-
-
-def test_a_swarm_with_standbys_replays_exactly() -> None:
-    def events(seed: int) -> tuple[int, Any]:
-        plan = FaultPlan(drop=0.05, jitter_ms=5, crashes=(Crash(4, "planner-t1"), Crash(5, "targets-0")))
-        simulation = Simulation(seeded(seed, STANDING_BY), faults=plan)
-        simulation.run_until(9)
-        return simulation.log.deliveries, simulation.report(9)
-
-    assert events(1) == events(1)

@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 import numpy as np
 import pytest
+from support.simulated import agents, cells
 
-from launch_scripts.simulation import simulate as simulate_module
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation, simulate
 from launch_scripts.simulation.worlds import SMALL, seeded
-from swarm.config.load import load_scenario
-from vehicle_agent.agent import Agent
-from vehicle_agent.service import AgentService
 
-SCENARIOS = Path(simulate_module.__file__).parents[1] / "scenarios"
 SECONDS = 24.0
-
-
-def agent_of(simulation: Simulation, name: str) -> Agent:
-    service = simulation.nodes[name].service
-    assert isinstance(service, AgentService)
-    return service.agent
 
 
 def check_all(simulation: Simulation) -> LawBook:
@@ -65,20 +53,14 @@ def test_the_laws_hold_under_seeded_faults(seed):
     assert report["lethal_entries"] == report["payloads_dropped"] == 0
 
 
-def test_nothing_acknowledged_is_lost_though_the_keeper_dies_again_and_again():
-    crashes = tuple(Crash(2 + 1.3 * n, "keeper-0") for n in range(8))
-    plan = FaultPlan(drop=0.05, duplicate=0.05, jitter_ms=10, quiet_s=16, crashes=crashes)
+def test_nothing_acknowledged_is_lost_and_nobody_collides_though_keeper_and_agents_die_again_and_again():
+    keepers = [Crash(2 + 1.3 * n, "keeper-0") for n in range(8)]
+    crashes = (*keepers, *(Crash(3 + 0.9 * n, f"agent-a{n % 3}") for n in range(12)))
+    plan = FaultPlan(drop=0.05, duplicate=0.05, jitter_ms=20, reorder=0.05, quiet_s=16, crashes=crashes)
     simulation = Simulation(seeded(5), faults=plan)
     laws = check_all(simulation)
     assert sum(seq for _, seq in laws.acknowledged.values()) > 10
     assert simulation.nodes["keeper-0"].crashes >= 4
-
-
-def test_agents_that_die_again_and_again_collide_with_nobody():
-    crashes = tuple(Crash(3 + 0.9 * n, f"agent-a{n % 3}") for n in range(12))
-    plan = FaultPlan(drop=0.05, jitter_ms=20, reorder=0.05, quiet_s=16, crashes=crashes)
-    simulation = Simulation(seeded(6), faults=plan)
-    check_all(simulation)
 
 
 def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
@@ -86,7 +68,7 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     simulation = Simulation(seeded(2), faults=plan)
     laws = LawBook(simulation)
     simulation.run_until(4)
-    agent = agent_of(simulation, "agent-a1")
+    agent = agents(simulation)["agent-a1"].agent
     simulation.run_until(4.2)  # what was on its way before the cut may still be granted
     held = {id: list(agent.holdings.path(id)) for id in agent.vehicles}
     simulation.run_until(12)
@@ -101,11 +83,11 @@ def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_v
     simulation = Simulation(seeded(1), faults=plan)
     laws = LawBook(simulation)
     simulation.run_until(8.9)
-    stood = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
+    stood = {id: cell for id, cell in cells(simulation).items() if id.startswith("a1")}
     simulation.run_until(12)
-    assert agent_of(simulation, "agent-a1").vehicles == {}
+    assert agents(simulation)["agent-a1"].agent.vehicles == {}
     simulation.run_until(13)
-    back = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
+    back = {id: cell for id, cell in cells(simulation).items() if id.startswith("a1")}
     assert back.keys() == stood.keys()
     assert max(simulation.terrain.grid.distance_cells(cell, stood[id]) for id, cell in back.items()) <= 8
     simulation.run_until(20)
@@ -139,18 +121,3 @@ def test_targets_that_evade_jump_or_stand_still_are_caught():
     assert result.report["captures"] > 0
     assert result.report["collisions"] == result.report["lethal_entries"] == 0
     assert result.report["targets"] == 4
-
-
-@pytest.mark.slow
-def test_the_demo_on_real_terrain_routes_everybody_and_captures():
-    scenario = load_scenario(SCENARIOS / "jacksboro.toml")
-    simulation = Simulation(scenario)
-    laws = LawBook(simulation)
-    simulation.run_until(10)
-    simulation.finish()
-    report = simulation.report(10)
-    assert report["vehicles_routed"] == report["vehicles"] == 100
-    assert report["captures"] > 0
-    assert report["marks"] > 0
-    assert report["collisions"] == report["lethal_entries"] == report["lost"] == 0
-    assert laws.collisions == laws.lethal == []

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from support.ordered_simulation import OrderedSimulation
+from support.simulated import Guest, OrderedSimulation, cells
 
 from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Partition, random_plan
@@ -17,12 +17,9 @@ from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.worlds import SMALL, crowd, seeded
 from shared_map.terrain.terrain import build_terrain
-from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.agents import added_agent
 from swarm.config.scenario import RoverConfig
-from swarm.right_of_way.guest_session import GuestService
-from swarm.right_of_way.incarnations import MemoryLives
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 from swarm.wire.messages.vehicles import Body, RemoveVehicles
 from swarm.wire.topics import BODY, LEAVE
@@ -36,76 +33,25 @@ _ROVERS = (
 )
 
 
-class Robot:
-    """A guest that drives at random on what it is granted, and is a body too, as in `swarm.client`."""
+class Robot(Guest):
+    """A guest that is a body too, as in `swarm.client`."""
 
-    def __init__(self, world: Interplay, name: str, cell: int) -> None:
-        self.world, self.name, self.cell = world, name, cell
-        self.lives = MemoryLives()
-        self.on: int | None = None
-        self.moves = self.seq = 0
-        self.service: GuestService | None = None
-        self.bus: Any = None
-        self.incarnation = 0
-        self.warnings: list[str] = []
+    def __init__(self, world: Interplay, name: str) -> None:
+        super().__init__(world.simulation, name, world.chance.choice(world.free), world.chance, world.open)
+        self.world = world
+        self.incarnation = self.seq = 0
 
     def boot(self) -> None:
-        if self.service is not None or self.world.guests_over:
-            return
-        simulation = self.world.simulation
-        self.bus = simulation.network.bus(
-            self.name, simulation.scenario.network.namespace, simulation.authenticator
-        )
-        self.incarnation = now_ns = self.world.now_ns
-        self.service = GuestService(
-            self.name, self.world.grid, now_ns, self.lives, self.bus, self.hear, self.warnings.append
-        )
-        self.service.start(now_ns)
-        self.service.enter(self.cell if self.on is None else self.on, now_ns)
+        if not self.world.guests_over:
+            self.incarnation = self.incarnation if self.service is not None else self.now_ns
+            super().boot()
 
-    def hear(self, event: Event) -> None:
-        if self.service is not None:
-            self.service.handle(event, self.world.now_ns)
-
-    def crash(self) -> None:
-        if self.service is not None:
-            self.bus.close()
-            self.service = None
-
-    def leave(self) -> None:
-        if self.service is not None:
-            self.service.leave(self.world.now_ns)
-            self.on = None
-
-    def tick(self) -> None:
-        if self.service is None:
-            return
-        guest, chance = self.service.guest, self.world.chance
-        if guest is not None and guest.cells:
-            if len(guest.cells) > 1 and chance.random() < 0.5:
-                guest.left(guest.cells[0])
-                self.moves += 1
-            self.on = self.cell = guest.cells[0]
-            path = list(guest.cells)
-            while len(path) < 4:
-                near = [cell for cell in self.near(path[-1]) if cell not in path[-2:]]
-                if not near:
-                    break
-                path.append(chance.choice(near))
-            guest.want(path, self.near(self.on))
-            self.tell()
-        self.service.tick(self.world.now_ns)
-
-    def tell(self) -> None:
-        assert self.on is not None
+    def stands(self, cell: int) -> None:
         self.seq += 1
-        x_m, y_m = self.world.middle(self.on)
-        half_m = self.world.grid.resolution_m / 2
+        x_m, y_m = self.grid.centre_m(cell)
+        half_m = self.grid.resolution_m / 2
         report = Body(id=self.name, incarnation=self.incarnation, seq=self.seq, x_m=x_m, y_m=y_m, radius_m=half_m)
         self.bus.publish(BODY, report, id=self.name)
-
-    def near(self, cell: int) -> list[int]:
-        return [other for _, other in self.world.grid.neighbours(cell) if self.world.open[other]]
 
 
 class Walker:
@@ -119,7 +65,7 @@ class Walker:
         self.kind = chance.choice(("stands", "walks", "onto", "leaps", "huge", "twins"))
         self.radius_m = {"huge": 100.0}.get(self.kind, chance.choice((0.5, 3.0, 8.0)))
         self.lease_s = chance.choice((0.3, 1.0, 10.0))
-        self.x_m, self.y_m = world.middle(chance.choice(world.free))
+        self.x_m, self.y_m = world.grid.centre_m(chance.choice(world.free))
         self.heading = chance.uniform(0.0, math.tau)
         self.speed = chance.choice((0.5, 2.0, 5.0)) if self.kind == "walks" else 0.0
         if self.kind == "huge":
@@ -139,11 +85,10 @@ class Walker:
                 self.x_m += 2 * math.sin(self.heading) * self.speed * TICK_S
                 self.y_m += 2 * math.cos(self.heading) * self.speed * TICK_S
         elif self.kind == "onto" and chance.random() < 0.02:  # it is put onto a vehicle, stopped or not
-            cells = world.vehicle_cells()
-            if cells:
-                self.x_m, self.y_m = world.middle(chance.choice(cells))
+            if on := list(cells(world.simulation).values()):
+                self.x_m, self.y_m = world.grid.centre_m(chance.choice(on))
         elif self.kind == "leaps" and chance.random() < 0.05:
-            self.x_m, self.y_m = world.middle(chance.choice(world.free))
+            self.x_m, self.y_m = world.grid.centre_m(chance.choice(world.free))
         self.seq += 1
         twin = 1 if self.kind == "twins" and self.seq % 2 else 0
         report = Body(
@@ -198,7 +143,7 @@ class Interplay:
         simulation.after_tick.append(self._forget_removed)
         self.trial = LawBook(simulation)
         simulation.after_tick.append(self._look)
-        self.robots = [Robot(self, f"robot-{n}", chance.choice(self.free)) for n in range(2)]
+        self.robots = [Robot(self, f"robot-{n}") for n in range(2)]
         self.walkers: list[Walker] = []
         self._operator = self.bus("operator")
         self.calls: list[tuple[float, Any]] = []
@@ -213,18 +158,6 @@ class Interplay:
     def bus(self, name: str) -> Any:
         simulation = self.simulation
         return simulation.network.bus(name, simulation.scenario.network.namespace, simulation.authenticator)
-
-    def middle(self, cell: int) -> tuple[float, float]:
-        row, col = divmod(cell, self.grid.cols)
-        side_m = self.grid.resolution_m
-        return self.grid.west_m + (col + 0.5) * side_m, self.grid.north_m - (row + 0.5) * side_m
-
-    def agents(self) -> dict[str, AgentService]:
-        nodes = self.simulation.nodes.values()
-        return {node.name: node.service for node in nodes if isinstance(node.service, AgentService)}
-
-    def vehicle_cells(self) -> list[int]:
-        return [v.cell for each in self.agents().values() for v in each.agent.vehicles.values()]
 
     # --- what happens -----------------------------------------------------------------------------------------
 
@@ -289,7 +222,7 @@ class Interplay:
     def _flood(self) -> None:
         bus = self.bus("flood")
         for n in range(400):
-            x_m, y_m = self.middle(self.chance.choice(self.free))
+            x_m, y_m = self.grid.centre_m(self.chance.choice(self.free))
             wrong = self.chance.random()
             report = Body(
                 id=f"flood-{n}",
@@ -316,7 +249,7 @@ class Interplay:
     def _order(self) -> None:
         chance, simulation = self.chance, self.simulation
         cell = chance.choice(self.free)
-        around = [robot.on for robot in self.robots if robot.on is not None] + self.vehicle_cells()
+        around = [robot.on for robot in self.robots if robot.on is not None] + list(cells(simulation).values())
         if around and chance.random() < 0.6:
             middle = chance.choice(around)
         elif self.walkers and chance.random() < 0.5:

@@ -1,0 +1,175 @@
+"""What tests of whole swarms look at and do: agents and vehicles, orders, agents that join, guests."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from launch_scripts.process_table import planner_spec, spec_of
+from launch_scripts.simulation.faults import OBSERVER
+from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulate import Simulation
+from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.clock import NS_PER_S
+from swarm.config.agents import AddedAgent
+from swarm.config.scenario import Scenario
+from swarm.liveness import ranked_id
+from swarm.right_of_way.guest_session import GuestService
+from swarm.right_of_way.incarnations import MemoryLives
+from swarm.runtime.order_book import OrderBook
+from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
+from swarm.wire.topics import GIVE_ORDER, ZONES
+from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.service import AgentService
+
+
+def agents(simulation: Simulation) -> dict[str, AgentService]:
+    """Node -> its service, of the agents that run."""
+    services = {name: node.service for name, node in simulation.nodes.items()}
+    return {name: service for name, service in services.items() if isinstance(service, AgentService)}
+
+
+def vehicles(simulation: Simulation, vehicle_class: str | None = None) -> dict[str, Vehicle]:
+    """Vehicles by id, of all classes or of one."""
+    hosts = [service.agent for service in agents(simulation).values()]
+    some = [agent for agent in hosts if vehicle_class in (None, agent.plan.group.vehicle_class)]
+    return {id: vehicle for agent in some for id, vehicle in agent.vehicles.items()}
+
+
+def cells(simulation: Simulation, vehicle_class: str | None = None) -> dict[str, int]:
+    return {id: vehicle.cell for id, vehicle in vehicles(simulation, vehicle_class).items()}
+
+
+class OrderedSimulation(Simulation):
+    """A simulation with an operator and a launcher.
+
+    book     what was ordered and a keeper acknowledged
+    refused  what was not acknowledged: (when, order, why)
+    """
+
+    def __init__(self, scenario: Scenario, **options: Any) -> None:
+        super().__init__(scenario, **options)
+        self.book = OrderBook()
+        self.refused: list[tuple[float, GiveOrder | ZoneOrder, str | None]] = []
+        self._operator = self.network.bus(OBSERVER, scenario.network.namespace)
+        self._orders_given = 0
+
+    def add(self, added: AddedAgent) -> Node:
+        """Let an agent join that is not in the scenario."""
+        node = self.node(spec_of("agent", added.plan.id), added=added)
+        node.boot()
+        return node
+
+    def order(self, at_s: float, order: GiveOrder | ZoneOrder) -> None:
+        """An operator gives an order then. A target that is added gets a planner, as a launcher would start it."""
+        self.at(at_s, partial(self.give, order))
+
+    def give(self, order: GiveOrder | ZoneOrder) -> None:
+        """An operator gives an order now."""
+        self._orders_given += 1
+
+        def post(event: Event) -> None:
+            match event:
+                case Replied(message=Orders(given=Order() as given)):
+                    self.book.merge([given], self.scheduler.clock.now_ns())
+                    self._start_planners()
+                case AskEnded(replies=0, failure=failure):
+                    self.refused.append((self.now_s, order, failure))
+
+        topic = ZONES if isinstance(order, ZoneOrder) else GIVE_ORDER
+        self._operator.ask(topic, order, post, tag=f"order-{self._orders_given}", timeout_s=1.0, keeper="0")
+
+    def _start_planners(self) -> None:
+        """As a launcher does: a planner for each target, and none for one that was removed."""
+        targets, ranks = self.book.targets(self.scenario), range(self.scenario.standbys.planner + 1)
+        wanted = {ranked_id(id, rank) for id in targets for rank in ranks}
+        there = {node.spec.id: node for node in self.nodes.values() if node.spec.role == "planner"}
+        for id in sorted(wanted - there.keys()):
+            self.scheduler.after(NS_PER_S // 2, self.node(planner_spec(id)).boot)
+        for id in sorted(there.keys() - wanted):
+            node = self.nodes.pop(there[id].name)
+            node.crash()
+            node.retired = True
+
+
+class Guest:
+    """A guest that drives at random on what it is granted, among vehicles that chase targets.
+
+    open  whether each cell may be entered
+    on    where it is; None until it is granted a cell, and once it has left
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        name: str,
+        cell: int,
+        chance: random.Random,
+        open: Sequence[bool],
+        lives: MemoryLives | None = None,
+    ) -> None:
+        self.simulation, self.name, self.cell, self.chance, self.open = simulation, name, cell, chance, open
+        self.grid = simulation.terrain.grid
+        self.lives = lives or MemoryLives()
+        self.on: int | None = None
+        self.moves = 0
+        self.warnings: list[str] = []
+        self.service: GuestService | None = None
+        self.bus: Any = None
+
+    @property
+    def now_ns(self) -> int:
+        return self.simulation.scheduler.clock.now_ns()
+
+    def boot(self) -> None:
+        if self.service is not None:
+            return
+        simulation, now_ns = self.simulation, self.now_ns
+        namespace = simulation.scenario.network.namespace
+        self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
+        self.service = GuestService(
+            self.name, self.grid, now_ns, self.lives, self.bus, self.hear, self.warnings.append
+        )
+        self.service.start(now_ns)
+        self.service.enter(self.cell if self.on is None else self.on, now_ns)
+
+    def hear(self, event: Event) -> None:
+        if self.service is not None:
+            self.service.handle(event, self.now_ns)
+
+    def crash(self) -> None:
+        if self.service is not None:
+            self.bus.close()
+            self.service = None
+
+    def leave(self) -> None:
+        if self.service is not None:
+            self.service.leave(self.now_ns)
+            self.on = None
+
+    def tick(self) -> None:
+        if self.service is None:
+            return
+        guest, chance = self.service.guest, self.chance
+        if guest is not None and guest.cells:
+            if len(guest.cells) > 1 and chance.random() < 0.5:
+                guest.left(guest.cells[0])
+                self.moves += 1
+            self.on = self.cell = guest.cells[0]
+            path = list(guest.cells)
+            while len(path) < 4:
+                near = [cell for cell in self.near(path[-1]) if cell not in path[-2:]]
+                if not near:
+                    break
+                path.append(chance.choice(near))
+            guest.want(path, self.near(self.on))
+            self.stands(self.on)
+        self.service.tick(self.now_ns)
+
+    def stands(self, cell: int) -> None:
+        """Called in every tick in which it is on a cell."""
+
+    def near(self, cell: int) -> list[int]:
+        return [other for _, other in self.grid.neighbours(cell) if self.open[other]]
