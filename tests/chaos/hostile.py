@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections import deque
-from collections.abc import Collection
 from typing import Any
 
 import msgpack
@@ -22,28 +21,16 @@ _BIG = (1 << 61) + 12345
 _KEPT = 32
 """Payloads kept of each key: a replay may be seconds old."""
 _KEYS = 5000
+_PUBLISHED = tuple(topic for topic in TOPICS if topic.published)
 
 
 class Hostile:
-    """Makes hostile messages.
+    """Makes hostile messages."""
 
-    spared  names of topics whose keys get none
-    """
-
-    def __init__(
-        self,
-        namespace: str,
-        fuzzer: MessageFuzzer,
-        seed: int,
-        kinds: Collection[str] = KINDS,
-        spared: Collection[str] = (),
-    ) -> None:
+    def __init__(self, namespace: str, fuzzer: MessageFuzzer, seed: int) -> None:
         self._namespace = namespace
         self._fuzzer = fuzzer
-        self._kinds = [kind for kind in KINDS if kind in kinds]
         self._chance = random.Random(f"hostile/{seed}")
-        self._spared = [topic for topic in TOPICS if topic.name in spared]
-        self._topics = [topic for topic in TOPICS if topic.published and topic.name not in spared]
         self._heard: dict[str, deque[tuple[bytes, bytes | None]]] = {}
         """Key -> what was said under it lately, each with its code."""
         self._keys: list[str] = []
@@ -52,7 +39,7 @@ class Hostile:
         """Keep a genuine message as material. `code` came with it, and proves who said it."""
         kept = self._heard.get(key)
         if kept is None:
-            if len(self._keys) >= _KEYS or any(topic.parse(self._namespace, key) for topic in self._spared):
+            if len(self._keys) >= _KEYS:
                 return
             kept = self._heard[key] = deque(maxlen=_KEPT)
             self._keys.append(key)
@@ -61,16 +48,12 @@ class Hostile:
     def next(self) -> tuple[str, str, bytes, bytes | None]:
         """Kind, key, payload and code of one message. A thief has the codes of what he heard, and no other."""
         chance = self._chance
-        kind = chance.choice(self._kinds)
+        kind = chance.choice(KINDS)
         if kind == "lies" or not self._keys:
-            topic = chance.choice(self._topics)
+            topic = chance.choice(_PUBLISHED)
             message = self._fuzzer.message(topic.message)
-            return (
-                "lies",
-                topic.keyed(self._namespace, **self._fuzzer.fields(topic, message)),
-                encode(message),
-                None,
-            )
+            key = topic.keyed(self._namespace, **self._fuzzer.fields(topic, message))
+            return "lies", key, encode(message), None
         key = chance.choice(self._keys)
         payload, code = chance.choice(self._heard[key])
         if kind == "flipped":

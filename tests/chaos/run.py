@@ -20,7 +20,7 @@ from support.up_process import UpProcess
 
 from chaos.attacker import Attacker
 from chaos.fault_schedule import FAULTS, Fault, faults
-from chaos.hostile import KINDS, Hostile
+from chaos.hostile import Hostile
 from chaos.results import Ended, Outcome, Recovery, Results, Sample, name_of
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
 from launch_scripts.launcher.takeover import has_ended, processes
@@ -34,7 +34,7 @@ from swarm.config.classes import aloft_classes
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError, ProtocolError, StoreError
 from swarm.wire.codec import decode
-from swarm.wire.topics import FLEET, TOPICS
+from swarm.wire.topics import FLEET
 
 _UP_WITHIN_S = 180.0
 _SETTLE_S = 5.0
@@ -60,8 +60,6 @@ class Options:
     messages  the run ends with so many hostile messages; None: with the seconds
     every_s   from one fault to the next, at least
     kinds     which faults
-    hostile   which hostile messages
-    spared    topics under which nothing hostile is said
     within_s  a fault from which the swarm recovers later breaks a law
     """
 
@@ -71,8 +69,6 @@ class Options:
     seed: int
     every_s: float
     kinds: tuple[str, ...]
-    hostile: tuple[str, ...]
-    spared: tuple[str, ...]
     within_s: float
     runs: Path
 
@@ -88,13 +84,6 @@ def chaos(
     ] = None,
     blow: Annotated[
         list[str] | None, typer.Option(help="Only this: kill, hang or messages; may be given several times.")
-    ] = None,
-    hostile: Annotated[
-        list[str] | None,
-        typer.Option(help="Only these messages: flipped, numbers, replayed or lies; may be given several times."),
-    ] = None,
-    spare: Annotated[
-        list[str] | None, typer.Option(help="Say nothing hostile under this topic; may be given several times.")
     ] = None,
     every: Annotated[float, typer.Option(min=1, help="Seconds from one blow to the next, at least.")] = 10.0,
     within: Annotated[
@@ -115,15 +104,16 @@ def chaos(
     code 1 if a process ended by itself, vehicles did not recover in time or met, or memory grew. Leaves chaos.json
     in the run's folder.
     """
+    for each in blow or ():
+        if each not in FAULTS:
+            raise ConfigError(f"--blow: no {each!r}; there are {', '.join(FAULTS)}")
     options = Options(
         scenario=scenario,
         seconds=60.0 if seconds is None and messages is None else seconds,
         messages=messages,
         seed=seed,
         every_s=every,
-        kinds=_known("--blow", blow, FAULTS),
-        hostile=_known("--hostile", hostile, KINDS),
-        spared=_known("--spare", spare, tuple(topic.name for topic in TOPICS)) if spare else (),
+        kinds=tuple(blow or FAULTS),
         within_s=within,
         runs=runs,
     )
@@ -146,14 +136,6 @@ def chaos(
     return {**report, "interrupted": interrupted, "shown": shown, "notes": notes}
 
 
-def _known(option: str, given: list[str] | None, known: tuple[str, ...]) -> tuple[str, ...]:
-    """What an option that may be given several times names; all if it is not given. Raises ConfigError."""
-    for each in given or ():
-        if each not in known:
-            raise ConfigError(f"{option}: no {each!r}; there are {', '.join(known)}")
-    return tuple(given or known)
-
-
 class ChaosRun:
     """One run, whose `results` say what it came to. It leaves no process behind, whatever happens."""
 
@@ -172,7 +154,7 @@ class ChaosRun:
         classes = [each.name for each in scenario.classes]
         fuzzer = MessageFuzzer(terrain.grid, options.seed, tuple(dict.fromkeys(names)), classes)
         namespace = scenario.network.namespace
-        self._hostile = Hostile(namespace, fuzzer, options.seed, options.hostile, options.spared)
+        self._hostile = Hostile(namespace, fuzzer, options.seed)
         self.run_dir = make_run_dir(options.runs, f"chaos-{time.strftime('%Y%m%d-%H%M%S')}-{options.seed}")
         self.results = Results(scenario=options.scenario, seed=options.seed, within_s=options.within_s)
         self._began_s = time.monotonic()

@@ -69,14 +69,3 @@ def test_nobody_stays_where_a_captured_target_was_that_nobody_sees_while_it_may_
     captures = simulation.recorder.observed.counts_by("captures_of")
     assert found_empty.intersection(captures), "no hidden target was captured and left unseen: nothing is tried"
     assert longest_s < _STAYS_S
-
-
-def test_whoever_may_chase_no_other_target_searches_for_it() -> None:
-    text = _SCENARIO.replace('[[targets]]\nname = "t"\ncount = 1\nspeed_m_per_s = 1\n', "").replace("= 2", "= 1", 1)
-    simulation = Simulation(parse_scenario(text), terrain=terrain_of_pace(np.full((40, 40), 0.3, np.float32), 10.0))
-    states: set[str] = set()
-    while simulation.now_s < 30.0 and "searching" not in states:
-        simulation.run_until(simulation.now_s + 1.0)
-        state = simulation.recorder.summary(simulation.scheduler.clock.now_ns())
-        states = {name for name, number in state.states.items() if number}
-    assert "searching" in states

@@ -257,25 +257,23 @@ class BodyReferee:
             return
         if body.radius_m > MOST_RADIUS_M or body.speed_m_per_s > MOST_M_PER_S:
             return
-        began_ns = min(now_ns, record.until_ns)
-        fresh = now_ns < record.until_ns and body.lease_s > 0.0
-        before = record.covers if fresh else {}
-        closed_before = record.closed_ns if fresh else {}
-        record.seq, record.until_ns = body.seq, now_ns + int(body.lease_s * NS_PER_S)
-        covered = capsule_of(body, self._grid, 0.0).cells(self._grid) if body.lease_s > 0.0 else []
-        closed = capsule_of(body, self._grid, body.speed_m_per_s * REACTION_S).cells(self._grid) if covered else []
-        record.closed_ns = {cell: closed_before.get(cell, now_ns) for cell in closed}
-        ended, record.covers = record.covers, {}
-        for cell in covered:
-            cover = before.get(cell)
-            if cover is None:
-                cover = _Cover(body.id, now_ns, record.closed_ns.get(cell, now_ns), 0)
-                self._covers.setdefault(cell, []).append(cover)
-            cover.end_ns = record.until_ns
-            record.covers[cell] = cover
-        for cell, cover in ended.items():
-            if record.covers.get(cell) is not cover:
-                cover.end_ns = began_ns
+        goes_on = now_ns < record.until_ns and body.lease_s > 0.0
+        left, record.covers = record.covers, {}
+        closed_before, record.closed_ns = record.closed_ns if goes_on else {}, {}
+        left_ns, record.until_ns = min(now_ns, record.until_ns), now_ns + int(body.lease_s * NS_PER_S)
+        record.seq = body.seq
+        if body.lease_s > 0.0:
+            closed = capsule_of(body, self._grid, body.speed_m_per_s * REACTION_S).cells(self._grid)
+            record.closed_ns = {cell: closed_before.get(cell, now_ns) for cell in closed}
+            for cell in capsule_of(body, self._grid, 0.0).cells(self._grid):
+                cover = left.pop(cell, None) if goes_on else None
+                if cover is None:
+                    cover = _Cover(body.id, now_ns, record.closed_ns.get(cell, now_ns), 0)
+                    self._covers.setdefault(cell, []).append(cover)
+                cover.end_ns = record.until_ns
+                record.covers[cell] = cover
+        for cover in left.values():
+            cover.end_ns = left_ns
         if not 0 <= now_ns - self._swept_ns < NS_PER_S:
             self._sweep(now_ns)
 

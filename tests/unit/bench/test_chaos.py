@@ -47,8 +47,8 @@ def test_there_is_a_message_of_every_type_and_it_passes_the_door(kind: type[Mess
         assert decode(encode(made), kind) == made
 
 
-def hostile(seed: int = 1, **options: object) -> Hostile:
-    made = Hostile("swarm", MessageFuzzer(GridSpec(40, 40, 10.0), seed), seed, **options)  # type: ignore[arg-type]
+def hostile(seed: int = 1) -> Hostile:
+    made = Hostile("swarm", MessageFuzzer(GridSpec(40, 40, 10.0), seed), seed)
     fuzzer = MessageFuzzer(GridSpec(40, 40, 10.0), 9)
     for _ in range(50):
         pose = fuzzer.message(POSE.message)
@@ -63,16 +63,10 @@ def test_hostile_messages_are_of_all_kinds_and_the_same_for_the_same_seed() -> N
     assert all(key.startswith("swarm/") for _, key, *_ in one)
 
 
-def test_nothing_hostile_is_said_under_a_topic_that_is_spared() -> None:
-    made = hostile(spared=("pose", "true-pose"))
-    keys = [made.next()[1] for _ in range(300)]
-    assert not any(POSE.parse("swarm", key) for key in keys)
-
-
 def test_a_replay_is_byte_for_byte_what_was_said() -> None:
-    made = Hostile("swarm", MessageFuzzer(GridSpec(2, 5, 10.0), 1), 1, ["replayed"])
+    made = Hostile("swarm", MessageFuzzer(GridSpec(2, 5, 10.0), 1), 1)
     made.heard("swarm/x", b"said", b"code")
-    assert made.next() == ("replayed", "swarm/x", b"said", b"code")
+    assert ("replayed", "swarm/x", b"said", b"code") in [made.next() for _ in range(20)]
 
 
 def test_recovery_counts_from_when_the_fault_is_over_and_takes_the_last_vehicle() -> None:

@@ -13,18 +13,13 @@ import msgspec
 import pytest
 
 from docs.generate import scenario_page, wire_page
-from docs.generate.__main__ import PAGES, command_line
+from docs.generate.__main__ import command_line
 from launch_scripts import cli
 from launch_scripts.command_line.declaring import Family
 from swarm.config.scenario import Scenario
 from swarm.wire.topics import TOPICS
 
 ROOT = Path(__file__).parents[3]
-
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
-def test_the_page_is_current(path):
-    assert path.read_text(encoding="utf-8") == PAGES[path]() + "\n", "run `python -m docs.generate`"
 
 
 class Explained(msgspec.Struct):
