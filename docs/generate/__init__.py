@@ -1,10 +1,10 @@
 """The generated part of the documentation, which is always what the code says.
 
-    python -m docs.generate [--check]                         the reference: pages, JSON schema, lock of the wire
+    python -m docs.generate [--check]                         the reference: its pages and the JSON schema
     python -m docs.generate.method_pictures [NAME ...]        the pictures of docs/method.md
     python -m docs.generate.route_pictures [NAME ...]         those of docs/pulled.md and docs/air.md
 
 A page is a template in `templates/`, which holds its prose; declarations fill its tables. A key, message, command
-or option which the code has is on its page, with the words of its docstring. The lock refuses a change of the wire
-that the build before could not read. `site` is what MkDocs loads: pages of the Python API, and the decisions.
+or option which the code has is on its page, with the words of its docstring. `site` is what MkDocs loads: pages of
+the Python API, and the decisions.
 """

@@ -1,10 +1,14 @@
 """The lock of the wire: every key and message as it was written last, so that no change breaks the rules of
-versions unnoticed (decision 87)."""
+versions unnoticed (decision 87).
+
+    PYTHONPATH=.:tests python -m support.wire_lock       writes it, unless a change breaks a rule
+"""
 
 from __future__ import annotations
 
 import enum
 import json
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -63,12 +67,12 @@ def _layout(struct: type[msgspec.Struct]) -> str:
 
 def document() -> str:
     """The lock as text: a topic a line, a field a line, so that a change shows where it is."""
-    return json.dumps(lock(), indent=1)
+    return json.dumps(lock(), indent=1) + "\n"
 
 
 def faults() -> list[str]:
     """What breaks the rules since the lock was written last, a sentence each."""
-    return list(broken(json.loads(PATH.read_text(encoding="utf-8")), lock())) if PATH.is_file() else []
+    return list(broken(json.loads(PATH.read_text(encoding="utf-8")), lock()))
 
 
 def broken(before: Lock, now: Lock) -> Iterator[str]:
@@ -123,3 +127,9 @@ def _changed(before: Lock, now: Lock) -> Iterator[str]:
             is_now = now[what].get(part)
             if is_now != was and (what == "values" or is_now is not None):
                 yield f"{part} was {json.dumps(was)} and is {json.dumps(is_now)}"
+
+
+if __name__ == "__main__":
+    if found := faults():
+        sys.exit("\n".join(found))
+    PATH.write_text(document(), encoding="utf-8")
