@@ -207,10 +207,11 @@ class LawBook:
     def _bodies_entered(self, life: _Life, vehicle: Vehicle, ticked_ns: int) -> Iterator[BrokenLaw]:
         """The bodies onto which a vehicle has driven since the last tick of its agent."""
         now_ns, now_s = self.simulation.scheduler.clock.now_ns(), self.simulation.now_s
-        grid = self.simulation.terrain.grid
+        grid, middle = self.simulation.terrain.grid, self.simulation.terrain.grid.centre_m(vehicle.cell)
         for body, at_ns in life.reports.values():
             lasts = at_ns <= ticked_ns and now_ns < at_ns + body.lease_s * NS_PER_S
-            if lasts and vehicle.cell in capsule_of(body, grid, 0.0).cells(grid):
+            near = math.dist(middle, (body.x_m, body.y_m)) <= body.radius_m + grid.resolution_m
+            if lasts and near and vehicle.cell in capsule_of(body, grid, 0.0).cells(grid):
                 text = f"driven into body {body.id} at {now_s:.2f} s: {vehicle.id} on cell {vehicle.cell}"
                 yield BrokenLaw("bodies are avoided", text, now_s)
 

@@ -12,10 +12,11 @@ import pytest
 from launch_scripts.commands.simulation_commands import simulate_seeds
 from launch_scripts.simulation.campaign import MIX, Verdict, parse_seeds, run_seeds, try_seed, world_of
 from launch_scripts.simulation.faults import FaultPlan
-from launch_scripts.simulation.laws import BrokenLaw, LawBook
+from launch_scripts.simulation.laws import LONGEST_WAIT_S, BrokenLaw, LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
 from swarm.errors import ConfigError
+from vehicle_agent.traffic.steering import Steering
 
 
 def same(verdict: Verdict) -> Verdict:
@@ -77,6 +78,18 @@ def test_each_law_has_its_sentence():
         assert re.fullmatch(sentence, str(broken[law]))
     assert broken["acknowledged marks stay"].at_s is None
     assert broken["no wait without a reason"].at_s == 12.0
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_a_wait_counts_as_long_as_every_process_works(works: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Steering, "closed", lambda self, cell: True)
+    simulation = Simulation(seeded(1))
+    book = LawBook(simulation)
+    simulation.run_until(2)
+    if not works:
+        simulation.nodes["keeper-0"].crash()
+    simulation.run_until(14)
+    assert (book.longest_s > LONGEST_WAIT_S) == works
 
 
 def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
