@@ -97,16 +97,6 @@ def test_vehicles_are_pushed_routes_by_a_standby_as_soon_as_it_leads() -> None:
     assert all(each.route is not None for each in standby._planner.followers.all() if not each.stale)
 
 
-def test_a_planner_that_comes_back_stands_by_first_and_leads_again_without_a_gap() -> None:
-    simulation = Simulation(seeded(5, STANDING_BY), faults=FaultPlan(crashes=(Crash(8, "planner-t0"),)))
-    asker = Asker(simulation, 16)
-    simulation.run_until(9.5)
-    assert leaders(simulation, "t0") == ["planner-t0.r1"]
-    simulation.run_until(16)
-    assert leaders(simulation, "t0") == ["planner-t0"]
-    assert asker.longest_gap_s("t0", 9.5, 16) <= 2 * ASK_S
-
-
 def test_both_sides_of_a_cut_are_planned_for_and_one_planner_leads_when_it_heals() -> None:
     plan = FaultPlan(partitions=(Partition(8, 14, ("planner-t0.r1", "agent-a0")),))
     simulation = Simulation(seeded(2, STANDING_BY), faults=plan)

@@ -251,18 +251,6 @@ def test_a_second_tracker_is_refused_by_everybody_until_the_first_is_dead(seed: 
     assert report["poses_refused"] > 30
 
 
-def test_a_handover_is_at_once_and_nobody_is_lost() -> None:
-    simulation = Simulation(seeded(2, EXTERNAL))
-    OutsideTracker(simulation, "m", 20, 3, 10, hands_over=True)
-    OutsideTracker(simulation, "a", 22, 6, 20)
-    simulation.run_until(9.5)
-    assert owners(simulation) == {"m"}
-    simulation.run_until(10.3)
-    assert owners(simulation) == {"a"}
-    simulation.run_until(12)
-    assert kinds(simulation) == ["tracker-refused", "tracker-changed"]
-
-
 def test_a_receiver_that_starts_while_two_trackers_tell_follows_the_same_as_all_others() -> None:
     crashes = tuple(Crash(8 + n, node) for n, node in enumerate(("planner-x", "agent-a0", "targets-0")))
     simulation = Simulation(seeded(4, EXTERNAL), faults=FaultPlan(drop=0.1, jitter_ms=30, crashes=crashes))

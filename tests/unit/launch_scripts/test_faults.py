@@ -30,10 +30,6 @@ def sent(model: FaultyLinks, times: int, every_s: float = 0.001) -> list[tuple[f
     return arrivals
 
 
-def test_without_faults_every_message_arrives_once_after_the_same_time():
-    assert sent(links(delay_ms=5.0), 3, every_s=1.0) == [(0.005,), (1.005,), (2.005,)]
-
-
 def test_the_planned_share_is_lost_repeated_and_reordered():
     arrivals = sent(links(drop=0.2, duplicate=0.1), 5000)
     assert 0.17 < sum(not each for each in arrivals) / 5000 < 0.23

@@ -6,7 +6,6 @@ import contextlib
 import json
 import re
 import signal
-import statistics as plain
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +13,6 @@ import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
@@ -364,18 +361,6 @@ def test_options_that_cannot_be_are_refused(tmp_path, scheduler, workers, said):
 
 
 # --- intervals ---------------------------------------------------------------------------------------------------
-
-
-@given(
-    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40) | st.lists(st.integers(0, 2), min_size=1, max_size=9)
-)
-def test_an_interval_holds_its_value_and_lies_among_the_data(values):
-    for estimate, middle in ((statistics.mean(values), plain.fmean(values)),
-                             (statistics.median(values), plain.median(values))):  # fmt: skip
-        assert estimate.value == pytest.approx(middle, rel=1e-9, abs=1e-6)
-        if estimate.low is not None:
-            least, most = min(values), max(values)
-            assert least - 1e-6 <= estimate.low <= estimate.high <= most + 1e-6
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():

@@ -96,14 +96,6 @@ def test_a_target_moves_smoothly_at_its_speed_times_the_time_scale(walk: Walk) -
     assert np.median(strides) == pytest.approx(1.2)
 
 
-def test_targets_start_connected_to_the_others() -> None:
-    pace = flat()
-    pace[:, 10] = np.inf
-    for seed in range(20):
-        world = World(TargetConfig(walk="still"), pace=pace, seed=seed)
-        assert world.poses(world.settle())["t"].cell % 50 > 10
-
-
 def test_a_captured_target_turns_up_far_away() -> None:
     world = World(still())
     before = world.poses(world.settle())["t"]

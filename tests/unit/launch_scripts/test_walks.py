@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.target_reports import FLAT, RES, flat
+from support.target_reports import RES, flat
 
 from launch_scripts.simulation.world.walks import (
     WALKS,
@@ -146,18 +146,6 @@ def naive_cost(where: TrueTerrain, start: int, end: int) -> float:
                     cost[to] = there
                     changed = True
     return cost[end]
-
-
-def test_a_walled_in_target_stays_where_it_is() -> None:
-    pace = flat(5, 5)
-    pace[1:4, 1:4] = np.inf
-    pace[2, 2] = FLAT
-    where = terrain(pace)
-    walks: tuple[Walk, ...] = ("random", "waypoints", "evade")
-    for walk in walks:
-        one = walker(where, 12, walk)
-        one.advance(where, 100.0, NOBODY)
-        assert one.cell == 12
 
 
 @pytest.mark.parametrize(
