@@ -15,6 +15,12 @@ from typer.exceptions import TyperException
 from swarm.config.input_files import quoted
 from swarm.errors import ConfigError, StoreError, SwarmError
 
+_EXTRAS = {
+    "pyogrio": "vectors", "shapely": "vectors", "mcap": "ros2", "rosbags": "ros2", "xxhash": "ros2",
+    "distributed": "sweep", "pyarrow": "sweep",
+}  # fmt: skip
+"""Package that a small install lacks -> the extra which brings it."""
+
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     """Runs the command that is made here. Returns its exit code; what a user, a file or the network has wrong is
@@ -43,6 +49,13 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRAS:
+            raise  # a fault of ours
+        needed = f"pip install 'terrain-swarm[{_EXTRAS[package]}]'"
+        print(f"swarm: this needs {package}, which is not installed: {needed}", file=sys.stderr)
+        return ConfigError.exit_code
     except BrokenPipeError:
         _leave_output()
         return 0

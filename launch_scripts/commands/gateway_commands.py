@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -81,11 +80,6 @@ def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
 
     changes  key -> value, such as {"ros.domain": 3}; None changes nothing
     """
-    for package in ("rosbags", "xxhash"):
-        if find_spec(package) is None:
-            raise ConfigError(
-                f"swarm ros2 needs {package}, which is not installed: pip install 'terrain-swarm[ros2]'"
-            )
     from launch_scripts.gateways.ros2.gateway_settings import load_settings
 
     return load_settings(file, changes)

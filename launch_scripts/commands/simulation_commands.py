@@ -9,7 +9,6 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -222,11 +221,6 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
 
     from swarm.config.input_files import quoted
 
-    for package in ("distributed", "pyarrow"):
-        if find_spec(package) is None:
-            raise ConfigError(
-                f"swarm sweep needs {package}, which is not installed: pip install 'terrain-swarm[sweep]'"
-            )
     if scheduler is not None and workers is not None:
         raise ConfigError("--workers goes without --scheduler: the workers of that cluster are used")
     if scheduler is not None and re.fullmatch(_SCHEDULER, scheduler) is None:

@@ -14,5 +14,5 @@ Commands and the ends of runs and studies write it; nothing else imports it. Mat
 | compare.py        | what differs between runs                                                                |
 | exporter.py       | the one exporter of layers and rasters: GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF      |
 | run_layers.py     | tracks, captures, routes and marks of a run as layers; `swarm export`                    |
-| mcap_export.py    | a run as MCAP with ROS 2 messages; timeline.py puts them in order                        |
+| mcap_export.py    | a run as MCAP with ROS 2 messages, in order of time                                      |
 """

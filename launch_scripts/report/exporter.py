@@ -116,8 +116,7 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     Raises
     ------
     ConfigError
-        On another ending, on a map without a place or an area where the format needs or forbids one, and if pyogrio
-        is not installed.
+        On another ending, and on a map without a place or an area where the format needs or forbids one.
     StoreError
         If the file cannot be written.
     """
@@ -150,14 +149,10 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
 
 
 def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append: bool) -> None:
-    try:
-        import shapely
-        from pyogrio import raw
-        from pyogrio.errors import DataLayerError, DataSourceError
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"--out: a {path.suffix} needs pyogrio and shapely: pip install 'terrain-swarm[vectors]'"
-        ) from error
+    import shapely
+    from pyogrio import raw
+    from pyogrio.errors import DataLayerError, DataSourceError
+
     degrees = form.degrees and frame.grid.crs != "local"
     options, more = {"DESCRIPTION": layer.about or layer.name}, dict[str, tuple[FieldKind, Value]]()
     match form.driver:
