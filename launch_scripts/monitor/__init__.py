@@ -2,8 +2,8 @@
 
 - `main`: the process; `service` hears the swarm and draws it frame by frame, ten a second for those who look, else
   five (decision 102). It asks nothing but costs of planners, and nobody waits for it.
-- `ground` lies still: the terrain, its layers with their legends, zones, windows of planners.
-- `movers` moves: vehicles, guests, targets, bodies, their routes and trails, beliefs, alarms.
+- `ground` lies still: the terrain, its layers with their legends, zones.
+- `movers` moves: vehicles, targets, bodies, their routes and trails, beliefs, alarms.
 - `live_layout` has the layers, their legends, and what stands beside: plots, a summary, a log.
 - `sinks` has the pen which logs what differs from what was logged last, and where that goes: a file `run.rrd`, a
   port for native viewers, a page. If the file ends for want of space, another is begun once there is some.

@@ -20,16 +20,17 @@ from launch_scripts.observe.facts import count, grouped
 from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
-from launch_scripts.report.map_figure import (
+from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
+from launch_scripts.report.run_picture import (
     GROUND_FILE,
     LEARNED_FILE,
     QUICKER,
     SLOWER,
+    cards,
     draw_map,
+    headline,
     size_km,
 )
-from launch_scripts.report.picture import cards, headline
-from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
 from launch_scripts.report.run_plots import PLOTS, draw_plot
 from launch_scripts.report.write_report import TABLES, flat
 from swarm.config.input_files import FileKind, read_bytes, read_text

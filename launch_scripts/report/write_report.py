@@ -70,7 +70,7 @@ def write_report(
     """
     report = {**report, **({"made": made} if (made := ended(folder)) else {})}
     # matplotlib takes a moment
-    from launch_scripts.report.map_figure import (
+    from launch_scripts.report.run_picture import (
         GROUND_FILE,
         LEARNED_FILE,
         ground_picture,
@@ -94,8 +94,8 @@ def write_report(
     for name, content in contents.items():
         with _sentence(folder / name):
             write_file(folder / name, content())
-    from launch_scripts.report.picture import save_picture
     from launch_scripts.report.run_page import write_page
+    from launch_scripts.report.run_picture import save_picture
 
     with _sentence(folder / PICTURE_FILE), replacing(folder / PICTURE_FILE) as half:
         save_picture(half, ground, tracks_in(tracks, folder / TRACKS_FILE), report)

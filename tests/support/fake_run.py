@@ -48,7 +48,7 @@ def leave(folder: Path, recorder: Recorder, terrain: Terrain, truth: Floats) -> 
     """Writes what a run leaves into a new folder, but an empty picture: that is another test's."""
     folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("launch_scripts.report.picture.save_picture", lambda half, *_: half.touch())
+        patched.setattr("launch_scripts.report.run_picture.save_picture", lambda half, *_: half.touch())
         write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
 
 

@@ -1,5 +1,5 @@
-"""What moves in the view: vehicles, guests, targets, bodies, their routes and trails, beliefs, alarms.
+"""What moves in the view: vehicles, targets, bodies, their routes and trails, beliefs, alarms.
 
-`movers_view` hears and draws, with `vehicles_view` for vehicles. `styles` is the one table of colours and of how
-much is drawn for how many vehicles, `map_lines` the lines.
+`movers_view` hears and draws, with `vehicles_view` for vehicles, their trails and routes. `styles` is the one table
+of colours and of how much is drawn for how many vehicles.
 """

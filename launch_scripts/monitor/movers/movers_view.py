@@ -14,10 +14,9 @@ import rerun as rr
 
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.movers import styles
-from launch_scripts.monitor.movers.map_lines import feet, poles, rings
 from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, screen, shown
+from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, Strips, even, screen, shown
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_alarms import Alarm
@@ -46,6 +45,7 @@ SILENT_NS = 5 * NS_PER_S
 """A planner that searches tells its belief once a second: what is older is drawn no more."""
 _FAINT, _FULL = 40, 235
 """Opacity of the least and of the likeliest place of a belief."""
+_CIRCLE_POINTS = 33
 _SMALLEST = 0.45
 """Radius below which nothing is drawn, as a share of `TerrainMesh.scale_m`: a rover of 2 m is seen on 10 km."""
 _PIN, _LABEL, _ALARM = 2.2, 5.4, 4.6
@@ -275,3 +275,21 @@ def alarm_marks(
         if place_m is not None and seen and len(marks) < _MOST_MARKS:
             marks.setdefault(place_m, f"{alarm.label}: {alarm.about}")
     return marks
+
+
+def feet(mesh: TerrainMesh, positions: Floats) -> Floats:
+    """Places on the terrain below these."""
+    return mesh.place(positions[:, 0], -positions[:, 1])
+
+
+def poles(mesh: TerrainMesh, tops: Floats) -> Strips:
+    """A line from each point, float32 (n, 3), down to the terrain."""
+    return even(np.stack([feet(mesh, tops), tops], axis=1))
+
+
+def rings(mesh: TerrainMesh, centres: Floats, radii_m: Floats) -> Strips:
+    """A circle on the terrain around each place."""
+    angle = np.linspace(0, 2 * np.pi, _CIRCLE_POINTS, dtype=np.float32)
+    east_m = centres[:, :1] + radii_m[:, None] * np.cos(angle)
+    south_m = -centres[:, 1:2] + radii_m[:, None] * np.sin(angle)
+    return even(mesh.place(east_m, south_m, 0.25 * mesh.scale_m))

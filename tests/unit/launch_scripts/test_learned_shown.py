@@ -12,7 +12,7 @@ from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.observe import facts
 from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report.map_figure import QUICKER, SLOWER, learned_pixels
+from launch_scripts.report.run_picture import QUICKER, SLOWER, learned_pixels
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.cost_map import CostMap
 from shared_map.learning.factors import LearnedGauges

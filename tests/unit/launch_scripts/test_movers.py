@@ -14,15 +14,27 @@ from numpy.typing import NDArray
 
 from launch_scripts.launcher.options import with_follow
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.movers.map_lines import RouteLines, RouteNow, Trails, cells_at, poles, rings
-from launch_scripts.monitor.movers.movers_view import OVER_S, alarm_marks, searched_points, target_labels
+from launch_scripts.monitor.movers.movers_view import (
+    OVER_S,
+    alarm_marks,
+    poles,
+    rings,
+    searched_points,
+    target_labels,
+)
 from launch_scripts.monitor.movers.styles import (
     HUES,
     LOST_COLOUR,
     Looks,
     RateLimit,
 )
-from launch_scripts.monitor.movers.vehicles_view import vehicle_details
+from launch_scripts.monitor.movers.vehicles_view import (
+    RouteLines,
+    RouteNow,
+    Trails,
+    cells_at,
+    vehicle_details,
+)
 from launch_scripts.monitor.sinks import Pen, Strips
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm

@@ -17,10 +17,10 @@ from support import fake_run
 
 from launch_scripts.observe.palette import hillshade
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report import picture
+from launch_scripts.report import run_picture as picture
 from launch_scripts.report import run_plots as plots
-from launch_scripts.report.map_figure import ground_picture
 from launch_scripts.report.run_arrays import packed_tracks, tracks_in
+from launch_scripts.report.run_picture import ground_picture
 from launch_scripts.report.run_plots import saved
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
