@@ -106,7 +106,7 @@ def _list_topics(settings: Settings, *, as_json: bool) -> None:
 
 def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
     """Forwards until Ctrl-C. Raises BusError if one of the two sides does not answer at the start."""
-    from launch_scripts.gateways.ros2.service import Ros2Service
+    from launch_scripts.gateways.ros2.service import serve
     from launch_scripts.stop_requests import stop_requests
     from swarm.bus.endpoints import listening
 
@@ -119,9 +119,17 @@ def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
         )
     if not listening(ros):
         raise BusError(f"no router of the ROS side listens at {ros}: start rmw_zenohd, or name it by --ros")
-    service = Ros2Service(settings, network, runs, lambda sentence: typer.echo(sentence, err=True))
     with stop_requests() as stopping, suppress(KeyboardInterrupt):
-        service.run(stopping=stopping)
+        serve(settings, lambda: _join(network), runs, lambda sentence: typer.echo(sentence, err=True), stopping)
+
+
+def _join(network: NetworkConfig) -> Swarm:
+    """A connection to a swarm, by its first router."""
+    from swarm.client import connect
+
+    tls = network.tls
+    files = {} if tls is None else {"ca": tls.ca, "certificate": tls.certificate, "key": tls.key}
+    return connect(network.connect[0], namespace=network.namespace, timeout_s=network.connect_timeout_s, **files)
 
 
 @dataclass(frozen=True)
@@ -187,7 +195,6 @@ def mavlink(
     from launch_scripts.gateways.mavlink.link import read_address
     from launch_scripts.gateways.mavlink.mavlink_codec import pymavlink
     from launch_scripts.gateways.mavlink.service import Body, read_key, run
-    from swarm.client import connect
     from swarm.config.agents import agent_of
 
     address = read_address(link)
@@ -207,17 +214,6 @@ def mavlink(
     pymavlink()
     network = where.network()
 
-    def join() -> Swarm:
-        files = network.tls
-        return connect(
-            network.connect[0],
-            namespace=network.namespace,
-            ca=None if files is None else files.ca,
-            certificate=None if files is None else files.certificate,
-            key=None if files is None else files.key,
-            timeout_s=network.connect_timeout_s,
-        )
-
     wishes = Wishes(target, drives.drive, drives.arm, altitude, drives.above, vehicle.lost_after)
     body = Body(id, vehicle.group, vehicle.radius, drives.vehicle_class)
-    run(join, address, body, wishes, sysid=vehicle.sysid, key=key, tell=typer.echo)
+    run(lambda: _join(network), address, body, wishes, sysid=vehicle.sysid, key=key, tell=typer.echo)

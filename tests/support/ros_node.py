@@ -1,7 +1,9 @@
-"""Nodes for tests: one which hears each message, as no gateway does, and one without a network."""
+"""Nodes for tests: one which calls back, and one without a network."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -16,14 +18,16 @@ class PeerNode(Node):
     """A node of ours as a peer."""
 
     def subscribe(self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT) -> None:
-        """Calls `hear` with each message, on Zenoh's thread."""
+        """Calls `hear` with what came last, on a thread of its own."""
         newest = self.newest(topic, type_name, qos)
 
-        def wake() -> None:
-            if (message := newest.take()) is not None:
-                hear(message)
+        def read() -> None:
+            while newest.endpoint in self.endpoints:
+                if (message := newest.take()) is not None:
+                    hear(message)
+                time.sleep(0.002)
 
-        newest.on_each(wake)
+        threading.Thread(target=read, daemon=True).start()
 
 
 class FakeNewest:
@@ -32,9 +36,6 @@ class FakeNewest:
     def __init__(self, topic: str) -> None:
         self.endpoint = SimpleNamespace(topic=topic)
         self.waiting: deque[Any] = deque(maxlen=1)
-
-    def on_each(self, wake: Callable[[], None]) -> None:
-        pass
 
     def take(self) -> Any | None:
         return self.waiting.pop() if self.waiting else None

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -24,10 +24,9 @@ from launch_scripts.gateways.ros2.ros_messages import Level, PackedPlaces, Place
 from launch_scripts.gateways.ros2.ros_types import RosTypes
 from launch_scripts.gateways.ros2.topic_table import TARGET, VEHICLE, TopicRow
 from shared_map.cost_map import merged
-from swarm.client.observer import SeenTarget, SeenVehicle
+from swarm.client.observer import Observer, SeenTarget, SeenVehicle
 from swarm.clock import NS_PER_S
 from swarm.grid import Window
-from swarm.wire.messages.map_data import MarkSet
 
 MOST_VEHICLES = 1000
 """More are not told: each has topics of its own, and each topic a token."""
@@ -39,8 +38,6 @@ _BARE = ("tf", "tf_static")
 """Topics that each vehicle has for itself where its frames are bare."""
 _STANDS_NS = NS_PER_S // 2
 """A vehicle of which no other place was told for so long stands."""
-_LEAP_M_PER_S = 100.0
-"""What moves faster was put elsewhere: it has no speed that anybody could use."""
 _PLAN_NS = NS_PER_S
 """A vehicle's route is told at most so often."""
 _BAD_STATES = ("stranded", "lost")
@@ -80,17 +77,6 @@ class Put(Struct, frozen=True):
 Action = Declare | Remove | Put
 
 
-class View(Protocol):
-    """What is seen of the swarm: `swarm.client.Observer`."""
-
-    @property
-    def vehicles(self) -> Mapping[str, SeenVehicle]: ...
-    @property
-    def targets(self) -> Mapping[str, SeenTarget]: ...
-    def take_routes(self) -> Mapping[str, list[tuple[float, float]]]: ...
-    def take_mark_sets(self) -> list[MarkSet]: ...
-
-
 @dataclass(frozen=True)
 class Health:
     """What the shell knows of its two sides.
@@ -111,7 +97,6 @@ class _Now(NamedTuple):
 
     now_ns: int
     stamp_ns: int
-    swarm_now_ns: int
     vehicles: Mapping[str, SeenVehicle]
     targets: Mapping[str, SeenTarget]
     health: Health
@@ -141,7 +126,6 @@ class Moving:
         self.route: NDArray[np.float64] = np.empty((0, 2), np.float64)
         self.route_is_new = False
         self.odometry = ros_messages.packed_odometry(made, frames)
-        self.transform = ros_messages.packed_transforms(made, [frames])
         self._route_told_ns = now_ns - _PLAN_NS
         self._moved_ns = now_ns
 
@@ -159,13 +143,11 @@ class Moving:
             east_m, north_m = seen.x_m - x_m, seen.y_m - y_m
             forward_m = math.hypot(east_m, north_m)
             turned_rad = 0.0
-            leaps = forward_m > _LEAP_M_PER_S * since_s
             if heading_rad is not None:
                 forward_m = east_m * math.sin(heading_rad) + north_m * math.cos(heading_rad)
                 if before_rad is not None:
                     turned_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
-            self.speed_m_per_s = 0.0 if leaps else forward_m / since_s
-            self.turn_rad_per_s = 0.0 if leaps else turned_rad / since_s
+            self.speed_m_per_s, self.turn_rad_per_s = forward_m / since_s, turned_rad / since_s
         self.place, self._moved_ns = (seen.x_m, seen.y_m, heading_rad), now_ns
 
     def take_route(self, now_ns: int) -> bool:
@@ -201,11 +183,9 @@ class Gateway:
         self._problems: list[str] = []
         self._crew_changed = False
         """Vehicles have come or gone since /tf_static was put."""
-        self._came: list[str] = []
-        """Names of those that have come since then."""
         self._pose = ros_messages.packed_pose(self._messages)
-        self._transforms: PackedPlaces | None = None
-        """Of all vehicles in their order; None if others have come since it was made."""
+        self._transforms: dict[str | None, PackedPlaces] = {}
+        """Of each group, since vehicles have come or gone last."""
         self._fresh: list[Window] = []
         """Windows that have changed since markers were put last."""
         self._changed: list[Window] = []
@@ -224,11 +204,6 @@ class Gateway:
             "markers": self._tell_markers, "diagnostics": self._tell_diagnostics,
         }  # fmt: skip
 
-    @property
-    def due_ns(self) -> int:
-        """When `tick` has something to do again, by the clock that never leaps."""
-        return min(self._due_ns.values(), default=0)
-
     def whole_map(self, stamp_ns: int) -> Any:
         """nav_msgs/OccupancyGrid of the map as it is known now."""
         return map_messages.occupancy_grid(self._messages, stamp_ns, self._feed.occupancy(self._feed.grid.window))
@@ -243,7 +218,7 @@ class Gateway:
         now_ns: int,
         stamp_ns: int,
         swarm_now_ns: int,
-        view: View,
+        view: Observer,
         health: Health,
         robots: Collection[str] = (),
     ) -> list[Action]:
@@ -258,7 +233,7 @@ class Gateway:
         if not due:
             return []
         vehicles = {id: each for id, each in view.vehicles.items() if id not in robots}
-        now = _Now(now_ns, stamp_ns, swarm_now_ns, vehicles, view.targets, health)
+        now = _Now(now_ns, stamp_ns, vehicles, view.targets, health)
         actions, self._first = [*self._first, *self._follow(now)], []
         for id, points_m in view.take_routes().items():
             if (moving := self._vehicles.get(ros_name(id))) is not None and moving.id == id:
@@ -284,8 +259,7 @@ class Gateway:
         taken = [self._take(id, seen, now.now_ns) for id, seen in now.vehicles.items()]
         came = [name for name in taken if name is not None]
         if came or gone:
-            self._transforms, self._crew_changed = None, True
-            self._came += came
+            self._transforms, self._crew_changed = {}, True
         actions += [Declare(self._channels(VEHICLE, name)) for name in came]
         for id in now.targets:
             name = ros_name(id)
@@ -354,31 +328,27 @@ class Gateway:
                 place = self._to_wgs84(*each.place[:2])
                 yield name, self._messages.fix(now.stamp_ns, each.frames[1], *place)
 
-    def _tell_transforms(self, now: _Now) -> _Told:
+    def _groups(self) -> _Told:
+        """Vehicles whose transforms go into one message, with the name of the one that has a topic of its own."""
         if self._bare:
-            for name, each in self._vehicles.items():
-                yield name, each.transform.at(now.stamp_ns, [each.place])
+            yield from ((name, [each]) for name, each in self._vehicles.items())
         elif self._vehicles:
-            if self._transforms is None:
-                frames = [each.frames for each in self._vehicles.values()]
-                self._transforms = ros_messages.packed_transforms(self._messages, frames)
-            yield None, self._transforms.at(now.stamp_ns, [each.place for each in self._vehicles.values()])
+            yield None, list(self._vehicles.values())
+
+    def _tell_transforms(self, now: _Now) -> _Told:
+        for name, group in self._groups():
+            if name not in self._transforms:
+                frames = [each.frames for each in group]
+                self._transforms[name] = ros_messages.packed_transforms(self._messages, frames)
+            yield name, self._transforms[name].at(now.stamp_ns, [each.place for each in group])
 
     def _tell_static(self, now: _Now) -> _Told:
         """The frames that do not move lie in the map's origin."""
-
-        def of(vehicles: Iterable[Moving]) -> Any:
-            pairs = [(self._messages.map.frame, each.frames[0]) for each in vehicles]
-            return self._messages.transforms(self._messages.transform(now.stamp_ns, pair) for pair in pairs)
-
-        came, self._came = self._came, []
-        if self._bare:
-            for name in dict.fromkeys(came):
-                if name in self._vehicles:
-                    yield name, of([self._vehicles[name]])
-        elif self._vehicles and self._crew_changed:
-            yield None, of(self._vehicles.values())
-        self._crew_changed = False
+        changed, self._crew_changed = self._crew_changed, False
+        for name, group in self._groups() if changed else ():
+            pairs = [(self._messages.map.frame, each.frames[0]) for each in group]
+            told = [self._messages.transform(now.stamp_ns, pair) for pair in pairs]
+            yield name, self._messages.transforms(told)
 
     def _tell_all_poses(self, now: _Now) -> _Told:
         told = sorted(self._vehicles.values(), key=lambda each: each.id)
@@ -423,14 +393,10 @@ class Gateway:
     def _tell_markers(self, now: _Now) -> _Told:
         grid, fresh = self._feed.grid, self._fresh
         self._fresh = []
-        lethal, paced = (cells[:MOST_CUBES].tolist() for cells in self._feed.marked)
-        drawn: list[map_messages.Drawing] = [
+        lethal, paced, zones = (cells[:MOST_CUBES].tolist() for cells in self._feed.marked)
+        drawn = [
             *(map_messages.route(grid, map_messages.corners(each.route)) for each in self._vehicles.values()),
-            *map_messages.marked_cells(grid, lethal, paced),
-            *(
-                map_messages.zone(grid, closed, cells)
-                for closed, cells in self._feed.zones(now.swarm_now_ns).values()
-            ),
+            *map_messages.marked_cells(grid, lethal, paced, zones),
             map_messages.windows(grid, fresh),
         ]
         yield None, map_messages.marker_array(self._messages, now.stamp_ns, drawn)

@@ -31,7 +31,7 @@ NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}\Z")]
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_/]{0,79}(?<!/)\Z")]
 RosName = Annotated[str, Meta(pattern=r"^[a-zA-Z][a-zA-Z0-9_]{0,60}\Z")]
 Topic = Annotated[str, Meta(min_length=1, max_length=200)]
-Frame = Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/{}-]{0,200}\Z")]
+Frame = Annotated[str, Meta(pattern=r"^(?:[a-zA-Z0-9_/-]|\{robot\}){0,200}\Z")]
 PoseType = Literal["odometry", "pose", "pose_with_covariance"]
 _TOPIC = re.compile(r"(?:/[a-zA-Z_][a-zA-Z0-9_]*)+")
 Rate = Annotated[float, Meta(ge=0, le=MOST_HZ)]
@@ -131,6 +131,10 @@ class Robots(Section, frozen=True, kw_only=True):
     target: Name | None = None
     plan: Topic = "/{robot}/plan"
     goal: Topic = "/{robot}/goal_pose"
+
+    def own(self, topic: str) -> str:
+        """A topic of the one robot, if it is one."""
+        return topic.replace(topic_table.ROBOT, self.id or topic_table.ROBOT)
 
     def robot_of(self, topic: str) -> str | None:
         """The robot that has a topic; None if it is none of these robots."""
@@ -240,15 +244,15 @@ def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_ta
     """
     rows: list[topic_table.TopicRow] = []
     for robots in settings.robots:
-        names = {"robot": robots.topic, "goal": robots.goal, "robot_goal": robots.goal, "robot_plan": robots.plan}
+        own: dict[str, dict[str, Any]] = {
+            "robot": {"topic": robots.topic, "type_name": topic_table.POSE_TYPES[robots.type], "hz": robots.hz},
+            "goal": {"topic": robots.goal},
+            "robot_goal": {"topic": robots.goal},
+            "robot_plan": {"topic": robots.plan},
+        }
         for row in topic_table.ROBOT_TABLE:
-            own = replace(
-                row, topic=names.get(row.name, row.topic).replace(topic_table.ROBOT, robots.id or topic_table.ROBOT)
-            )
-            is_pose = row.name == "robot"
-            rows.append(
-                replace(own, type_name=topic_table.POSE_TYPES[robots.type], hz=robots.hz) if is_pose else own
-            )
+            named = replace(row, **own.get(row.name, {}))
+            rows.append(replace(named, topic=robots.own(named.topic)))
     rows += [replace(topic_table.SET_POSE, topic=settings.set_pose_of(each)) for each in settings.targets]
     rows += [replace(topic_table.ZONE, topic=each.topic) for each in settings.zones]
     rows += [replace(topic_table.GRID, topic=each.topic) for each in settings.grids]
@@ -269,18 +273,13 @@ def load_settings(path: Path | None, options: Mapping[str, object] | None = None
 def parse_settings(text: str, source: str = "settings", options: Mapping[str, object] | None = None) -> Settings:
     """As `load_settings`, of a text."""
     raw = parse_toml(text, source, ConfigError)
-    settings = _checked(raw, source)
     said = {key: value for key, value in (options or {}).items() if value is not None}
-    if not said:
-        return settings
-    # Into what was read, not into what became of it: defaults need not be values that a file may have.
     for key, value in said.items():
         section, _, name = key.rpartition(".")
-        (raw.setdefault(section, {}) if section else raw)[name] = value
-    return _checked(raw, "options")
-
-
-def _checked(raw: dict[str, Any], source: str) -> Settings:
+        inside = raw.setdefault(section, {}) if section else raw
+        if isinstance(inside, dict):
+            inside[name] = value
+    source += " with options" if said else ""
     try:
         settings = msgspec.convert(raw, Settings)
     except msgspec.ValidationError as error:
@@ -300,7 +299,7 @@ def check(settings: Settings, source: str = "settings") -> None:
     for name, changes in settings.topics.items():
         where, row = f"{source}: topics.{name}", topic_table.ROWS[name]
         if changes.topic:
-            _check_topic(changes.topic, row.per or topic_table.VEHICLE, 1 if row.per else 0, f"{where}.topic")
+            _check_topic(changes.topic, row.per, f"{where}.topic")
         if changes.hz and row.hz is None:
             raise ConfigError(f"{where}.hz: {name} is put when something changes, and has no rate")
     topics = Counter(row.topic for row in settings.rows())
@@ -322,25 +321,16 @@ def check_incoming(settings: IncomingSettings, source: str = "settings") -> None
             raise ConfigError(
                 f"{where}: topic is {robots.topic!r}, expected {topic_table.ROBOT} in it, or an id and none in it"
             )
-        own = {"topic": robots.topic, "plan": robots.plan, "goal": robots.goal}
-        if len({each.replace(topic_table.ROBOT, robots.id or topic_table.ROBOT) for each in own.values()}) < len(
-            own
-        ):
-            told = ", ".join(own.values())
-            raise ConfigError(f"{where}: topic, plan and goal are {told}, expected three topics")
+        own = {key: robots.own(getattr(robots, key)) for key in ("topic", "plan", "goal")}
+        if len(set(own.values())) < len(own):
+            raise ConfigError(f"{where}: topic, plan and goal are {', '.join(own.values())}, expected three topics")
         for key, topic in own.items():
-            _check_topic(
-                topic,
-                topic_table.ROBOT,
-                1 if robots.id is None or topic_table.ROBOT in topic else 0,
-                f"{where}.{key}",
-            )
-        _check_braces(robots.frame, topic_table.ROBOT, robots.frame.count(topic_table.ROBOT), f"{where}.frame")
+            _check_topic(topic, None if robots.id else topic_table.ROBOT, f"{where}.{key}")
     drawn = [*((f"zones[{n}]", each.topic) for n, each in enumerate(settings.zones)),
              *((f"grids[{n}]", each.topic) for n, each in enumerate(settings.grids))]  # fmt: skip
     for area, topic in drawn:
-        _check_topic(topic, topic_table.ROBOT, 0, f"{source}: {area}.topic")
-    _check_topic(settings.set_pose, topic_table.TARGET, 1, f"{source}: set_pose")
+        _check_topic(topic, None, f"{source}: {area}.topic")
+    _check_topic(settings.set_pose, topic_table.TARGET, f"{source}: set_pose")
     robot_ids = [each.id for each in settings.robots if each.id]
     robot_topics = [each.topic for each in settings.robots]
     for key, names in {
@@ -353,17 +343,17 @@ def check_incoming(settings: IncomingSettings, source: str = "settings") -> None
             raise ConfigError(f"{source}: {key}: {doubled[0]!r} is there twice, expected once")
 
 
-def _check_topic(topic: str, part: str, many: int, where: str) -> None:
-    """Zenoh refuses what is none: empty parts between slashes, a slash at the end."""
-    _check_braces(topic, part, many, where)
-    if len(topic) > 200 or not _TOPIC.fullmatch(topic.replace(part, "x")):
-        raise ConfigError(f"{where} is {topic[:60]!r}, expected a topic such as /a/b, of letters, digits and _")
+def _check_topic(topic: str, part: str | None, where: str) -> None:
+    """Zenoh refuses what is none: empty parts between slashes, a slash at the end.
 
-
-def _check_braces(text: str, part: str, many: int, where: str) -> None:
-    rest = text.replace(part, "")
-    if text.count(part) != many or "{" in rest or "}" in rest:
-        raise ConfigError(f"{where} is {text[:60]!r}, expected {part + ' once' if many else 'no braces'}")
+    part  what must stand in it once, such as VEHICLE; None: nothing
+    """
+    plain = topic if part is None else topic.replace(part, "x", 1)
+    if len(topic) > 200 or not _TOPIC.fullmatch(plain) or (part is not None and part not in topic):
+        once = f", with {part} once" if part else ""
+        raise ConfigError(
+            f"{where} is {topic[:60]!r}, expected a topic such as /a/b, of letters, digits and _{once}"
+        )
 
 
 def _check_ros_endpoint(ros: RosSide, where: str) -> None:

@@ -6,7 +6,7 @@ else is unknown.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2.map_messages import Occupancy, occupancy_of
 from shared_map.cost_map import CostMap
-from shared_map.replication.marks import is_zone, standing
+from shared_map.replication.marks import is_zone
+from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
 from shared_map.terrain.store import load_prepared, read_meta
@@ -27,11 +28,9 @@ from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 QUICK_S_PER_M = 0.1
 """The pace of the quickest ground where the terrain is not known: 10 m/s."""
-_WHOLE_SHARE, _MUCH_CELLS = 0.02, 1000
-"""Much has changed if windows of more than this share of the map have, and of more cells than these."""
 _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
-"""The whole map is due so long after it was put last if much has changed. If anything has, it is due after as many
-times longer as it has more cells than a million."""
+"""The whole map is due so long after it was put last if anything has changed, and as many times longer as it has
+more cells than a million."""
 _REDRAW_NS = 10 * NS_PER_S
 """All marks are looked at again so often, as those that expire are in no set that comes."""
 _META = "terrain.json"
@@ -51,6 +50,7 @@ class MapFeed:
     def __init__(self, grid: GridSpec, terrain: Terrain | None) -> None:
         self.grid = grid
         self.knows_ground = terrain is not None
+        self._whole_ns = _WHOLE_NS * max(1, grid.cells // _CELLS_AT_ONCE)
         self._map = CostMap(_unknown(grid)) if terrain is None else CostMap(terrain, learning=True)
         self._replica = MapReplica(grid, self._map)
         passable = self._map.pace_s_per_m[np.isfinite(self._map.pace_s_per_m)]
@@ -58,9 +58,8 @@ class MapFeed:
         self._told_ns: int | None = None
         self._changed_cells = 0
         """Since the whole map was told last, at `_told_ns`."""
-        self._whole_ns = _WHOLE_NS * max(1, grid.cells // _CELLS_AT_ONCE)
-        self._marked: dict[int, tuple[_Cells, _Cells]] = {}
-        """Tile -> cells of it that are marked as lethal, and with a pace."""
+        self._marked: dict[int, tuple[_Cells, _Cells, _Cells]] = {}
+        """Tile -> cells of it that are marked as lethal, and with a pace, and those of zones."""
         self._redraw_due_ns = 0
 
     def merge(self, sets: Sequence[MarkSet], now_ns: int, swarm_now_ns: int) -> None:
@@ -77,9 +76,20 @@ class MapFeed:
             tiles |= self._marked.keys()
         for tile in tiles:
             if tile < self.grid.tiles:
+                zones = [each for each in self._replica.held.of_tile(tile) if is_zone(each.author)]
+                stated = winners(zones, swarm_now_ns)
+                drawn = stated.cells[stated.kinds != MarkKind.CLEAR]
                 won = self._replica.winners(tile)
-                cells = self._cells_of(tile, won.cells)
-                self._marked[tile] = cells[won.kinds == MarkKind.LETHAL], cells[won.kinds == MarkKind.PACE]
+                marks = np.isin(won.cells, drawn, invert=True)
+                lethal, paced = (
+                    won.cells[marks & (won.kinds == kind)] for kind in (MarkKind.LETHAL, MarkKind.PACE)
+                )
+                corner = tile_corners(self.grid, [tile])[0]
+                self._marked[tile] = (
+                    grid_cells(self.grid, corner, lethal),
+                    grid_cells(self.grid, corner, paced),
+                    grid_cells(self.grid, corner, drawn),
+                )
 
     def change(self, now_ns: int, *, whole: bool) -> list[Window] | None:
         """Returns the windows that have changed since the last call, or None if the whole map is to be told: at
@@ -90,9 +100,7 @@ class MapFeed:
         """
         windows = self._map.take_dirty()
         self._changed_cells += sum(each.cells for each in windows)
-        much = self._changed_cells > max(_WHOLE_SHARE * self.grid.cells, _MUCH_CELLS)
-        wait_ns = _WHOLE_NS if much else self._whole_ns
-        due = self._told_ns is None or (self._changed_cells and now_ns - self._told_ns >= wait_ns)
+        due = self._told_ns is None or (self._changed_cells and now_ns - self._told_ns >= self._whole_ns)
         if not (whole and due):
             return windows
         self._told_ns, self._changed_cells = now_ns, 0
@@ -104,30 +112,10 @@ class MapFeed:
         return occupancy_of(pace, self._best_s_per_m)
 
     @property
-    def marked(self) -> tuple[_Cells, _Cells]:
-        """Cells that are marked as lethal, and those that are marked with a pace; zones among them."""
-        lethal, paced = zip((_NO_CELLS, _NO_CELLS), *self._marked.values(), strict=True)
-        return np.concatenate(lethal), np.concatenate(paced)
-
-    def zones(self, now_ns: int) -> Mapping[str, tuple[bool, _Cells]]:
-        """The zones that stand: whether they are closed, and their cells, by name."""
-        found: dict[str, tuple[bool, _Cells]] = {}
-        for tile in self._replica.held.tiles:
-            if tile >= self.grid.tiles:
-                continue
-            for each in self._replica.held.of_tile(tile):
-                if is_zone(each.author) and each.kinds:
-                    said = standing(each, now_ns)
-                    stated = said.kinds != MarkKind.CLEAR
-                    if stated.any():
-                        closed, before = found.get(each.author, (False, _NO_CELLS))
-                        cells = np.concatenate([before, self._cells_of(tile, said.cells[stated])])
-                        closed |= bool((said.kinds[stated] == MarkKind.LETHAL).any())
-                        found[each.author] = closed, cells
-        return found
-
-    def _cells_of(self, tile: int, cells: NDArray[np.uint16]) -> _Cells:
-        return grid_cells(self.grid, tile_corners(self.grid, [tile])[0], cells)
+    def marked(self) -> tuple[_Cells, _Cells, _Cells]:
+        """Cells that are marked as lethal, those that are marked with a pace, and those of zones."""
+        lethal, paced, zones = zip((_NO_CELLS,) * 3, *self._marked.values(), strict=True)
+        return np.concatenate(lethal), np.concatenate(paced), np.concatenate(zones)
 
 
 def _unknown(grid: GridSpec) -> Terrain:

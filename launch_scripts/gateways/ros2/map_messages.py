@@ -120,7 +120,7 @@ class Form(enum.IntEnum):
 class Drawing:
     """One thing to draw.
 
-    layer     what can be switched on and off together, such as "routes" or "zones/closed"
+    layer     what can be switched on and off together, such as "routes" or "zones"
     points_m  float64 (n, 2): x, y
     size_m    width of a line, or side of a cube
     """
@@ -159,12 +159,16 @@ def route(grid: GridSpec, points_m: Points, colour: Colour = ROUTE) -> Drawing:
     return Drawing("routes", Form.LINE, points_m, colour, _HAIR * grid.resolution_m)
 
 
-def marked_cells(grid: GridSpec, lethal: Sequence[int], slower: Sequence[int]) -> list[Drawing]:
-    """Cells that are marked as lethal, and those that have a pace of their own."""
+def marked_cells(
+    grid: GridSpec, lethal: Sequence[int], slower: Sequence[int], zones: Sequence[int]
+) -> list[Drawing]:
+    """Cells that are marked as lethal, those that have a pace of their own, and those of zones."""
     return [
-        Drawing("marks", Form.CUBES, middles_of(grid, cells).T, colour, grid.resolution_m)
-        for cells, colour in ((lethal, LETHAL_MARK), (slower, PACE_MARK))
-    ]
+        Drawing(layer, Form.CUBES, middles_of(grid, cells).T, colour, grid.resolution_m)
+        for layer, cells, colour in (
+            ("marks", lethal, LETHAL_MARK), ("marks", slower, PACE_MARK), ("zones", zones, ZONE),
+        )
+    ]  # fmt: skip
 
 
 def windows(grid: GridSpec, windows: Iterable[Window]) -> Drawing:
@@ -178,12 +182,6 @@ def windows(grid: GridSpec, windows: Iterable[Window]) -> Drawing:
     return Drawing("windows", Form.LINES, np.concatenate(sides), WINDOW, _HAIR * grid.resolution_m)
 
 
-def zone(grid: GridSpec, closed: bool, cells: NDArray[np.uint32]) -> Drawing:
-    """The outline of a zone, which is closed or slower."""
-    layer = "zones/closed" if closed else "zones/pace"
-    return Drawing(layer, Form.LINES, outline(grid, cells), ZONE, 2 * _HAIR * grid.resolution_m)
-
-
 def corners(points_m: Points) -> Points:
     """A line without the points at which it goes straight on: float64 (n, 2) to float64 (at most n, 2)."""
     if len(points_m) < 3:
@@ -193,20 +191,3 @@ def corners(points_m: Points) -> Points:
     back = (steps[1:] * steps[:-1]).sum(axis=1) <= 0  # or it stands
     kept = np.concatenate([[True], turns | back, [True]])
     return np.asarray(points_m[kept])
-
-
-def outline(grid: GridSpec, cells: NDArray[np.uint32]) -> Points:
-    """The sides between cells of a set and others: float64 (2 n, 2), from the first point to the second, from the
-    third to the fourth, and so on."""
-    rows, cols = np.divmod(np.asarray(cells, np.int64), grid.cols)
-    row0, col0 = rows.min(initial=grid.rows), cols.min(initial=grid.cols)
-    inside = np.zeros((rows.max(initial=row0) - row0 + 3, cols.max(initial=col0) - col0 + 3), np.bool_)
-    inside[rows - row0 + 1, cols - col0 + 1] = True
-    # A line below each cell that differs from the one south of it, and right of each that differs from that east.
-    level, upright = np.argwhere(inside[1:] != inside[:-1]), np.argwhere(inside[:, 1:] != inside[:, :-1])
-    starts = np.concatenate([level + np.array([1, 0]), upright + np.array([0, 1])])
-    ends = np.concatenate([level + 1, upright + 1])
-    lines = np.stack([starts, ends], axis=1).reshape(-1, 2)
-    east_m = grid.west_m + (lines[:, 1] - 1 + col0) * grid.resolution_m
-    south_m = grid.north_m - (lines[:, 0] - 1 + row0) * grid.resolution_m
-    return np.stack([east_m, south_m], axis=1)

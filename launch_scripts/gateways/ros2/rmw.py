@@ -177,48 +177,34 @@ def read_token(key: str) -> Endpoint | None:
 
 # --- peers which will never meet us -------------------------------------------------------------------------------
 
-_MEETS = {
-    Kind.PUBLISHER: Kind.SUBSCRIPTION,
-    Kind.SUBSCRIPTION: Kind.PUBLISHER,
-    Kind.SERVICE: Kind.CLIENT,
-    Kind.CLIENT: Kind.SERVICE,
-}
-_DOES = {
-    Kind.PUBLISHER: "publishes",
-    Kind.SUBSCRIPTION: "subscribes to",
-    Kind.SERVICE: "serves",
-    Kind.CLIENT: "asks",
+_MEETS_AND_DOES = {
+    Kind.PUBLISHER: (Kind.SUBSCRIPTION, "publishes"),
+    Kind.SUBSCRIPTION: (Kind.PUBLISHER, "subscribes to"),
+    Kind.SERVICE: (Kind.CLIENT, "serves"),
+    Kind.CLIENT: (Kind.SERVICE, "asks"),
 }
 MOST_TOLD = 1000
+"""Sentences, after which nothing more is told."""
 
 
 class PeerWatch:
-    """Tells of each peer's fault once.
-
-    counts is bounded: after MOST_TOLD sentences nothing more is told.
-    """
+    """Tells of each peer's fault once."""
 
     def __init__(self) -> None:
         self._told: set[str] = set()
 
-    def sentence(self, seen: Endpoint, ours: Iterable[Endpoint]) -> str | None:
-        """What keeps a peer's endpoint from meeting one of ours of the same name; None if nothing does, or if it
-        was told before."""
-        said: str | None = None
-        for mine in ours:
-            if mine.topic != seen.topic or _MEETS[mine.kind] is not seen.kind:
-                continue
-            why = _why_not(seen, mine)
-            if why is None:
-                return None
-            said = said or why
-        if said is None:
-            return None
-        sentence = f"node {seen.node.name[:80]} {_DOES[seen.kind]} {seen.topic[:120]} {said}"
+    def sentences(self, seen: Endpoint, ours: Iterable[Endpoint]) -> list[str]:
+        """What keeps a peer's endpoint from meeting one of ours of the same name: one sentence; none if nothing
+        does, or if it was told before."""
+        meets, does = _MEETS_AND_DOES[seen.kind]
+        faults = [_why_not(seen, mine) for mine in ours if mine.topic == seen.topic and mine.kind is meets]
+        if not faults or None in faults:
+            return []
+        sentence = f"node {seen.node.name[:80]} {does} {seen.topic[:120]} {faults[0]}"
         if sentence in self._told or len(self._told) >= MOST_TOLD:
-            return None
+            return []
         self._told.add(sentence)
-        return sentence
+        return [sentence]
 
 
 def _why_not(seen: Endpoint, mine: Endpoint) -> str | None:

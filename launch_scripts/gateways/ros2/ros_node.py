@@ -53,21 +53,11 @@ class Newest:
     def __init__(self, node: Node, endpoint: Endpoint, most_bytes: int) -> None:
         self.endpoint = endpoint
         self._node, self._most_bytes = node, most_bytes
-        self._wake: Callable[[], None] | None = None
         self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
 
     def keep(self, sample: zenoh.Sample) -> None:
         """On Zenoh's threads: keeps the bytes as they are."""
         self._waiting.append(sample)
-        if self._wake is not None:
-            self._wake()
-
-    def on_each(self, wake: Callable[[], None]) -> None:
-        """Calls `wake` for each message that comes, on Zenoh's thread; and at once for what has come already: a
-        latched message may be here before anybody can ask for it."""
-        self._wake = wake
-        if self._waiting:
-            wake()
 
     def take(self) -> Any | None:
         """The newest message, once; None if none has come, or it is none of its type."""

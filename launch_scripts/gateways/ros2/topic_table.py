@@ -51,7 +51,7 @@ class TopicRow:
 _OUT, _IN, _SERVICE = Direction.OUT, Direction.IN, Direction.SERVICE
 TABLE: tuple[TopicRow, ...] = (
     TopicRow("map", "/map", "nav_msgs/msg/OccupancyGrid", Qos.LATCHED, _OUT, None,
-             "How fast each cell may be driven; put again when much of it has changed."),
+             "How fast each cell may be driven; put again now and then while it changes."),
     TopicRow("map_updates", "/map_updates", "map_msgs/msg/OccupancyGridUpdate", Qos.DEFAULT, _OUT, 1.0,
              "Windows of the map that marks have changed."),
     TopicRow("tf", "/tf", "tf2_msgs/msg/TFMessage", Qos.TRANSFORMS, _OUT, 10.0,

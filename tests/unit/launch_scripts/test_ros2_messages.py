@@ -220,10 +220,9 @@ def test_what_is_drawn_on_screen_is_what_was_drawn_last(histories: list[list[tup
 
 
 def test_drawings_lie_where_they_are_in_the_map_frame() -> None:
-    cubes, none = map_messages.marked_cells(GRID, [0, 23], [])
+    cubes, none, zone = map_messages.marked_cells(GRID, [0, 23], [], [7])
     assert len(none.points_m) == 0
     outline = map_messages.windows(GRID, [Window(0, 0, 1, 2)])
-    zone = map_messages.zone(GRID, True, np.array([7], np.uint32))
     messages = maker()
     array = as_sent(messages, map_messages.marker_array(messages, STAMP_NS, [cubes, none, outline, zone]))
     _, lethal, window, zone = array.markers
@@ -231,8 +230,7 @@ def test_drawings_lie_where_they_are_in_the_map_frame() -> None:
     assert (lethal.type, lethal.scale.x, lethal.ns, lethal.id) == (6, 25.0, "marks", 0)
     assert {(p.x, p.y) for p in window.points} == {(0, 100), (50, 100), (50, 75), (0, 75)}
     assert len(window.points) == 8
-    assert (zone.ns, zone.type) == ("zones/closed", 5)
-    assert {(p.x, p.y) for p in zone.points} == {(25, 75), (50, 75), (25, 50), (50, 50)}
+    assert (zone.ns, [(p.x, p.y) for p in zone.points]) == ("zones", [(37.5, 62.5)])
     assert zone.pose.orientation.w == 1
 
 
@@ -258,7 +256,7 @@ def every_message(messages: RosMessages) -> list[Any]:
         map_messages.occupancy_grid(messages, STAMP_NS, np.full((4, 6), -1, np.int8)),
         map_messages.occupancy_update(messages, STAMP_NS, np.full((2, 3), 100, np.int8), Window(1, 1, 3, 4)),
         map_messages.marker_array(
-            messages, STAMP_NS, [map_messages.route(GRID, LINE_M), *map_messages.marked_cells(GRID, [3], [4])]
+            messages, STAMP_NS, [map_messages.route(GRID, LINE_M), *map_messages.marked_cells(GRID, [3], [4], [5])]
         ),
     ]
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -117,13 +119,14 @@ def test_bytes_that_are_no_message_raise_only_a_protocol_error(content: bytes, n
             types.unpack(each, name)
 
 
-@pytest.mark.parametrize("early", [True, False])
-def test_a_message_that_comes_before_anybody_asks_wakes_as_a_later_one_does(early: bool) -> None:
-    nothing: Any = None
-    newest, woken = Newest(nothing, nothing, 100), []
-    if early:
-        newest.keep(nothing)
-    newest.on_each(lambda: woken.append(True))
-    if not early:
-        newest.keep(nothing)
-    assert woken == [True]
+def test_the_newest_message_waits_until_somebody_asks_and_is_taken_once() -> None:
+    types, name = types_of(Distribution.JAZZY), "std_msgs/msg/String"
+    node: Any = SimpleNamespace(types=types, dropped=lambda topic, error: None)
+    newest = Newest(node, SimpleNamespace(topic="/said", type_name=name), 100)  # type: ignore[arg-type]
+    for word in ("old", "new"):
+        content = zenoh.ZBytes(types.pack(types.make(name, data=word), name))
+        newest.keep(SimpleNamespace(payload=content))  # type: ignore[arg-type]
+    assert newest.take().data == "new"  # type: ignore[union-attr]
+    assert newest.take() is None
+    newest.keep(SimpleNamespace(payload=zenoh.ZBytes(bytes(200))))  # type: ignore[arg-type]
+    assert newest.take() is None, "more bytes than a message may have"

@@ -23,8 +23,6 @@ from swarm.config.agents import agent_of
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.02
-"""How often `tick` is best called."""
 MOST_ROBOTS = 256
 _LOOK_NS = NS_PER_S // 2
 """The swarm's own vehicles are looked at so often."""
@@ -100,11 +98,9 @@ class Incoming:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What has come in of the robots that are known, and how many of these are vehicles now."""
-        found = Counter({"robots": sum(robot.present for robot in self._robots.values())})
-        for robot in self._robots.values():
-            found.update(robot.counts)
-        return found
+        """How many robots are vehicles now, and what was refused of those that are known."""
+        robots = self._robots.values()
+        return {"robots": sum(each.present for each in robots), "refused": sum(each.refused for each in robots)}
 
     @property
     def _parts(self) -> list[Robot | Input]:

@@ -24,49 +24,20 @@ Answer = Callable[[Route | str], None]
 """Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
 
 
-class GoalTargets:
+class PlaceRoutes:
     """A few external targets, lent to those who need a route to a place. One serves all who go to the same cell.
 
-    A target that nobody needs stays where it is, so that its tree is good for the next one who goes there; the one
-    that has been idle for the longest is taken first. Pure.
-    """
+    A target that nobody needs stays where it is, so that its tree is good for the next one who goes there.
 
-    def __init__(self, ids: Sequence[str]) -> None:
-        self._cells: dict[str, int | None] = dict.fromkeys(ids)
-        """Where each stands, None before it was lent first. The one that was lent last is the last."""
-        self._users: Counter[str] = Counter()
-
-    def lend(self, cell: int) -> tuple[str, bool] | None:
-        """(target, whether it stands there already) for a goal in a cell; None if all are in use elsewhere."""
-        there = next((id for id, at in self._cells.items() if at == cell), None)
-        id = there or next((id for id in self._cells if not self._users[id]), None)
-        if id is None:
-            return None
-        del self._cells[id]
-        self._cells[id] = cell
-        self._users[id] += 1
-        return id, there is not None
-
-    def give_back(self, id: str) -> None:
-        """One who was lent it needs it no more."""
-        if self._users[id] <= 0:
-            raise ValueError(f"{id} is lent to nobody")
-        self._users[id] -= 1
-
-    def cell_of(self, id: str) -> int | None:
-        """Where it stands; None before it was lent first."""
-        return self._cells[id]
-
-
-class PlaceRoutes:
-    """Asks without waiting. Any thread may call.
-
-    goal_targets  external targets of the scenario that stand for goals
+    goal_targets  their ids
+    queue         does the waiting for planners
     """
 
     def __init__(self, swarm: Swarm, goal_targets: Sequence[str], queue: WorkQueue | None = None) -> None:
-        self._swarm, self._ids = swarm, goal_targets
-        self._pool = GoalTargets(goal_targets)
+        self._swarm = swarm
+        self._cells: dict[str, int | None] = dict.fromkeys(goal_targets)
+        """Where each stands; None before it was lent first."""
+        self._users: Counter[str] = Counter()
         self._targets: dict[str, Target] = {}
         self._lock = threading.Lock()
         self._queue = queue or WorkQueue("ros2-routes", _THREADS, MOST_WAITING)
@@ -76,35 +47,30 @@ class PlaceRoutes:
         free, or it cannot be put there."""
         cell = self._swarm.frame.cell(goal.x_m, goal.y_m)
         with self._lock:
-            lent = self._pool.lend(cell)
-            if lent is None:
-                ids = ", ".join(self._ids)
-                raise SwarmError(
-                    f"all goal targets are in use: {ids}" if ids
-                    else "no goal_targets are set, so no place can be a goal"
-                )  # fmt: skip
-            id, there = lent
-            try:
+            there = [id for id, at in self._cells.items() if at == cell]
+            free = [id for id in self._cells if not self._users[id]]
+            if not self._cells:
+                raise SwarmError("no goal_targets are set, so no place can be a goal")
+            if not there and not free:
+                raise SwarmError(f"all goal targets are in use: {', '.join(self._cells)}")
+            id = (there or free)[0]
+            if not there:
                 if id not in self._targets:
                     self._targets[id] = self._swarm.target(id, tracker=TRACKER)
-                if not there:
-                    self._targets[id].at(goal.x_m, goal.y_m)
-            except SwarmError:
-                self._pool.give_back(id)
-                raise
+                self._targets[id].at(goal.x_m, goal.y_m)
+                self._cells[id] = cell
+            self._users[id] += 1
             return id
 
     def give_back(self, target: str) -> None:
         """What was lent is needed no more."""
         with self._lock:
-            self._pool.give_back(target)
+            self._users[target] -= 1
 
     def to_target(
-        self, target: str, start: Place, vehicle_class: str, answer: Answer, *, lent: bool = False
+        self, target: str, start: Place, vehicle_class: str, answer: Answer, cell: int | None = None
     ) -> None:
-        """Finds the route to a target: wherever it is, or to where it was put that is lent."""
-        with self._lock:
-            cell = self._pool.cell_of(target) if lent else None
+        """Finds the route to a target: wherever it is, or to the cell where it was put."""
 
         def find() -> None:
             answer(self._find(target, cell, start, vehicle_class))
@@ -124,7 +90,7 @@ class PlaceRoutes:
             self.give_back(lent)
             answer(found)
 
-        self.to_target(lent, start, vehicle_class, give_back, lent=True)
+        self.to_target(lent, start, vehicle_class, give_back, self._swarm.frame.cell(goal.x_m, goal.y_m))
 
     def close(self) -> None:
         """Answers what waits, and lets all targets go."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
-from collections import Counter
+from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
@@ -18,20 +18,22 @@ from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages, packed_path
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher
 from launch_scripts.gateways.ros2.topic_table import POSE_TYPES, ROBOT
-from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, Vehicle
+from swarm.client import BusError, ConfigError, Route, Stream, Swarm, SwarmError, Vehicle
 from swarm.clock import NS_PER_S
 
 log = logging.getLogger(__name__)
 
 _GOAL_HZ = 10.0
 """A robot is given no more goals; of several the newest counts."""
+_MOST_POSTED = 64
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
 
 
 class Robot:
-    """Made when a robot is found, closed when it is gone.
+    """Made when a robot is found, closed when it is gone. One thread calls `tick`, and owns all state; what answers
+    on others is posted to it.
 
     topic     where it says where it is
     is_taken  whether a vehicle of the swarm's own is called so in ROS
@@ -51,18 +53,19 @@ class Robot:
             return topic.replace(ROBOT, id)
 
         self.id, self.topic = id, own(robots.topic)
-        self.counts: Counter[str] = Counter()
         self._robots, self._node, self._swarm, self._routes, self._messages = robots, node, swarm, routes, messages
         self._is_taken = is_taken
         self._reader = FrameReader(messages.map, own(robots.frame), robots.offset_m, robots.turn_rad)
         self._track = Track(self._reader, robots.lease_s)
         self._vehicle: Vehicle | None = None
+        self._followed: Stream[Route] | None = None
+        """Routes to the target that it follows."""
         self._goal: tuple[str, int] | None = None
         """Target that is lent for its goal, and its cell; None while it has no goal of its own."""
         self._goal_cell: int | None = None
         """Of the goal_pose that was put last."""
-        self._lock = threading.RLock()
-        """Held while any of the above is read or changed: threads of ROS, the swarm and the gateway come here."""
+        self._posted: deque[Callable[[], None]] = deque(maxlen=_MOST_POSTED)
+        """What is to be done at the next tick."""
         self._poses = Input(node, self.topic, POSE_TYPES[robots.type], robots.hz, self._hear_pose, qos=Qos.SENSOR)
         self._goals = Input(node, own(robots.goal), _POSE, _GOAL_HZ, self._hear_goal)
         self._plan = node.publisher(own(robots.plan), "nav_msgs/msg/Path", Qos.LATCHED)
@@ -70,37 +73,39 @@ class Robot:
         self._certificate = node.publisher(f"/{id}/plan_certificate", status, Qos.LATCHED)
         self._goal_out = node.publisher(own(robots.goal), _POSE)
         self._service = node.serve(f"/{id}/get_plan", "nav_msgs/srv/GetPlan", self._answer_plan)
-        self._goals.newest.on_each(self._take_goal)
 
     @property
     def present(self) -> bool:
         """Whether it is a vehicle of the swarm now."""
         return self._vehicle is not None
 
+    @property
+    def refused(self) -> int:
+        return self._poses.refused + self._goals.refused
+
     def tick(self, now_ns: int) -> None:
         """Tells the swarm where it is, if that was said; ends its life if it was not for too long."""
-        with self._lock:
-            self._poses.tick(now_ns)
-            self.counts["refused"] = self._poses.refused
-            if self._track.gone(now_ns):
-                self._leave()
-            self._goals.tick(now_ns)
+        while self._posted:
+            self._posted.popleft()()
+        self._poses.tick(now_ns)
+        if self._track.gone(now_ns):
+            self._leave()
+        self._goals.tick(now_ns)
+        while self._followed is not None and (route := self._followed.next(0.0)) is not None:
+            self._hear_route(route)
 
     def close(self) -> None:
         """Takes it away, with all that was declared for it."""
-        with self._lock:
-            self._leave()
+        self._leave()
         self._poses.close()
         self._goals.close()
-        for publisher in (self._plan, self._certificate, self._goal_out):
-            self._node.remove(publisher.endpoint)
-        self._node.remove(self._service)
+        for endpoint in (self._plan.endpoint, self._certificate.endpoint, self._goal_out.endpoint, self._service):
+            self._node.remove(endpoint)
 
     # --- where it is --------------------------------------------------------------------------------------------
 
     def _hear_pose(self, message: Any, now_ns: int) -> None:
         """Raises SwarmError."""
-        self.counts["poses"] += 1
         place, robots = self._track.hear(message, now_ns), self._robots
         if self._is_taken(self.id):  # which may be seen late: the swarm's vehicles come after the connection
             self._leave()
@@ -108,26 +113,23 @@ class Robot:
                 f"robot {self.id} is not taken in: the swarm has a vehicle that ROS knows by this name; is "
                 "its topic that of another gateway?"
             )
+        first = self._vehicle is None
         if self._vehicle is None:
             self._vehicle = self._swarm.vehicle(
                 self.id, group=robots.group, radius_m=robots.radius_m, lease_s=robots.lease_s,
                 vehicle_class=robots.vehicle_class,
             )  # fmt: skip
-            self._vehicle.on_route(self._hear_route)
             log.info("robot %s of ROS is a vehicle: %s", self.id, self.topic)
-        first = not self.counts["told"]
         self._vehicle.at(place.x_m, place.y_m, heading_rad=place.heading_rad, speed_m_per_s=place.speed_m_per_s)
-        self.counts["told"] += 1
-        if self._goal is not None and self._vehicle.cell == self._goal[1]:
+        at_goal = self._goal is not None and self._vehicle.cell == self._goal[1]
+        if at_goal:
             log.info("robot %s is at its goal", self.id)
             self._end_goal()
-            self._follow_target()
-        elif first:
-            self._follow_target()
+        if first or at_goal:
+            self._follow(robots.target)
 
     def _leave(self) -> None:
         self._end_goal()
-        self.counts["told"] = 0
         if self._vehicle is not None:
             log.info("robot %s of ROS is no vehicle any more: nothing is heard on %s", self.id, self.topic)
             self._vehicle.leave()
@@ -135,81 +137,70 @@ class Robot:
 
     # --- where it goes ------------------------------------------------------------------------------------------
 
-    def _follow_target(self) -> None:
+    def _follow(self, target: str | None) -> None:
         """Raises SwarmError."""
-        if self._robots.target and self._vehicle is not None:
-            self._vehicle.follow(self._robots.target)
+        if target and self._vehicle is not None:
+            self._followed = self._vehicle.follow(target)
 
     def _end_goal(self) -> None:
+        """It follows nothing any more."""
         if self._goal is not None:
             self._routes.give_back(self._goal[0])
-            self._goal = None
+        self._goal = self._followed = None
         if self._vehicle is not None:
             self._vehicle.unfollow()
 
-    def _take_goal(self) -> None:
-        """On a thread of ROS, as soon as a goal comes."""
-        with self._lock:
-            self._goals.tick(time.monotonic_ns())
-
     def _hear_goal(self, message: Any, now_ns: int) -> None:
         """Raises SwarmError if it cannot have this goal: then it has none, as its plan says."""
-        self.counts["goals"] += 1
-        self._poses.tick(now_ns)  # which may have come just before
         self._end_goal()
         try:
             if self._vehicle is None or self._track.place is None:
                 raise ConfigError(f"robot {self.id} has not said where it is, so it gets no goal")
             if (target := _target_frame(message)) is not None:
-                self._vehicle.follow(target)
+                self._follow(target)
                 return
             goal, start = self._reader.pose(message.header, message.pose), self._track.place
             lent = self._routes.lend(goal)
-            self._goal = lent, self._swarm.frame.cell(goal.x_m, goal.y_m)
-            self._vehicle.follow(lent)
-            # The first route is asked for at once; newer ones are pushed.
-            self._routes.to_target(lent, start, self._robots.vehicle_class, self._hear_first, lent=True)
+            self._goal = sought = lent, self._swarm.frame.cell(goal.x_m, goal.y_m)
+            self._follow(lent)
         except SwarmError as error:
             self._end_goal()
             self._put_plan(str(error))
-            self._follow_target()
+            self._follow(self._robots.target)
             raise
+        # The first route is asked for at once; newer ones are pushed.
+        self._routes.to_target(
+            lent, start, self._robots.vehicle_class,
+            lambda found: self._posted.append(lambda: self._hear_first(sought, found)), sought[1],
+        )  # fmt: skip
 
-    def _hear_first(self, found: Route | str) -> None:
-        if isinstance(found, str):
+    def _hear_first(self, sought: tuple[str, int], found: Route | str) -> None:
+        if not isinstance(found, str):
+            self._hear_route(found)
+        elif self._goal == sought:
             self._goals.refuse(found)
             self._put_plan(found)
-        else:
-            self._hear_route(found)
 
     def _hear_route(self, route: Route) -> None:
-        """On the thread of the swarm's connection, or of the queue."""
-        with self._lock:
-            goal = self._goal
-            if self._vehicle is None or (goal is not None and (route.target, route.target_cell) != goal):
-                return
-            end = route.cells[-1] if route.ok and route.remaining_s == 0 else None
-            moved = goal is None and end is not None and end != self._goal_cell
-            if moved:
-                self._goal_cell = end
+        """A route to where its goal's target stood before is none of it."""
+        if self._vehicle is None or (self._goal is not None and (route.target, route.target_cell) != self._goal):
+            return
         self._put_plan(route)
-        if moved and end is not None:
+        end = route.cells[-1] if route.ok and route.remaining_s == 0 else None
+        if self._goal is None and end is not None and end != self._goal_cell:
+            self._goal_cell = end
             pose = self._messages.pose_stamped(time.time_ns(), *self._swarm.frame.centre_m(end))
             self._put(self._goal_out, pose)
 
     def _put_plan(self, found: Route | str) -> None:
         stamp_ns = time.time_ns()
-        self.counts["plans"] += 1
         self._put(self._plan, path_of(self._messages, stamp_ns, found))
         self._put(self._certificate, certificate_of(self._messages, stamp_ns, self.id, found))
 
     def _put(self, publisher: Publisher, message: Any) -> None:
-        """From any thread, one at a time. What a lost link does not take is counted."""
-        with self._lock:
-            try:
-                publisher.put(message)
-            except BusError:
-                self.counts["put_failed"] += 1
+        """What a lost link does not take is lost."""
+        with suppress(BusError):
+            publisher.put(message)
 
     # --- questions ----------------------------------------------------------------------------------------------
 
@@ -219,9 +210,9 @@ class Robot:
         def answer(found: Route | str) -> None:
             stamp_ns = time.time_ns()
             reply(path_of(self._messages, stamp_ns, found))
-            self._put(self._certificate, certificate_of(self._messages, stamp_ns, self.id, found))
+            certificate = certificate_of(self._messages, stamp_ns, self.id, found)
+            self._posted.append(lambda: self._put(self._certificate, certificate))
 
-        self.counts["questions"] += 1
         what = "start"
         try:
             start = self._start_of(request.start)
@@ -238,11 +229,9 @@ class Robot:
         """Where a plan begins: where it says, or without a frame where the robot is. Raises ConfigError."""
         if start.header.frame_id:
             return self._reader.pose(start.header, start.pose)
-        with self._lock:
-            self._poses.tick(time.monotonic_ns())
-            if self._track.place is None:
-                raise ConfigError(f"robot {self.id} has not said where it is: give a start with a frame")
-            return self._track.place
+        if (place := self._track.place) is None:
+            raise ConfigError(f"robot {self.id} has not said where it is: give a start with a frame")
+        return place
 
 
 def path_of(messages: RosMessages, stamp_ns: int, route: Route | str) -> bytes:

@@ -28,35 +28,26 @@ class WorkQueue:
 
     def __init__(self, name: str, threads: int, most: int) -> None:
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
-        self._lock = threading.Lock()
-        self._most = most
-        self._waiting = 0
+        self._room = threading.Semaphore(most)
 
     def give(self, what: str, work: Callable[[], None], failed: Failed) -> bool:
         """Does it when its turn comes; `failed` is called with a sentence if it raises, or the queue is closed.
         Returns False, and does nothing, if too much waits already."""
-        with self._lock:
-            if self._waiting >= self._most:
-                return False
-            self._waiting += 1
-
-        def run() -> None:
-            try:
-                work()
-            except SwarmError as error:
-                failed(str(error))
-            except Exception:
-                log.exception("%s failed", what)
-                failed(f"{what} failed: see the gateway's log")
+        if not self._room.acquire(blocking=False):
+            return False
 
         def end(done: Future[None]) -> None:
-            with self._lock:
-                self._waiting -= 1
+            self._room.release()
             if done.cancelled():
                 failed("the gateway ends")
+            elif isinstance(error := done.exception(), SwarmError):
+                failed(str(error))
+            elif error is not None:
+                log.error("%s failed", what, exc_info=error)
+                failed(f"{what} failed: see the gateway's log")
 
         try:
-            self._pool.submit(run).add_done_callback(end)
+            self._pool.submit(work).add_done_callback(end)
         except RuntimeError:  # it is closed
             failed("the gateway ends")
         return True
