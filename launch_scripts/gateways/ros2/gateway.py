@@ -32,14 +32,11 @@ MOST_VEHICLES = 1000
 """More are not told: each has topics of its own, and each topic a token."""
 MOST_CUBES = 5000
 """The marked cells of each kind that are drawn; all of them are in the map."""
-_STEP_HZ, _MAP_HZ = 10.0, 1.0
-"""What has no rate of its own is looked at so often; the map less often, as it is large."""
-_BARE = ("tf", "tf_static")
-"""Topics that each vehicle has for itself where its frames are bare."""
+_STEP_HZ, _SELDOM_HZ = 10.0, 1.0
+"""What has no rate of its own is looked at so often; what is large less often."""
+_SELDOM = ("map", "plan")
 _STANDS_NS = NS_PER_S // 2
 """A vehicle of which no other place was told for so long stands."""
-_PLAN_NS = NS_PER_S
-"""A vehicle's route is told at most so often."""
 _BAD_STATES = ("stranded", "lost")
 ToWgs84 = Callable[[float, float], tuple[float, float]]
 
@@ -126,7 +123,6 @@ class Moving:
         self.route: NDArray[np.float64] = np.empty((0, 2), np.float64)
         self.route_is_new = False
         self.odometry = ros_messages.packed_odometry(made, frames)
-        self._route_told_ns = now_ns - _PLAN_NS
         self._moved_ns = now_ns
 
     def take(self, seen: SeenVehicle, now_ns: int) -> None:
@@ -149,13 +145,6 @@ class Moving:
                     turned_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
             self.speed_m_per_s, self.turn_rad_per_s = forward_m / since_s, turned_rad / since_s
         self.place, self._moved_ns = (seen.x_m, seen.y_m, heading_rad), now_ns
-
-    def take_route(self, now_ns: int) -> bool:
-        """Whether its route is to be told now; then it is told."""
-        if not self.route_is_new or now_ns - self._route_told_ns < _PLAN_NS:
-            return False
-        self.route_is_new, self._route_told_ns = False, now_ns
-        return True
 
 
 class Gateway:
@@ -194,7 +183,7 @@ class Gateway:
         """The whole map is to be put."""
         self._due_ns = dict.fromkeys(self._rows, 0)
         """When each row is told again, by the clock that never leaps."""
-        always = tuple(self._channel(row.name) for row in self._rows.values() if self._per(row) is None)
+        always = tuple(self._channel(row.name) for row in self._rows.values() if row.per is None)
         self._first: list[Action] = [Declare(always)]
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
             "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
@@ -293,18 +282,11 @@ class Gateway:
             self._refused.add(who)
             self._problems.append(f"{who} is not told to ROS: {why}")
 
-    def _per(self, row: TopicRow) -> str | None:
-        """What there is a topic of the row for each of: VEHICLE, TARGET, or None."""
-        return VEHICLE if self._bare and row.name in _BARE else row.per
-
     def _channels(self, per: str, name: str) -> tuple[Channel, ...]:
-        return tuple(self._channel(row.name, name) for row in self._rows.values() if self._per(row) == per)
+        return tuple(self._channel(row.name, name) for row in self._rows.values() if row.per == per)
 
     def _channel(self, row: str, name: str | None = None) -> Channel:
-        topic = self._rows[row].topic
-        if name is not None and self._rows[row].per is None:
-            return Channel(row, f"/{name}{topic}")
-        return Channel(row, topic.replace(VEHICLE, name or "").replace(TARGET, name or ""))
+        return Channel(row, self._rows[row].topic.replace(VEHICLE, name or "").replace(TARGET, name or ""))
 
     # --- vehicles -------------------------------------------------------------------------------------------------
 
@@ -319,7 +301,8 @@ class Gateway:
 
     def _tell_plans(self, now: _Now) -> _Told:
         for name, each in self._vehicles.items():
-            if each.take_route(now.now_ns):
+            if each.route_is_new:
+                each.route_is_new = False
                 yield name, ros_messages.packed_path(self._messages.map, now.stamp_ns, each.route)
 
     def _tell_fixes(self, now: _Now) -> _Told:
@@ -433,6 +416,6 @@ class Gateway:
 
 def _next_ns(row: TopicRow, now_ns: int) -> int:
     """The next multiple of its period: topics of one rate stay together, and no delay adds up."""
-    hz = row.hz or (_MAP_HZ if row.name == "map" else _STEP_HZ)
+    hz = row.hz or (_SELDOM_HZ if row.name in _SELDOM else _STEP_HZ)
     period_ns = int(NS_PER_S / hz)
     return (now_ns // period_ns + 1) * period_ns

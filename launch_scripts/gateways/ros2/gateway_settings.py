@@ -234,7 +234,8 @@ class Settings(Section, frozen=True, kw_only=True):
 
     def _changed(self, row: topic_table.TopicRow) -> topic_table.TopicRow:
         changes = self.topics.get(row.name, TopicSettings())
-        return replace(row, topic=changes.topic or row.topic, hz=changes.hz or row.hz)
+        before = f"/{topic_table.VEHICLE}" if self.frames.bare and row.name in topic_table.FRAMES else ""
+        return replace(row, topic=before + (changes.topic or row.topic), hz=changes.hz or row.hz)
 
 
 def incoming_rows(settings: IncomingSettings, *, has_map: bool) -> list[topic_table.TopicRow]:

@@ -78,6 +78,8 @@ TABLE: tuple[TopicRow, ...] = (
              "How many vehicles are in which state, targets, links, what was dropped."),
 )  # fmt: skip
 ROWS = {row.name: row for row in TABLE}
+FRAMES = ("tf", "tf_static")
+"""Topics that each vehicle has for itself where its frames are bare."""
 
 _POSE, _TRIGGER = "geometry_msgs/msg/PoseStamped", "std_srvs/srv/Trigger"
 ROBOT_TABLE: tuple[TopicRow, ...] = (
