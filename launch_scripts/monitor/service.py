@@ -21,6 +21,7 @@ from launch_scripts.monitor.live_layout import (
     summary_markdown,
 )
 from launch_scripts.monitor.movers.movers_view import MoversView
+from launch_scripts.monitor.movers.styles import RateLimit
 from launch_scripts.monitor.sinks import Pen, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
@@ -56,8 +57,8 @@ _ROUTES_SEEN_S = 0.5
 """For those who look routes are taken so often."""
 _UNSEEN = 2
 """While nobody looks each frame but the second is left out: what is drawn is for the recording only."""
-_ANEW_NS = 10 * NS_PER_S
-"""For viewers that come, what is drawn on change only is drawn anew, but not more often than this."""
+_EVERY_S = {"anew": 10.0, "figures": 1.0}
+"""How often for viewers that come what is drawn on change only is drawn anew at most, and figures are drawn."""
 _ANSWER_S = 5.0
 
 
@@ -104,13 +105,12 @@ class MonitorService:
         self._watched = False
         self._drawn_for = 0
         """So many viewers had ever come when all was drawn anew last."""
-        self._anew_due_ns = 0
+        self._limit = RateLimit(_EVERY_S)
         self._turn = self._frame = 0
         """Ticks so far, and those in which something was drawn."""
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
         self._last_sample_s = -1.0
-        self._figures_due_ns = 0
         self._member.needs("the shared map", lambda: self._sync.joined)
 
     def lacks(self) -> list[str]:
@@ -156,7 +156,7 @@ class MonitorService:
         for heard in self._observer.due(now_ns, all=True):
             self._hear(heard, now_ns)
         self.figures.finish(now_ns)
-        self._figures_due_ns = now_ns
+        self._limit.all_due()
         self._ground.finish()
         self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
         self.over = True
@@ -212,8 +212,8 @@ class MonitorService:
         self._frame += 1
         self._pen.set_time(self._frame, self.at_s)
         self._watch_recording(now_ns)
-        if viewers > self._drawn_for and now_ns >= self._anew_due_ns:
-            self._drawn_for, self._anew_due_ns = viewers, now_ns + _ANEW_NS
+        if viewers > self._drawn_for and self._limit.due("anew", now_ns):
+            self._drawn_for = viewers
             self._pen.forget()
             self._ground.draw_anew()
             self._movers.draw_anew()
@@ -230,12 +230,10 @@ class MonitorService:
         if sample is not None and sample.time_s != self._last_sample_s:
             self._last_sample_s = sample.time_s
             self._panel.plots(sample)
-        if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
-            return
-        self._figures_due_ns = now_ns + NS_PER_S
-        summary = self.figures.shown(now_ns)
-        self._movers.summarised(summary)
-        self._panel.summary(summary_markdown(self._setup, summary))
+        if self._limit.due("figures", now_ns):  # by our own clock: a swarm that says nothing any more is news, too
+            summary = self.figures.shown(now_ns)
+            self._movers.summarised(summary)
+            self._panel.summary(summary_markdown(self._setup, summary))
 
 
 def load_view(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
+from support.target_reports import planner_status
 
 from launch_scripts.observe.counts import Counts
 from launch_scripts.web.prometheus import HELP, Figures, OneScrape, Run, families
 from shared_map.keeper.service import THROTTLED
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, READY, Counters
-from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -43,11 +43,7 @@ def exported() -> dict[str, set[str]]:
             },
         )
     )  # fmt: skip
-    status = PlannerStatus(
-        target="t0", incarnation=1, stamp_ns=1, strategy="exact", target_cell=5, map_version=1, tree_age_ms=250.0,
-        window=[], growths=2, window_growths=3, growth_ms=4.0, routes_served=5, following=7, pose_age_s=0.5,
-        tracker_lost=True,
-    )  # fmt: skip
+    status = planner_status(pose_age_s=0.5, tracker_lost=True)
     figures = Figures(Run("r", "demo", 1), counts, {"t0": status}, [("agent", "a0")])
     text = generate_latest(OneScrape(families(figures))).decode()
     found: dict[str, set[str]] = {}

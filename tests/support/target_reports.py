@@ -1,11 +1,14 @@
-"""Level ground, and the reports of vehicles on it."""
+"""Level ground, and the reports of vehicles and planners on it."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 
 FLAT = 0.1
@@ -44,3 +47,16 @@ def fleet(
         states=bytes([state] * count),
         targets=bytes([NO_TARGET if target is None else 0] * count),
     )
+
+
+def planner_status(target: str = "t0", **told: Any) -> PlannerStatus:
+    """What a planner tells of itself once a second.
+
+    told  fields that differ from those here
+    """
+    fields = {
+        "incarnation": 1, "stamp_ns": 1, "strategy": "exact", "target_cell": 5, "map_version": 1,
+        "tree_age_ms": 1.0,
+        "window": [], "growths": 3, "window_growths": 2, "growth_ms": 1.5, "routes_served": 9, "following": 1,
+    }  # fmt: skip
+    return PlannerStatus(target=target, **(fields | told))

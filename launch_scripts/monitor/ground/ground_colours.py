@@ -25,7 +25,6 @@ from shared_map.arrays import Bools
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.pyramid import any_in_blocks
 from shared_map.terrain.terrain import Terrain
-from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest
@@ -50,7 +49,6 @@ _MOST_FACTOR = 4.0
 _COST_STEPS = 256
 Ints = NDArray[np.int64]
 _MOST_SAMPLES = 64 * 64
-_ASK_NS = 2 * NS_PER_S
 _BESIDE = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 _ON_THE_WAY = np.linspace(0, 1, 9)[1:-1]
 """Where between two samples it is looked for lethal cells."""
@@ -241,26 +239,20 @@ class CostSamples:
         self._shown = shown
         self.targets: deque[str] = deque()
         """Targets with a planner, the one that was asked least lately first."""
-        self._due_ns, self._asked = 0, 0
+        self._asked = 0
 
     def hear_target(self, target: str) -> None:
         """A planner told its state."""
         if target not in self.targets:
             self.targets.append(target)
 
-    def next_target(self, now_ns: int, slower: int = 1) -> str | None:
-        """The target to ask about now, if it is time.
-
-        slower  by how many times as seldom as somebody needs who looks
-        """
-        if now_ns < self._due_ns or not self.targets:
-            return None
-        self._due_ns = now_ns + slower * _ASK_NS
+    def next_target(self) -> str | None:
+        """The target to ask about; None while none has a planner."""
         self._asked += 1
         if self._asked % 2 and self._shown in self.targets:
             return self._shown
         self.targets.rotate(-1)
-        return self.targets[-1]
+        return self.targets[-1] if self.targets else None
 
     def hear(self, reply: CostReply) -> bool:
         """Takes an answer in. Returns whether it says something."""
@@ -336,10 +328,10 @@ class TargetPictures:
     def __init__(self, mesh: TerrainMesh, colours: GroundColours, samples: CostSamples) -> None:
         self._mesh, self._colours, self._samples = mesh, colours, samples
         grid = mesh.grid
+        pixel = max(grid.rows, grid.cols) / _PIXELS
         self._rows, self._cols = (
-            ((np.arange(pixels) + 0.5) / pixels * side).astype(np.int64)
+            np.linspace(0, side - 1, max(1, round(side / pixel))).astype(np.int64)
             for side in (grid.rows, grid.cols)
-            for pixels in (max(1, round(side * _PIXELS / max(grid.rows, grid.cols))),)
         )
         self._palette = between(COST_TO_GO_COLOURS, 256)
         self.full_s = 0.0

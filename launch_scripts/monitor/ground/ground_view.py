@@ -7,8 +7,8 @@ logged once: see docs/decisions/0008-the-live-view.md.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -37,7 +37,7 @@ from launch_scripts.monitor.live_layout import (
     Scale,
     legend_picture,
 )
-from launch_scripts.monitor.movers.styles import Look
+from launch_scripts.monitor.movers.styles import Look, RateLimit
 from launch_scripts.monitor.sinks import Pen, screen
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
@@ -45,12 +45,11 @@ from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import zone_mask
-from swarm.clock import NS_PER_S
 from swarm.config.classes import class_numbers
 from swarm.config.ground import ZoneConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
-from swarm.grid import GridSpec, Window
+from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 
@@ -63,8 +62,8 @@ _RULES: dict[str, Rule] = {
 _MOST_EDGES = 20_000
 """Sides of texels along a border that is drawn. A zone with more is named, and hatched if closed."""
 _LARGEST_FILE = 1 << 25
-_LAYER_NS = 5 * NS_PER_S
-_NEAREST_NS = 8 * NS_PER_S
+_EVERY_S = {"photo": 1.0, "cost": 5.0, "known": 5.0, "learned": 5.0, "nearest": 8.0, "question": 2.0}
+"""How often tiles of a layer that are out of date are drawn, and a planner is asked for costs."""
 _UNSEEN = 4
 """While nobody looks the ground is drawn so many times as seldom, for the recording."""
 _TILES_AT_ONCE = 80
@@ -94,22 +93,6 @@ class Area:
     def title(self) -> str:
         whom = "" if self.vehicle_class is None else f" for {self.vehicle_class}"
         return self.name if self.name == self.rule else f"{self.name}: {self.rule}{whom}"
-
-
-@dataclass(eq=False)
-class _Tiles:
-    """A layer of tiles: which are out of date. Marks come many times a second to the same tiles, and each of their
-    pictures is drawn once for all; one that looks as before is not logged again.
-
-    layer      whose tiles these are
-    every_ns   how often tiles that are out of date are drawn
-    """
-
-    layer: Layer
-    picture: Callable[[Window], Bytes]
-    every_ns: int
-    due_ns: int = 0
-    stale: dict[int, None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,29 +131,32 @@ class GroundView:
         now, prior = cost_map.ground_s_per_m, cost_map.prior_s_per_m
         self._colours = colours = GroundColours(self._mesh, terrain, now, scene.truth, prior)
         self._colours.close(closed_cells(self._zones))
-        tiled = (
-            _Tiles(PHOTO, colours.photo_of, NS_PER_S),
-            _Tiles(COST, colours.cost_of, _LAYER_NS),
-            _Tiles(KNOWN, colours.known_of, _LAYER_NS),
-            _Tiles(LEARNED, colours.learned_of, _LAYER_NS),
-        )
-        self._layers = [each for each in tiled if each.layer in scene.layers]
-        self._entities = {layer.entity for layer in scene.layers}
-        self._targets = [layer for layer in scene.layers if layer.target is not None]
-        self.samples = CostSamples(terrain.grid, next((layer.target for layer in self._targets), None))
+        drawn_by = {
+            PHOTO: colours.photo_of,
+            COST: colours.cost_of,
+            KNOWN: colours.known_of,
+            LEARNED: colours.learned_of,
+        }
+        self._tiled = {layer: picture for layer, picture in drawn_by.items() if layer in scene.layers}
+        """What draws a tile of each layer of tiles."""
+        self._stale: dict[str, dict[int, None]] = {layer.name: {} for layer in self._tiled}
+        """Name of a layer -> its tiles that are out of date. Marks come many times a second to the same tiles, and
+        each of their pictures is drawn once for all; one that looks as before is not logged again."""
+        self._nearest = any(layer.name == NEAREST.name for layer in scene.layers)
+        self._to_target = next((layer for layer in scene.layers if layer.target is not None), None)
+        self.samples = CostSamples(terrain.grid, self._to_target and self._to_target.target)
         self._pictures = TargetPictures(self._mesh, colours, self.samples)
-        self._nearest_due_ns = 0
+        self._limit = RateLimit(_EVERY_S)
         self._ordered: list[Area] = []
         self._zones_version = 0
 
     def begin(self) -> None:
         """Draws all of it. What never changes is static: the shape of the ground, legends, the scenario's zones."""
         self._pen.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        tiled = [each.layer for each in self._layers]
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
         for layer in self._shown:
-            for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in tiled else whole):
+            for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in self._tiled else whole):
                 self._pen.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
             self._legend(layer)
         self._draw_margin()
@@ -181,13 +167,13 @@ class GroundView:
     def draw_anew(self) -> None:
         """All is drawn once more when it is due, as the pen has forgotten it."""
         self._draw_zones("ordered", self._ordered, static=False)
-        for layer in self._layers:
-            layer.stale, layer.due_ns = dict.fromkeys(range(self._mesh.tiles)), 0
+        self._stale = {layer.name: dict.fromkeys(range(self._mesh.tiles)) for layer in self._tiled}
+        self._limit.all_due()
 
     def finish(self) -> None:
         """Draws all tiles that are out of date."""
         self._take_changes()
-        for layer in self._layers:
+        for layer in self._tiled:
             self._draw_tiles(layer, self._mesh.tiles)
 
     def hear_status(self, status: PlannerStatus) -> None:
@@ -199,11 +185,10 @@ class GroundView:
         """Draws what a planner answered."""
         if not self.samples.hear(reply):
             return
-        for layer in self._targets:
-            if layer.target == reply.target and reply.target in self.samples.costs_s:
-                self._draw_to_target(layer, reply.target)
-        if NEAREST.entity in self._entities and now_ns >= self._nearest_due_ns and self.samples.costs_s:
-            self._nearest_due_ns = now_ns + _NEAREST_NS
+        layer = self._to_target
+        if layer is not None and layer.target == reply.target and reply.target in self.samples.costs_s:
+            self._draw_to_target(layer, reply.target)
+        if self._nearest and self.samples.costs_s and self._limit.due("nearest", now_ns):
             self._texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
     def tick(self, now_ns: int, watched: bool) -> str | None:
@@ -215,24 +200,24 @@ class GroundView:
             self._ordered = ordered_areas(self._replica, now_ns, self._classes)
             self._colours.close(closed_cells([*self._zones, *self._ordered]))
             self._draw_zones("ordered", self._ordered, static=False)  # they come and go
-        for layer in self._layers:
-            if now_ns >= layer.due_ns:
-                layer.due_ns = now_ns + slower * layer.every_ns
+        for layer in self._tiled:
+            if self._limit.due(layer.name, now_ns, slower):
                 self._draw_tiles(layer, _TILES_AT_ONCE)
-        return self.samples.next_target(now_ns, slower)
+        return self.samples.next_target() if self._limit.due("question", now_ns, slower) else None
 
     def _take_changes(self) -> None:
         for window in self._cost_map.take_dirty():
             changed = dict.fromkeys(self._mesh.tiles_touching(window))
-            for layer in self._layers:
-                layer.stale.update(changed)
+            for stale in self._stale.values():
+                stale.update(changed)
 
-    def _draw_tiles(self, layer: _Tiles, most: int) -> None:
-        for tile in list(layer.stale)[:most]:
-            del layer.stale[tile]
-            image = layer.picture(self._mesh.tile_window(tile))
-            if self._pen.news(f"{layer.layer.entity}/{tile}", pixels=hash(image.tobytes())):
-                self._texture(layer.layer.entity, tile, image)
+    def _draw_tiles(self, layer: Layer, most: int) -> None:
+        stale = self._stale[layer.name]
+        for tile in list(stale)[:most]:
+            del stale[tile]
+            image = self._tiled[layer](self._mesh.tile_window(tile))
+            if self._pen.news(f"{layer.entity}/{tile}", pixels=hash(image.tobytes())):
+                self._texture(layer.entity, tile, image)
 
     def _texture(self, entity: str, tile: int, image: Bytes) -> None:
         """Logs the pixels of a tile. Not static: a viewer which joins late gets only recent data."""

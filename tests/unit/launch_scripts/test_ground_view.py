@@ -242,8 +242,8 @@ def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_co
 
     def logged_when(at_s: int) -> list[str]:
         logged.clear()
-        for layer in view._layers:
-            layer.stale[0] = None  # as after any mark in this tile
+        for stale in view._stale.values():
+            stale[0] = None  # as after any mark in this tile
         view.tick(at_s * NS_PER_S, watched=True)
         return logged
 

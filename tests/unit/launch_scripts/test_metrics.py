@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
+from support.target_reports import planner_status
 
 from launch_scripts import web
 from launch_scripts.observe.counts import Counts
@@ -50,23 +51,10 @@ def _stats(role: str, id: str, counters: Counters, life: int = _BEGAN_NS) -> Sta
 
 
 def _status(target: str) -> PlannerStatus:
-    return PlannerStatus(
-        target=target,
-        incarnation=_BEGAN_NS,
-        stamp_ns=_BEGAN_NS,
-        strategy="exact",
-        target_cell=5,
-        map_version=1,
-        tree_age_ms=250.0,
-        window=[],
-        growths=2,
-        window_growths=3,
-        growth_ms=4.0,
-        routes_served=5,
-        following=7,
-        pose_age_s=0.5,
-        tracker_lost=True,
-    )
+    return planner_status(
+        target, stamp_ns=_BEGAN_NS, tree_age_ms=250.0, growths=2, window_growths=3, growth_ms=4.0, routes_served=5,
+        following=7, pose_age_s=0.5, tracker_lost=True,
+    )  # fmt: skip
 
 
 def _agent() -> Counters:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.map_strategies import set_of
+from support.target_reports import planner_status
 
 from launch_scripts.launcher.tables import plain_line
 from launch_scripts.observe import facts
@@ -118,24 +119,8 @@ def pose(target: str, east_m: float, south_m: float, seq: int, captures: int = 0
 
 
 def status(target: str, gap_max: float | None, following: int = 1) -> PlannerStatus:
-    return PlannerStatus(
-        target=target,
-        incarnation=1,
-        stamp_ns=0,
-        strategy="full",
-        target_cell=0,
-        map_version=1,
-        tree_age_ms=1.0,
-        window=[0, 0, 1, 1],
-        growths=3,
-        window_growths=2,
-        growth_ms=1.5,
-        routes_served=9,
-        following=following,
-        gap_mean=gap_max,
-        gap_p95=gap_max,
-        gap_max=gap_max,
-    )
+    gaps = dict.fromkeys(("gap_mean", "gap_p95", "gap_max"), gap_max)
+    return planner_status(target, stamp_ns=0, following=following, **gaps)
 
 
 def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.monitor_rig import Rig, little_scenario, little_terrain
+from support.target_reports import planner_status
 
 from launch_scripts.monitor.ground.ground_colours import LETHAL_MARK, GroundColours
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.live_layout import level_of, summary_markdown
+from launch_scripts.monitor.sinks import in_markdown, shown
 from launch_scripts.observe.recorder import Recorder
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario
@@ -119,3 +122,28 @@ def test_the_summary_says_what_is_not_known_yet_with_a_dash() -> None:
 def test_what_should_worry_a_person_is_a_warning() -> None:
     assert level_of("restart") == "WARN"
     assert level_of("capture") == "INFO"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("behind: agent-a0", "behind: agent-a0"),
+        ("a\n# b\x1b[31m", "a # b?[31m"),
+        ("gate \U0001f600 \u6f22", "gate ? ?"),
+        ("x" * 400, "x" * 297 + "..."),
+    ],
+)
+def test_a_strange_text_is_one_line_of_characters_that_every_viewer_has(text: str, line: str) -> None:
+    assert shown(text) == line
+
+
+def test_markdown_of_others_is_shown_and_not_read() -> None:
+    assert in_markdown("![x](http://a/) | **b**") == r"\!\[x\](http://a/) \| \*\*b\*\*"
+
+
+def test_names_that_planners_make_up_do_not_fill_the_view() -> None:
+    rig = Rig(little_scenario(), little_terrain(), None)
+    for n in range(300):
+        rig.service._ground.hear_status(planner_status(f"x{n}"))
+    assert len(rig.service._ground.samples.targets) == 258
+    rig.sinks.close()

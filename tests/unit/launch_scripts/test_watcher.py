@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 from support.swarm_model import SwarmModel
-from support.target_reports import fleet
+from support.target_reports import fleet, planner_status
 
 from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
@@ -20,7 +20,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.liveness import Peer, split_rank
 from swarm.wire.messages.orders import Order, Orders
-from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Alarm, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, STATS, STATUS
@@ -111,13 +110,6 @@ def figures(spec: ProcessSpec, stamp_ns: int = 1, alarms: tuple[Alarm, ...] = ()
     )  # fmt: skip
 
 
-def status(target: str) -> PlannerStatus:
-    return PlannerStatus(
-        target=target, incarnation=1, stamp_ns=0, strategy="full", target_cell=0, map_version=1, tree_age_ms=1.0,
-        window=[], growths=3, window_growths=2, growth_ms=1.5, routes_served=9, following=1,
-    )  # fmt: skip
-
-
 class Part:
     """A launcher that looks after some processes, and a swarm whose processes all speak."""
 
@@ -142,7 +134,7 @@ class Part:
                 bus.publish(FLEET, report, region=0, author=report.author)
                 bus.publish(FOLLOWED, followed(), agent="a0", vehicle="a0-00")
             elif spec.role == "planner" and not split_rank(spec.id)[1]:
-                bus.publish(STATUS, status(spec.id), target=spec.id)
+                bus.publish(STATUS, planner_status(spec.id), target=spec.id)
         self.swarm.run(0.2)
         self.watcher.listen(0.0)
 
