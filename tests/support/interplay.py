@@ -175,8 +175,6 @@ class Interplay:
             until_s = at(4.0, quiet_s + 1.0)
             begin_s = chance.uniform(1.0, until_s)
             self.calls.append((begin_s, lambda n=name, u=until_s: self.walkers.append(Walker(self, n, u))))
-        if chance.random() < 0.3:
-            self.calls.append((at(5.0), self._flood))
         if chance.random() < 0.7:
             group = simulation.scenario.groups[0].name
             joins_s = at(3.0, 7.0)
@@ -218,24 +216,6 @@ class Interplay:
 
     def _remove(self, agent: str, vehicles: list[str]) -> None:
         self._operator.ask(LEAVE, RemoveVehicles(vehicles=vehicles), lambda event: None, tag="x", agent=agent)
-
-    def _flood(self) -> None:
-        bus = self.bus("flood")
-        for n in range(400):
-            x_m, y_m = self.grid.centre_m(self.chance.choice(self.free))
-            wrong = self.chance.random()
-            report = Body(
-                id=f"flood-{n}",
-                incarnation=1,
-                seq=1,
-                x_m=1e7 if wrong < 0.05 else x_m,
-                y_m=y_m,
-                radius_m=5e3 if wrong > 0.95 else 0.1,
-                speed_m_per_s=1e6 if 0.5 < wrong < 0.55 else 0.0,
-                lease_s=self.chance.choice((0.0, 0.2, 1.0)),
-            )
-            bus.publish(BODY, report, id=f"flood-{n}")
-        bus.close()
 
     def _end_guests(self) -> None:
         self.guests_over = True
@@ -342,10 +322,7 @@ class Interplay:
                 if lost:
                     broken.append(f"no route any more: {lost}")
                 continue
-            if text.startswith("driven into body"):
-                continue
             broken.append(text)
-        broken += [str(law) for law in self.trial.driven_into if "into body flood-" not in str(law)]
         if self.trial.whole_s is not None:
             late = max((at for id, at in self.trial.routed_s.items() if id not in self.removed), default=0.0)
             self.routed_after_s = late - self.trial.whole_s
