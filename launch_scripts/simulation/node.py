@@ -75,7 +75,6 @@ class Node:
     """One process, and the place where it is started again.
 
     name      in the network; a second life of an agent on another machine has a name of its own
-    added     of an agent that is not in the scenario: what it hosts
     skew_ns   by how much the machine's clock is wrong; a process reads it once, at its start
     """
 
@@ -86,7 +85,6 @@ class Node:
         phase_ns: int,
         skew_ns: int,
         name: str | None = None,
-        added: AddedAgent | None = None,
     ) -> None:
         self.spec = spec
         self.name = name or spec.name
@@ -103,7 +101,8 @@ class Node:
         self.skew_ns = skew_ns
         self.retired = False
         """Whether it never starts again."""
-        self.added = added
+        self.added: AddedAgent | None = None
+        """What it hosts, if it is an agent that is not in the scenario."""
         self._simulation = simulation
         self._clock = simulation.scheduler.clock
         self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))

@@ -27,7 +27,6 @@ from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
-from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import collected_rarely
 from swarm.wire.access import Authenticator
@@ -158,11 +157,9 @@ class Simulation:
             backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
             self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
 
-    def node(
-        self, spec: ProcessSpec, skew_ns: int = 0, name: str | None = None, added: AddedAgent | None = None
-    ) -> Node:
+    def node(self, spec: ProcessSpec, skew_ns: int = 0, name: str | None = None) -> Node:
         """A process more, which has not started yet."""
-        node = Node(self, spec, self._phases.randrange(NS_PER_S), skew_ns, name, added)
+        node = Node(self, spec, self._phases.randrange(NS_PER_S), skew_ns, name)
         self.nodes[node.name] = node
         return node
 

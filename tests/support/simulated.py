@@ -58,7 +58,8 @@ class OrderedSimulation(Simulation):
 
     def add(self, added: AddedAgent) -> Node:
         """Let an agent join that is not in the scenario."""
-        node = self.node(spec_of("agent", added.plan.id), added=added)
+        node = self.node(spec_of("agent", added.plan.id))
+        node.added = added
         node.boot()
         return node
 

@@ -11,6 +11,7 @@ import re
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -41,6 +42,12 @@ class Estimate(msgspec.Struct, frozen=True):
     high: float | None = None
 
 
+def _between(value: float, ends: Any) -> Estimate:
+    """An estimate whose interval has both ends, or none."""
+    low, high = map(float, ends)
+    return Estimate(value, low, high) if math.isfinite(low) and math.isfinite(high) else Estimate(value)
+
+
 def mean(values: Sequence[float]) -> Estimate | None:
     """The mean; None of no values. The bootstrap draws by a fixed seed: the same values give the same interval."""
     data = np.asarray(values, np.float64)
@@ -52,28 +59,20 @@ def mean(values: Sequence[float]) -> Estimate | None:
     if np.ptp(data) <= _SAME * np.abs(data).max():
         return Estimate(middle, middle, middle)
     if len(data) > MOST_BOOTSTRAPPED:
-        low, high = stats.t.interval(LEVEL, len(data) - 1, middle, stats.sem(data))
-        return Estimate(middle, float(low), float(high))
+        return _between(middle, stats.t.interval(LEVEL, len(data) - 1, middle, stats.sem(data)))
     # Of values at the limits of floats there is no interval.
     with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore", category=stats.DegenerateDataWarning):
         chance = np.random.default_rng(0)
         found = stats.bootstrap((data,), np.mean, n_resamples=_RESAMPLES, rng=chance, batch=1000)
-    low, high = map(float, found.confidence_interval)
-    return Estimate(middle, low, high) if math.isfinite(low) and math.isfinite(high) else Estimate(middle)
+    return _between(middle, found.confidence_interval)
 
 
 def median(values: Sequence[float]) -> Estimate | None:
-    """The median, between two of the values: so many ranks from either end that the binomial law says; None of no
-    values."""
-    data = np.sort(np.asarray(values, np.float64))
-    if not len(data):
+    """The median, between two of the values, by order statistics; None of no values."""
+    if not len(values):
         return None
-    middle = float(np.median(data))
-    # Below the rank r lie r values or more, if r of n coins show heads.
-    rank = int(stats.binom.ppf((1 - LEVEL) / 2, len(data), 0.5))
-    if rank == 0 or stats.binom.cdf(rank - 1, len(data), 0.5) > (1 - LEVEL) / 2:
-        return Estimate(middle)
-    return Estimate(middle, float(data[rank - 1]), float(data[len(data) - rank]))
+    found = stats.quantile_test(values, p=0.5).confidence_interval(LEVEL)
+    return _between(float(np.median(values)), found)
 
 
 def share(hits: int, count: int) -> Estimate:
