@@ -94,26 +94,12 @@ def test_what_flies_and_what_drives_share_cells_and_neither_waits_for_the_other(
 _PLAIN = """
 name = "plain"
 terrain = { source = "synthetic", rows = 48, cols = 64, resolution_m = 10.0, relief_m = 0.0 }
-[[targets]]
-walk = "still"
-start = END
-[[groups]]
-name = "drones"
-class = "drone"
-vehicles = 1
-cells = [START]
-[[classes]]
-name = "drone"
-[classes.air]
-speed_m_per_s = 12.0
-[wind]
-speed_m_per_s = 6.0
-from_deg = 270.0
-[planner]
-routes = "ROUTES"
-[vehicles]
-capture_range_m = 5.0
-reserve_cells = 8
+targets = [{ walk = "still", start = END }]
+groups = [{ name = "drones", class = "drone", vehicles = 1, cells = [START] }]
+classes = [{ name = "drone", air = { speed_m_per_s = 12.0 } }]
+wind = { speed_m_per_s = 6.0, from_deg = 270.0 }
+planner = { routes = "ROUTES" }
+vehicles = { capture_range_m = 5.0, reserve_cells = 8 }
 """
 WEST, EAST, SOUTH_EAST = (9, 9), (9, 52), (45, 45)
 

@@ -15,26 +15,12 @@ _SCENARIO = """
 name = "hidden"
 seed = 4
 time_scale = 10
-[terrain]
-source = "synthetic"
-rows = 40
-cols = 40
-resolution_m = 10
-[[targets]]
-name = "t"
-count = 1
-speed_m_per_s = 1
-[[targets]]
-name = "h"
-count = 2
-speed_m_per_s = 1
-tracker = "sighted"
-[[groups]]
-vehicles = 8
-[vehicles]
-per_agent = 4
-sense_range_m = 60
-capture_range_m = 15
+terrain = { source = "synthetic", rows = 40, cols = 40, resolution_m = 10 }
+targets = [
+    { name = "t", count = 1, speed_m_per_s = 1 }, { name = "h", count = 2, speed_m_per_s = 1, tracker = "sighted" },
+]
+groups = [{ vehicles = 8 }]
+vehicles = { per_agent = 4, sense_range_m = 60, capture_range_m = 15 }
 """
 _STAYS_S = 6.0
 """It takes 2 s to find that a place is empty, half a second to ask, and a little for the answers."""

@@ -37,23 +37,12 @@ _SIDE = 24
 _BASE = """
 name = "little"
 time_scale = 10
-[terrain]
-source = "synthetic"
-rows = 24
-cols = 24
-resolution_m = 10
-[[targets]]
-name = "t"
-count = 2
-speed_m_per_s = 1
-[[groups]]
-vehicles = 4
-[vehicles]
-per_agent = 2
-sense_range_m = 40
-capture_range_m = 20
+terrain = { source = "synthetic", rows = 24, cols = 24, resolution_m = 10 }
+targets = [{ name = "t", count = 2, speed_m_per_s = 1 }]
+groups = [{ vehicles = 4 }]
+vehicles = { per_agent = 2, sense_range_m = 40, capture_range_m = 20 }
 """
-_HIDDEN = _BASE.replace("speed_m_per_s = 1\n", 'speed_m_per_s = 1\ntracker = "sighted"\n')
+_HIDDEN = _BASE.replace("speed_m_per_s = 1", 'speed_m_per_s = 1, tracker = "sighted"')
 _SHOWN_S = 4.5
 """When the running swarm is looked at."""
 

@@ -146,25 +146,11 @@ class Wild:
 """
 WILD_SCENARIO = """
 time_scale = 5.0
-[terrain]
-source = "synthetic"
-rows = 48
-cols = 48
-[terrain.hidden]
-rubble_fields = 3
-[[targets]]
-count = 2
-walk = "wild:Wild"
-[[groups]]
-vehicles = 12
-start = "cluster"
-[vehicles]
-per_agent = 4
-sensor = "wild:Wild"
-assignment = "wild:Wild"
-dynamics = "wild:Wild"
-[planner]
-strategy = "wild:Wild"
+terrain = { source = "synthetic", rows = 48, cols = 48, hidden = { rubble_fields = 3 } }
+targets = [{ count = 2, walk = "wild:Wild" }]
+groups = [{ vehicles = 12, start = "cluster" }]
+vehicles = { per_agent = 4, sensor = "wild:Wild", assignment = "wild:Wild", dynamics = "wild:Wild" }
+planner = { strategy = "wild:Wild" }
 """
 
 

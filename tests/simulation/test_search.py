@@ -21,23 +21,10 @@ _SCENARIO = """
 name = "search"
 seed = 6
 time_scale = 10
-[terrain]
-source = "synthetic"
-rows = 60
-cols = 60
-resolution_m = 10
-[[targets]]
-name = "h"
-count = 1
-speed_m_per_s = 1
-tracker = "sighted"
-[[groups]]
-vehicles = 3
-start = "cluster"
-[vehicles]
-per_agent = 3
-sense_range_m = 40
-capture_range_m = 15
+terrain = { source = "synthetic", rows = 60, cols = 60, resolution_m = 10 }
+targets = [{ name = "h", count = 1, speed_m_per_s = 1, tracker = "sighted" }]
+groups = [{ vehicles = 3, start = "cluster" }]
+vehicles = { per_agent = 3, sense_range_m = 40, capture_range_m = 15 }
 """
 
 

@@ -12,22 +12,10 @@ SCENARIO = """
 name = "hill"
 seconds = 3
 time_scale = 10
-[terrain]
-source = "synthetic"
-rows = 32
-cols = 32
-resolution_m = 30
-[terrain.hidden]
-rubble_fields = 3
-[[targets]]
-count = 2
-speed_m_per_s = 3
-[[groups]]
-vehicles = 6
-[vehicles]
-per_agent = 3
-sense_range_m = 120
-capture_range_m = 60
+terrain = { source = "synthetic", rows = 32, cols = 32, resolution_m = 30, hidden = { rubble_fields = 3 } }
+targets = [{ count = 2, speed_m_per_s = 3 }]
+groups = [{ vehicles = 6 }]
+vehicles = { per_agent = 3, sense_range_m = 120, capture_range_m = 60 }
 """
 STUDY = """
 scenarios = ["hill.toml"]
