@@ -170,10 +170,7 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Itera
     waiting: set[Future[R]] = set()
     rest = iter(items)
     try:
-        while True:
-            waiting |= {executor.submit(work, item) for item in islice(rest, jobs + 1 - len(waiting))}
-            if not waiting:
-                return
+        while waiting := waiting | {executor.submit(work, item) for item in islice(rest, jobs + 1 - len(waiting))}:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             yield from (future.result() for future in done)
     finally:

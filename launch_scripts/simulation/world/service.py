@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.simulation.world.referee import BodyHit, Collision, LethalEntry
-from launch_scripts.simulation.world.rovers import Rovers
 from launch_scripts.simulation.world.targets import Action, Captured, TargetWorld
 from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
@@ -92,14 +91,6 @@ class TargetsService:
         self.counters = self._member.counters
         for name in ("captures", "collisions", "driven_into", "hit_by_bodies", "lethal_entries", "poses"):
             self.counters.count(name, 0)
-
-    @property
-    def leads(self) -> bool:
-        return self._world.leads
-
-    @property
-    def rovers(self) -> Rovers:
-        return self._world.rovers
 
     def lacks(self) -> list[str]:
         return self._member.lacks()

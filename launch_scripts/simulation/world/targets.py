@@ -130,7 +130,7 @@ class TargetWorld:
             class_truths(scenario, terrain, truth_s_per_m), terrain.grid, aloft_classes(scenario)
         )
         self._target_bodies = TargetBodies(scenario, terrain.grid)
-        self.rovers = Rovers(scenario, self._terrain, incarnation)
+        self._rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
         self._trackings = Trackings(terrain.grid)
@@ -259,7 +259,7 @@ class TargetWorld:
     def hear_body(self, body: Body, now_ns: int) -> None:
         """Takes where a body is: of anybody's for the referee, of a rover that another leader moves for itself."""
         if not self.leads:
-            self.rovers.hear(body)
+            self._rovers.hear(body)
         self._referee.hear_body(body, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
@@ -283,7 +283,7 @@ class TargetWorld:
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
         self._budget.ways = _WAYS_PER_TICK
-        actions: list[Action] = [*self.rovers.tick(time_scale, now_ns)]
+        actions: list[Action] = [*self._rovers.tick(time_scale, now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
