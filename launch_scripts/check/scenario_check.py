@@ -20,7 +20,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
 from swarm.config.classes import GROUND, flies
-from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES, is_loopback
+from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
@@ -33,18 +33,9 @@ from vehicle_agent.placement import spawn_cells
 
 def files_of(scenario: Scenario) -> dict[str, str]:
     """Key of the scenario -> the file that it names: of the terrain, and of zones."""
-    terrain = scenario.terrain
-    named = {
-        "terrain.source": None if terrain.source in BUILT_IN_TERRAINS else terrain.source,
-        "terrain.photo": terrain.photo,
-        "terrain.labels": terrain.labels,
-        "terrain.cover": terrain.cover,
-        "terrain.cover_codes": None if terrain.cover_codes in COVER_TABLES else terrain.cover_codes,
-    }
-    for key, zones in (("cost.zones", scenario.cost.zones), ("terrain.hidden.zones", terrain.hidden.zones)):
-        for n, zone in enumerate(zones):
-            named |= {f"{key}[{n}].mask": zone.mask, f"{key}[{n}].file": zone.file}
-    return {key: name for key, name in named.items() if name is not None}
+    named: dict[str, str] = {}
+    with_files(scenario, named.setdefault)
+    return named
 
 
 def files_named(scenario: Scenario) -> Iterator[Finding]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from launch_scripts.deploy.machine_plan import Plan, PlannedHost
-from swarm.config.ground import ZoneConfig
-from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES
+from swarm.config.load import with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import UNTIL_STOPPED_S, Scenario, TlsConfig
 from swarm.errors import ConfigError
@@ -23,26 +21,13 @@ _NAMES_OTHERS = (".vrt", ".yaml", ".yml")
 
 def host_scenario(plan: Plan, host: PlannedHost) -> tuple[Scenario, dict[str, Path]]:
     """The scenario of a machine with paths relative to its file, and where its files come from: path there -> file
-    here. Raises ConfigError on a file that cannot be taken along alone."""
-    scenario, files = _with_files_beside(plan.scenario)
-    network = msgspec.structs.replace(
-        scenario.network,
-        listen=host.listen or scenario.network.listen,
-        connect=host.connect,
-        peers=host.peers,
-        tls=TlsConfig(ca=f"{CERTIFICATES}/ca.pem", certificate=CERTIFICATES, key=CERTIFICATES),
-    )
-    scenario = msgspec.structs.replace(scenario, network=network, seconds=UNTIL_STOPPED_S, plugin_folder=PLUGINS)
-    return scenario, files if host.has_files else {}
-
-
-def _with_files_beside(scenario: Scenario) -> tuple[Scenario, dict[str, Path]]:
-    """Every file that the terrain names as one below `GROUND`, under a name of its own, with what belongs to it."""
+    here. Each file that the terrain names lies below `GROUND`. Raises ConfigError on a file that cannot be taken
+    along alone."""
     files: dict[str, Path] = {}
     folders: dict[Path, int] = {}
     """Files of one folder stay together and apart from others: what belongs to a file is found by its name."""
 
-    def beside(name: str) -> str:
+    def beside(key: str, name: str) -> str:
         path = Path(name)
         if path.suffix.lower() in _NAMES_OTHERS:
             raise ConfigError(
@@ -53,38 +38,16 @@ def _with_files_beside(scenario: Scenario) -> tuple[Scenario, dict[str, Path]]:
         files[place] = path
         return place
 
-    terrain = scenario.terrain
-    moved = {
-        "source": terrain.source if terrain.source in BUILT_IN_TERRAINS else beside(terrain.source),
-        "photo": terrain.photo and beside(terrain.photo),
-        "labels": terrain.labels and beside(terrain.labels),
-        "cover": terrain.cover and beside(terrain.cover),
-        "cover_codes": terrain.cover_codes
-        if terrain.cover_codes is None or terrain.cover_codes in COVER_TABLES
-        else beside(terrain.cover_codes),
-    }
-    hidden = msgspec.structs.replace(terrain.hidden, zones=_zones(terrain.hidden.zones, beside))
-    zones = _zones(scenario.cost.zones, beside)
-    return msgspec.structs.replace(
-        scenario,
-        terrain=msgspec.structs.replace(terrain, hidden=hidden, **moved),
-        cost=msgspec.structs.replace(scenario.cost, zones=zones),
-        classes=tuple(
-            msgspec.structs.replace(each, cost=msgspec.structs.replace(each.cost, zones=zones))
-            for each in scenario.classes
-        ),
-    ), files
-
-
-def _zones(zones: tuple[ZoneConfig, ...], beside: Callable[[str], str]) -> tuple[ZoneConfig, ...]:
-    return tuple(
-        msgspec.structs.replace(
-            zone,
-            mask=zone.mask and beside(zone.mask),
-            file=zone.file and beside(zone.file),
-        )
-        for zone in zones
+    scenario = with_files(plan.scenario, beside)
+    network = msgspec.structs.replace(
+        scenario.network,
+        listen=host.listen or scenario.network.listen,
+        connect=host.connect,
+        peers=host.peers,
+        tls=TlsConfig(ca=f"{CERTIFICATES}/ca.pem", certificate=CERTIFICATES, key=CERTIFICATES),
     )
+    scenario = msgspec.structs.replace(scenario, network=network, seconds=UNTIL_STOPPED_S, plugin_folder=PLUGINS)
+    return scenario, files if host.has_files else {}
 
 
 def parts_of(path: Path) -> list[Path]:

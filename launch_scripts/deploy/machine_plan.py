@@ -1,13 +1,12 @@
 """Which process runs on which machine: the plan that units and containers are written from, and how it is shown.
 
-Jobs are placed apart, consecutive agents together, load by cores (`place`).
+Processes of one job are placed apart, consecutive agents together, load by cores (`place`).
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
 from types import MappingProxyType
 from typing import Any
@@ -29,16 +28,12 @@ from swarm.errors import ConfigError
 from swarm.liveness import job_of
 
 LAUNCHER_CORES = 0.06
-ROUTER_CORES = 0.11
-"""Cores that a machine's launcher and router take in a swarm of 1,000 vehicles, in docs/scale-figures.md."""
-_AGENT = "agent"
-_WITH_KEEPERS = frozenset({"targets"})
-"""Roles that need the terrain's files, as keepers do: beside them, fewer machines get the files."""
-_CORES = {"keeper": 0.04, "monitor": 0.17, "targets": 0.09}
+"""Cores that a machine's launcher takes in a swarm of 1,000 vehicles, in docs/scale-figures.md."""
+_CORES = {"router": 0.11, "keeper": 0.04, "monitor": 0.17, "targets": 0.09}
 """Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, in docs/scale-figures.md."""
 _CORES_PER_VEHICLE = 0.00066
 """Of an agent; from the same table."""
-ROUTER, KEEPER = "router", "keeper"
+ROUTER, KEEPER, AGENT = "router", "keeper", "agent"
 COLUMNS = ("machine", "address", *ROLES, "load", "terrain")
 """Of `rows`."""
 
@@ -138,51 +133,18 @@ def make_plan(
 
     keepers  id of a keeper -> name of the machine that it ran on before: it stays there if it can, with its store
     """
-    scenario = _surviving(scenario, hosts.losses)
+    more = {role: max(getattr(scenario.standbys, role), hosts.losses) for role in ("planner", "targets")}
+    scenario = msgspec.structs.replace(scenario, standbys=StandbyConfig(**more))
     _check(scenario, hosts)
-    carried = {role for host in hosts.hosts for role in host.roles}
-    jobs = _jobs(scenario, hosts.losses, keepers)
-    placed = place([job for job in jobs if job.role in carried], hosts.hosts)
+    placed = place(_processes(scenario, hosts), hosts.hosts, keepers)
     routers = [host for host in hosts.hosts if ROUTER in host.roles]
-    scenario = _admitting(scenario, hosts, len(routers))
-    planned = tuple(_host(scenario, hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
+    planned = tuple(_host(hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
+    # Routers admit what the scenario does not name itself, too: all keepers, routers and launchers.
+    beside = (each.certificate for host in planned for each in (*host.of(ROUTER), *host.of(KEEPER)))
+    admit = dict.fromkeys((*certificate_names(scenario), *beside, *(host.operator for host in planned)))
+    network = msgspec.structs.replace(scenario.network, admit=tuple(admit))
+    scenario = msgspec.structs.replace(scenario, network=network)
     return Plan(run_id=run_id, scenario=scenario, port=hosts.port, survive=hosts.losses, hosts=planned)
-
-
-def _surviving(scenario: Scenario, losses: int) -> Scenario:
-    """The scenario with standbys enough to lose so many machines."""
-    standbys = scenario.standbys
-    more = StandbyConfig(planner=max(standbys.planner, losses), targets=max(standbys.targets, losses))
-    return msgspec.structs.replace(scenario, standbys=more)
-
-
-def _admitting(scenario: Scenario, hosts: HostsConfig, routers: int) -> Scenario:
-    """The scenario whose routers admit what it does not name itself: all keepers, routers and launchers."""
-    names = [
-        *(f"{ROUTER}.{n}" for n in range(routers)),
-        *(f"{KEEPER}.{n}" for n in range(hosts.losses + 1)),
-        *(f"operator.{host.name}" for host in hosts.hosts),
-    ]
-    admit = dict.fromkeys((*certificate_names(scenario), *names))
-    return msgspec.structs.replace(scenario, network=msgspec.structs.replace(scenario.network, admit=tuple(admit)))
-
-
-def _jobs(scenario: Scenario, losses: int, kept: Mapping[str, str]) -> list[Job]:
-    """Every process but routers, of which each machine that may has one."""
-    vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
-    ids = [str(n) for n in range(losses + 1)]
-    keepers = [Job(KEEPER, id, KEEPER, _CORES[KEEPER], kept.get(id, "")) for id in ids]
-    others = []
-    for spec in processes_of(scenario, tuple(role for role in ROLES if role not in (ROUTER, KEEPER))):
-        match spec.role:
-            case "agent":
-                cores = vehicles[spec.id] * _CORES_PER_VEHICLE
-            case "planner":
-                cores = scenario.planner.cpu_budget
-            case _:
-                cores = _CORES[spec.role]
-        others.append(Job(spec.role, spec.id, f"{spec.role}.{job_of(spec.id)}", cores))
-    return [*keepers, *others]
 
 
 def _check(scenario: Scenario, hosts: HostsConfig) -> None:
@@ -199,47 +161,111 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
     for role in ROLES:
         if TABLE[role].expendable:
             continue
-        names = [host.name for host in hosts.hosts if role in host.roles]
+        found = sum(role in host.roles for host in hosts.hosts)
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))
-        if len(names) < wanted:
+        if found < wanted:
             because = f", as {why} are kept on machines of their own" if wanted > 1 else ""
             raise ConfigError(
-                f"hosts: {role!r} is among the roles of {len(names)} machines, expected at least {wanted}{because}"
+                f"hosts: {role!r} is among the roles of {found} machines, expected at least {wanted}{because}"
             )
 
 
-def _host(
-    scenario: Scenario, port: int, host: HostConfig, jobs: list[Job], routers: list[HostConfig]
-) -> PlannedHost:
-    """A machine with what it runs. Its processes use the routers of others while its own is away."""
-    is_router = host in routers
-    own = (
-        [Job(ROUTER, str(routers.index(host)), f"{ROUTER}.{routers.index(host)}", ROUTER_CORES)]
-        if is_router
-        else []
-    )
-    processes = tuple(
+def _processes(scenario: Scenario, hosts: HostsConfig) -> list[PlannedProcess]:
+    """Every process: of a router one for each machine that may have one, in the order of the machines."""
+    vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
+    carried = {role for host in hosts.hosts for role in host.roles}
+    ids = {
+        ROUTER: range(sum(ROUTER in host.roles for host in hosts.hosts)),
+        KEEPER: range(hosts.losses + 1),
+    }
+    named = [(role, str(n)) for role, numbers in ids.items() for n in numbers]
+    named += [(spec.role, spec.id) for spec in processes_of(scenario, tuple(carried - ids.keys()))]
+    cores = {**_CORES, "planner": scenario.planner.cpu_budget}
+    return [
         PlannedProcess(
-            role=job.role,
-            id=job.id,
-            certificate=certificate_name(scenario, job.role, job.id),
-            job=job.job,
-            cores=job.cores,
+            role=role,
+            id=id,
+            certificate=certificate_name(scenario, role, id),
+            job=KEEPER if role == KEEPER else f"{role}.{job_of(id)}",
+            cores=vehicles[id] * _CORES_PER_VEHICLE if role == AGENT else cores[role],
         )
-        for role in ROLES
-        for job in [*own, *jobs]
-        if job.role == role
-    )
-    local = [f"tls/127.0.0.1:{port}"] if is_router else []
+        for role, id in named
+    ]
+
+
+def place(
+    processes: Sequence[PlannedProcess], hosts: Sequence[HostConfig], before: Mapping[str, str]
+) -> dict[str, list[PlannedProcess]]:
+    """Host name -> its processes. Every role has machines enough.
+
+    Each goes to the machine that is then the least loaded for its cores, of those that have none of the same job,
+    or of all where there is one. Roles that few machines carry come first, so that others leave them room; then
+    agents, so that the loss of a machine costs no more vehicles than its share.
+
+    before  id of a keeper -> name of the machine that has its store
+    """
+    placed: dict[str, list[PlannedProcess]] = {host.name: [] for host in hosts}
+    carrying = {role: [host for host in hosts if role in host.roles] for role in ROLES}
+
+    def load(host: HostConfig) -> float:
+        return LAUNCHER_CORES + sum(each.cores for each in placed[host.name])
+
+    def put_apart(process: PlannedProcess) -> None:
+        free = [h for h in carrying[process.role] if all(each.job != process.job for each in placed[h.name])]
+        if process.role == "targets":  # it needs the terrain's files, as keepers do: so fewer machines get them
+            free = [host for host in free if any(each.role == KEEPER for each in placed[host.name])] or free
+        if process.role == KEEPER:
+            free = [host for host in free if host.name == before.get(process.id)] or free
+        least = min(free or carrying[process.role], key=lambda host: (load(host) + process.cores) / host.cores)
+        placed[least.name].append(process)
+
+    def stays(process: PlannedProcess) -> bool:
+        return process.role == KEEPER and before.get(process.id) in [host.name for host in carrying[KEEPER]]
+
+    by_role = {role: [each for each in processes if each.role == role] for role in ROLES}
+    for host, router in zip(carrying[ROUTER], by_role.pop(ROUTER), strict=True):
+        placed[host.name].append(router)
+    for role in sorted(by_role, key=lambda role: (len(carrying[role]), role != AGENT)):
+        if role == AGENT:
+            for agent, host in zip(by_role[role], _shared_out(by_role[role], carrying[role], load), strict=True):
+                placed[host.name].append(agent)
+            continue
+        # First those that stay where they are, so that no other takes their place.
+        for process in sorted(by_role[role], key=lambda process: not stays(process)):
+            put_apart(process)
+    return placed
+
+
+def _shared_out(
+    agents: Sequence[PlannedProcess], hosts: Sequence[HostConfig], load: Callable[[HostConfig], float]
+) -> list[HostConfig]:
+    """The machine of each agent: runs of consecutive ones, so long that all machines which get any are equally
+    loaded for their cores."""
+    loads, total = {host.name: load(host) for host in hosts}, sum(agent.cores for agent in agents)
+    takers, fuller = list(hosts), list(hosts)
+    while fuller:
+        level = (total + sum(loads[host.name] for host in takers)) / sum(host.cores for host in takers)
+        fuller = [host for host in takers if loads[host.name] > level * host.cores]
+        takers = [host for host in takers if host not in fuller]
+    ends = list(accumulate(level * host.cores - loads[host.name] for host in takers))
+    taken = accumulate(agent.cores for agent in agents)
+    middles = [end - agent.cores / 2 for agent, end in zip(agents, taken, strict=True)]
+    return [takers[min(bisect_left(ends, middle), len(takers) - 1)] for middle in middles]
+
+
+def _host(port: int, host: HostConfig, processes: list[PlannedProcess], routers: list[HostConfig]) -> PlannedHost:
+    """A machine with what it runs. Its processes use the routers of others while its own is away."""
     others = [each.endpoint(port) for each in routers if each is not host]
+    own, listen = (f"tls/127.0.0.1:{port}",), (f"tls/{'[::]' if ':' in host.address else '0.0.0.0'}:{port}",)
+    has_router = host in routers
     return PlannedHost(
         name=host.name,
         address=host.address,
         cores=host.cores,
-        processes=processes,
-        listen=(f"tls/{'[::]' if ':' in host.address else '0.0.0.0'}:{port}",) if is_router else (),
-        connect=(*local, *others),
-        peers=tuple(each.endpoint(port) for each in routers[: routers.index(host)]) if is_router else (),
+        processes=tuple(sorted(processes, key=lambda each: ROLES.index(each.role))),
+        listen=listen if has_router else (),
+        connect=(*(own if has_router else ()), *others),
+        peers=tuple(others[: routers.index(host)]) if has_router else (),
         operator=f"operator.{host.name}",
         has_files=any(each.role in (KEEPER, "targets") for each in processes),
     )
@@ -290,95 +316,3 @@ def _follows(one: str, other: str) -> bool:
     stem = one.rstrip("0123456789")
     number = one[len(stem) :]
     return number.isdecimal() and other == f"{stem}{int(number) + 1}"
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """A process to place.
-
-    job     what it does, alone or with others that are kept on other machines
-    cores   that it is expected to use
-    before  name of the machine that has its store; "" if none has
-    """
-
-    role: str
-    id: str
-    job: str
-    cores: float
-    before: str = ""
-
-
-def place(jobs: Sequence[Job], hosts: Sequence[HostConfig]) -> dict[str, list[Job]]:
-    """Host name -> its jobs. Every role of the jobs has machines enough.
-
-    Each job goes to the machine that is then the least loaded for its cores, of those that have none of the same
-    job, or of all where there is one. Roles that few machines carry come first, so that others leave them room;
-    then agents, so that the loss of a machine costs no more vehicles than its share.
-    """
-    placed = _Placed(hosts)
-    by_role: dict[str, list[Job]] = defaultdict(list)
-    for job in jobs:
-        by_role[job.role].append(job)
-    for role in sorted(by_role, key=lambda role: (len(placed.carrying(role)), role != _AGENT)):
-        if role == _AGENT:
-            placed.share_out(by_role[role])
-        else:
-            # First those that stay where they are, so that no other takes their place.
-            for job in sorted(by_role[role], key=lambda job: not placed.stays(job)):
-                placed.put_apart(job)
-    return placed.jobs
-
-
-class _Placed:
-    """What every machine has taken so far."""
-
-    def __init__(self, hosts: Sequence[HostConfig]) -> None:
-        self._hosts = hosts
-        self.jobs: dict[str, list[Job]] = {host.name: [] for host in hosts}
-        self._cores = {
-            host.name: LAUNCHER_CORES + (ROUTER_CORES if "router" in host.roles else 0.0) for host in hosts
-        }
-
-    def carrying(self, role: str) -> list[HostConfig]:
-        return [host for host in self._hosts if role in host.roles]
-
-    def stays(self, job: Job) -> bool:
-        """Whether the machine that has its store may still carry it."""
-        return any(host.name == job.before for host in self.carrying(job.role))
-
-    def put_apart(self, job: Job) -> None:
-        carrying = self.carrying(job.role)
-        free = [host for host in carrying if all(each.job != job.job for each in self.jobs[host.name])]
-        if job.role in _WITH_KEEPERS:
-            free = [host for host in free if any(each.role == "keeper" for each in self.jobs[host.name])] or free
-        if self.stays(job):
-            free = [host for host in free if host.name == job.before] or free
-        least = min(free or carrying, key=lambda host: (self._cores[host.name] + job.cores) / host.cores)
-        self._put(job, least)
-
-    def share_out(self, agents: Sequence[Job]) -> None:
-        """Runs of consecutive agents, so long that all machines which get any are equally loaded."""
-        hosts = self.carrying(_AGENT)
-        ends = list(accumulate(self._shares(hosts, sum(agent.cores for agent in agents))))
-        taken, n = 0.0, 0
-        for agent in agents:
-            middle = taken + agent.cores / 2
-            while n < len(hosts) - 1 and middle > ends[n]:
-                n += 1
-            self._put(agent, hosts[n])
-            taken += agent.cores
-
-    def _shares(self, hosts: Sequence[HostConfig], total: float) -> list[float]:
-        """Cores of `total` for each machine, so that the least loaded are filled to one common level."""
-        emptiest = sorted(hosts, key=lambda host: self._cores[host.name] / host.cores)
-        level = 0.0
-        for n in range(1, len(emptiest) + 1):
-            some = emptiest[:n]
-            level = (total + sum(self._cores[host.name] for host in some)) / sum(host.cores for host in some)
-            if n == len(emptiest) or level <= self._cores[emptiest[n].name] / emptiest[n].cores:
-                break
-        return [max(level * host.cores - self._cores[host.name], 0.0) for host in hosts]
-
-    def _put(self, job: Job, host: HostConfig) -> None:
-        self.jobs[host.name].append(job)
-        self._cores[host.name] += job.cores

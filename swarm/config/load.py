@@ -15,7 +15,7 @@ import msgspec
 from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import choice, doubled, explain, located, nearest
-from swarm.config.ground import CostConfig, HiddenConfig, ZoneConfig
+from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
@@ -238,38 +238,47 @@ def is_loopback(host: str) -> bool:
 
 def anchored(scenario: Scenario, base: Path) -> Scenario:
     """The scenario with its relative paths made relative to the folder of its file."""
-
-    def beside(path: str | None, *names: str) -> str | None:
-        return path if path is None or path in names else str(base / path)
-
-    def zones_of(section: CostConfig | HiddenConfig) -> tuple[ZoneConfig, ...]:
-        return tuple(replace(zone, mask=beside(zone.mask), file=beside(zone.file)) for zone in section.zones)
-
     replace = msgspec.structs.replace
-    terrain, network, tls = scenario.terrain, scenario.network, scenario.network.tls
-    terrain = replace(
-        terrain,
-        source=beside(terrain.source, *BUILT_IN_TERRAINS),
-        cover_codes=beside(terrain.cover_codes, *COVER_TABLES),
-        hidden=replace(terrain.hidden, zones=zones_of(terrain.hidden)),
-        **{key: beside(getattr(terrain, key)) for key in ("photo", "labels", "cover")},
-    )
+    network, tls = scenario.network, scenario.network.tls
     if tls is not None:
         network = replace(network, tls=TlsConfig(**{key: str(base / getattr(tls, key)) for key in _TLS_FILES}))
-    zones = zones_of(scenario.cost)
+    placed = with_files(scenario, lambda _, name: str(base / name))
+    return replace(placed, network=network, plugin_folder=str(base / scenario.plugin_folder))
+
+
+def with_files(scenario: Scenario, placed: Callable[[str, str], str]) -> Scenario:
+    """The scenario with another name for each file that its terrain or one of its zones names.
+
+    placed  key of the scenario, name of the file -> name that it shall have
+    """
+    replace = msgspec.structs.replace
+
+    def moved(section: Any, above: str, *keys: str) -> Any:
+        named = {key: getattr(section, key) for key in keys}
+        files = {
+            key: name for key, name in named.items() if name is not None and name not in _BUILT_IN.get(key, ())
+        }
+        return replace(section, **{key: placed(f"{above}.{key}", name) for key, name in files.items()})
+
+    def with_zones(section: Any, above: str) -> Any:
+        zones = (moved(zone, f"{above}.zones[{n}]", "mask", "file") for n, zone in enumerate(section.zones))
+        return replace(section, zones=tuple(zones))
+
+    terrain = moved(scenario.terrain, "terrain", "source", "photo", "labels", "cover", "cover_codes")
+    cost = with_zones(scenario.cost, "cost")
     return replace(
         scenario,
-        terrain=terrain,
-        cost=replace(scenario.cost, zones=zones),
-        classes=tuple(replace(each, cost=replace(each.cost, zones=zones)) for each in scenario.classes),
-        network=network,
-        plugin_folder=str(base / scenario.plugin_folder),
+        terrain=replace(terrain, hidden=with_zones(terrain.hidden, "terrain.hidden")),
+        cost=cost,
+        classes=tuple(replace(each, cost=replace(each.cost, zones=cost.zones)) for each in scenario.classes),
     )
 
 
 _TLS_FILES = ("ca", "certificate", "key")
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
 COVER_TABLES = ("worldcover", "corine", "corine-level-3", "nlcd")
+_BUILT_IN = {"source": BUILT_IN_TERRAINS, "cover_codes": COVER_TABLES}
+"""Names that stand for no file."""
 
 
 # --- settings by dotted keys: `planner.routes`, `groups.0.assignment`, `groups.*.assignment` ---------------------
