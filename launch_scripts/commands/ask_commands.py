@@ -72,13 +72,13 @@ def route(
     out            Write .geojson, .gpkg, .gpx, .kml or .csv; with --terrain also .png, a picture.
     """
     from launch_scripts.commands import terrain_routes
-    from launch_scripts.commands.route_files import check_route_file
+    from launch_scripts.report.exporter import FORMATS, check_target
     from swarm.places import read_place
 
+    check_target(out, "--out", *FORMATS, ".png")
     if terrain is not None:
         if start is None or end is None or target is not None or row is not None or col is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
-        check_route_file(out)
         terrain_routes.print_route(terrain_routes.find_route(terrain, start, end, preset), out, as_json)
         return
     if preset is not None:
@@ -88,7 +88,6 @@ def route(
         raise ConfigError(
             "give --target, --row and --col (or --from) to ask a swarm, or --terrain, --from and --to without one"
         )
-    check_route_file(out)
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
     from launch_scripts.commands import swarm_route
 

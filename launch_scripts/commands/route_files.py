@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import said_length
-from launch_scripts.report.exporter import COSTS, Feature, FieldKind, Layer, check_file, write_layers
+from launch_scripts.report.exporter import COSTS, Feature, FieldKind, Layer, write_layers
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import ConfigError
@@ -136,16 +136,9 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
     return [cells] if ending == ".csv" else [line, cells]
 
 
-def check_route_file(path: Path | None) -> None:
-    """Raises ConfigError before the work, if the ending says no format or the folder is not there."""
-    if path is not None:
-        check_file(path, ".png")
-
-
 def write_route(route: DescribedRoute, path: Path) -> None:
     """Writes a route in the format of the file's ending. Raises ConfigError or StoreError in one sentence, also
     without a place on Earth or a terrain where the format needs one."""
-    check_route_file(path)
     ending = path.suffix.lower()
     if ending != ".png":
         write_layers(path, layers_of(route, ending), MapFrame(route.grid))

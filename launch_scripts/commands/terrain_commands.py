@@ -20,7 +20,7 @@ from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.shared_options import AsJson, PresetOption, VehicleClass
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.exporter import FORMATS, write_raster
+from launch_scripts.report.exporter import FORMATS, check_target, write_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.slope_rules import (
     SLOPE_RULES,
@@ -33,7 +33,8 @@ from swarm.config.cost_rules import PRESETS, cost_of_preset
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.values import ElevationEncoding
-from swarm.errors import ConfigError, writing
+from swarm.config.write import toml_value
+from swarm.errors import writing
 from swarm.grid import GridSpec
 
 if TYPE_CHECKING:
@@ -171,8 +172,8 @@ def cost(
     from shared_map.class_grounds import class_terrains
     from shared_map.terrain.terrain import build_terrain
 
-    _check_target(out, "--out", *_TIFF)
-    _check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *_TIFF)
+    check_target(picture, "--picture", ".png")
     loaded = find_scenario(scenario, preset)
     with progress() as tell:
         started = time.perf_counter()
@@ -211,7 +212,7 @@ def rules(
 
     scenario  A scenario file or the name of a built-in one: show its rule alone, in m/s.
     """
-    _check_target(picture, "--picture", ".png")
+    check_target(picture, "--picture", ".png")
     if scenario is None:
         shown = rules_of_all()
     else:
@@ -221,11 +222,9 @@ def rules(
 
         draw_rules(shown, picture)
     if as_json:
-        console.print_json(
-            json.dumps({title: [_facts(curve) for curve in curves] for title, curves in shown.items()})
-        )
-        return
-    _show_rules(shown)
+        console.print_json(json.dumps(_rules_fields(shown)))
+    else:
+        _show_rules(shown)
 
 
 @command(app)
@@ -258,9 +257,9 @@ def synth(
     """
     from shared_map.terrain.terrain import build_terrain
 
-    _check_target(out, "--out", *_TIFF, ".npz")
-    _check_target(photo, "--photo", *_TIFF)
-    _check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *_TIFF, ".npz")
+    check_target(photo, "--photo", *_TIFF)
+    check_target(picture, "--picture", ".png")
     config = TerrainConfig(
         source="synthetic",
         rows=rows,
@@ -315,7 +314,7 @@ def reach(
     """
     from launch_scripts.commands import terrain_routes
 
-    _check_target(out, "--out", *_TIFF, *(ending for ending in FORMATS if ending != ".gpx"))
+    check_target(out, "--out", *_TIFF, *(ending for ending in FORMATS if ending != ".gpx"))
     if start is None:
         found = terrain_routes.reach(terrain, to, preset)
     else:
@@ -369,8 +368,8 @@ def classify(
     """
     from shared_map.terrain.terrain import build_terrain
 
-    _check_target(out, "--out", *_TIFF)
-    _check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *_TIFF)
+    check_target(picture, "--picture", ".png")
     config = TerrainConfig(
         source=str(elevation),
         photo=str(photo),
@@ -400,39 +399,25 @@ def _compare(terrain: Terrain, path: Path) -> None:
     _print_confusion("learnt, on polygons not seen", confusion(*held_out(*inputs, labels.classes, labels.groups)))
 
 
-def _print_confusion(title: str, counts: Any) -> None:
-    labelled = [kind for kind in TerrainClass if counts[kind].any()]
-    present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
-    unknown = counts[:, TerrainClass.UNKNOWN].sum() / counts.sum()
-    right = np.trace(counts) / counts.sum()
+def _print_confusion(title: str, counts: NDArray[np.int64]) -> None:
+    shares = [np.trace(counts), counts[:, TerrainClass.UNKNOWN].sum()] / counts.sum()
+    right, unknown = (f"{share:.1%}" for share in shares)
     table = Table(
-        title=f"{title}: {right:.1%} of the labelled cells, {unknown:.1%} unknown, {1 - right - unknown:.1%} wrong",
+        "labelled",
+        title=f"{title}: {right} of the labelled cells, {unknown} unknown, {1 - shares.sum():.1%} wrong",
         title_justify="left",
     )
-    table.add_column("labelled")
-    for kind in present:
-        table.add_column(kind.name.lower(), justify="right")
-    table.add_column("IoU", justify="right")
-    overlaps = []
-    for kind in labelled:
-        union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
-        cells = [str(counts[kind, other]) for other in present]
-        overlaps.append(counts[kind, kind] / union)
-        table.add_row(kind.name.lower(), *cells, f"{overlaps[-1]:.2f}")
+    present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
+    for heading in (*(kind.name.lower() for kind in present), "IoU"):
+        table.add_column(heading, justify="right")
+    labelled = [kind for kind in present if counts[kind].any()]
+    overlaps = [
+        counts[kind, kind] / (counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]) for kind in labelled
+    ]
+    for kind, overlap in zip(labelled, overlaps, strict=True):
+        table.add_row(kind.name.lower(), *map(str, counts[kind, present]), f"{overlap:.2f}")
     table.caption = f"mean IoU {np.mean(overlaps):.2f}"
     console.print(table)
-
-
-def _check_target(path: Path | None, option: str, *endings: str) -> None:
-    """Raises ConfigError now, not after the work, if a file cannot be written."""
-    if path is None:
-        return
-    if path.is_dir():
-        raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
-    if path.suffix.lower() not in endings:
-        raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
 
 
 def _draw(terrain: Terrain, path: Path | None, title: str) -> None:
@@ -453,6 +438,7 @@ def _shares(terrain: Terrain) -> str:
 
 SLOPES_PERCENT = (-30, -20, -10, -5, 0, 5, 10, 20, 30)
 """Of the tables; downhill is negative."""
+_SLOPES = [f"{slope:+d}" if slope else "0" for slope in SLOPES_PERCENT]
 
 
 class Curve(NamedTuple):
@@ -485,34 +471,19 @@ Shown = dict[str, list[Curve]]
 """Groups of curves under their titles."""
 
 
-def _facts(curve: Curve) -> dict[str, Any]:
-    values = {
-        f"{slope:+d}" if slope else "0": round(float(value), 4) if math.isfinite(value) and value > 0 else None
-        for slope, value in zip(SLOPES_PERCENT, curve.at(SLOPES_PERCENT), strict=True)
-    }
-    return {"name": curve.name, **curve.notes, "unit": curve.unit, "by_slope_percent": values}
-
-
 def rules_of_all() -> Shown:
     """Every rule with the settings that an empty scenario has, and every preset."""
-    rules = []
-    for name, row in SLOPE_RULES.items():
-        if name == "table":
-            continue
-        notes = {"about": row.about, "source": row.source}
-        rules.append(Curve(name, "factor", CostConfig(slope_rule=name), notes))
+    rules = [
+        Curve(name, "factor", CostConfig(slope_rule=name), {"about": row.about, "source": row.source})
+        for name, row in SLOPE_RULES.items()
+        if name != "table"
+    ]
     presets = []
-    for preset, told in PRESETS.items():
-        settings = ", ".join(f"{key} = {_toml(value)}" for key, value in told.settings.items())
+    for name, told in PRESETS.items():
+        settings = ", ".join(f"{key} = {toml_value(value)}" for key, value in told.settings.items())
         notes = {"about": told.about, "source": told.source, "settings": settings}
-        presets.append(Curve(preset, "m/s", cost_of_preset(preset), notes))
+        presets.append(Curve(name, "m/s", cost_of_preset(name), notes))
     return {"rules": rules, "presets": presets}
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
-    return f'"{value}"' if isinstance(value, str) else f"{value:g}"
 
 
 def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
@@ -524,30 +495,45 @@ def rules_of_scenario(scenario: Scenario, name: str) -> Shown:
         limits += f", steps to {climb_deg:g} degrees up and {descent_deg:g} down"
     notes = {"about": row.about, "source": row.source, "limits": limits}
     title = f"{name}: slope rule {cost.slope_rule}{f', preset {cost.preset}' if cost.preset else ''}"
-    step = Curve("each step" if cost.directional else "if directional", "m/s", msgspec.structs.replace(cost), notes)
-    cell = Curve("each cell", "m/s", cost, notes, is_mean=True)
-    return {title: [step] if cost.directional else [cell, step]}
+    if cost.directional:
+        return {title: [Curve("each step", "m/s", cost, notes)]}
+    return {
+        title: [Curve("each cell", "m/s", cost, notes, is_mean=True), Curve("if directional", "m/s", cost, notes)]
+    }
+
+
+def _rules_fields(shown: Shown) -> dict[str, Any]:
+    """For programs. What is too steep has no value."""
+    return {
+        title: [
+            {
+                "name": curve.name,
+                **curve.notes,
+                "unit": curve.unit,
+                "by_slope_percent": {
+                    slope: round(float(value), 4) if 0 < value < math.inf else None
+                    for slope, value in zip(_SLOPES, curve.at(SLOPES_PERCENT), strict=True)
+                },
+            }
+            for curve in curves
+        ]
+        for title, curves in shown.items()
+    }
 
 
 def _show_rules(shown: Shown) -> None:
-    """Print a table of each group, and what its lines are."""
+    """Prints a table of each group, and what its lines are."""
     for title, curves in shown.items():
         unit = "pace over that of level ground" if curves[0].unit == "factor" else "m/s on open ground"
-        table = Table(
-            title=f"{title}: {unit}, by slope in % (negative is downhill)", title_justify="left", box=None
-        )
-        table.add_column("")
-        for slope in SLOPES_PERCENT:
-            table.add_column(f"{slope:+d}" if slope else "0", justify="right")
+        heading = f"{title}: {unit}, by slope in % (negative is downhill)"
+        table = Table("", title=heading, title_justify="left", box=None)
+        for slope in _SLOPES:
+            table.add_column(slope, justify="right")
         for curve in curves:
-            values = [f"{value:.2f}" if 0 < value < math.inf else "-" for value in curve.at(SLOPES_PERCENT)]
-            table.add_row(curve.name, *values)
+            values = curve.at(SLOPES_PERCENT)
+            table.add_row(curve.name, *(f"{value:.2f}" if 0 < value < math.inf else "-" for value in values))
         console.print(table)
-        said = {curve.name: curve.notes for curve in curves}
-        for name, notes in (
-            said.items() if len({str(each) for each in said.values()}) > 1 else [("", curves[0].notes)]
-        ):
-            for key, text in notes.items():
-                label = f"{name}: " if name and key == "about" else f"  {key}: " if name else f"{key}: "
-                console.print(f"{label}{text}", highlight=False, markup=False, soft_wrap=True)
+        for curve in curves:
+            for key, text in curve.notes.items():
+                _say(f"{curve.name}: {text}" if key == "about" else f"  {key}: {text}")
         console.print()

@@ -99,15 +99,16 @@ FORMATS: Mapping[str, Format] = {
 """Ending -> format of layers."""
 
 
-def check_file(path: Path, *others: str) -> None:
-    """Raises ConfigError before the work, if the ending says no format or the folder is not there.
-
-    others  endings that the caller writes itself
-    """
-    if path.suffix.lower() not in (*FORMATS, *others):
-        raise ConfigError(f"--out {path}: write {', '.join((*FORMATS, *others))}")
-    if path.is_dir() or not path.parent.is_dir():
-        raise ConfigError(f"--out {path}: cannot write there, it is a folder or lies in none")
+def check_target(path: Path | None, option: str, *endings: str) -> None:
+    """Raises ConfigError now, not after the work, if a file cannot be written."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
+    if path.suffix.lower() not in endings:
+        raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
 
 
 def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
@@ -120,7 +121,7 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     StoreError
         If the file cannot be written.
     """
-    check_file(path)
+    check_target(path, "--out", *FORMATS)
     form = FORMATS[path.suffix.lower()]
     placed = frame.grid.crs != "local"
     if not placed and not form.local:
