@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
-
-from swarm.errors import SwarmError
 
 Level = Literal["ok", "warning", "failure"]
 STYLES: dict[Level, str] = {"ok": "green", "warning": "yellow", "failure": "red"}
@@ -27,9 +25,6 @@ class Finding(NamedTuple):
     def sentence(self) -> str:
         return f"{self.about}: {self.text}" if self.about else self.text
 
-    def fields(self) -> dict[str, str]:
-        return self._asdict()
-
 
 def failure(about: str, text: str) -> Finding:
     return Finding("failure", about, text)
@@ -37,19 +32,6 @@ def failure(about: str, text: str) -> Finding:
 
 def warning(about: str, text: str) -> Finding:
     return Finding("warning", about, text)
-
-
-def ok(about: str, text: str) -> Finding:
-    return Finding("ok", about, text)
-
-
-def refused(about: str, check: Callable[..., Any], *of: Any) -> list[Finding]:
-    """The failure with which a check refuses what it is given, if it does."""
-    try:
-        check(*of)
-    except SwarmError as error:
-        return [failure(about, str(error).removeprefix(f"{about}: "))]
-    return []
 
 
 def counted(findings: Sequence[Finding], level: Level) -> str:
@@ -62,5 +44,5 @@ def as_fields(findings: Sequence[Finding]) -> dict[str, Any]:
     """For `--json`."""
     return {
         "ok": not any(finding.level == "failure" for finding in findings),
-        "findings": [finding.fields() for finding in findings],
+        "findings": [finding._asdict() for finding in findings],
     }

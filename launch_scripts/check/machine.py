@@ -28,7 +28,6 @@ _EXTRAS = ("all", "roles", "vectors")
 _ENOUGH_BYTES = 1 << 30
 """Of memory, and of disk."""
 _ENOUGH_FILES = 1024
-_COARSE_S = 1e-3
 _UNSYNCHRONISED = 5
 """What `adjtimex` returns of a clock that nobody sets: TIME_ERROR."""
 _TIMEX_BYTES = 256
@@ -52,11 +51,11 @@ _MOST_BYTES = 1 << 60
 
 
 class Machine(NamedTuple):
-    """What there is here; None where that is not known."""
+    """What there is here: processor cores, and free bytes of memory and of the disk of a folder of runs."""
 
     cores: int
-    free_bytes: int | None
-    disk_bytes: int | None
+    free_bytes: int
+    disk_bytes: int
 
 
 class Needs(NamedTuple):
@@ -77,21 +76,14 @@ class Needs(NamedTuple):
 
 def this_machine(runs: Path) -> Machine:
     """What there is here, with the disk of a folder of runs."""
-    try:
-        disk = shutil.disk_usage(_nearest(runs)).free
-    except OSError:
-        disk = None
-    return Machine(len(os.sched_getaffinity(0)), available_bytes(), disk)
+    return Machine(len(os.sched_getaffinity(0)), available_bytes(), shutil.disk_usage(_nearest(runs)).free)
 
 
-def available_bytes() -> int | None:
+def available_bytes() -> int:
     """Memory that new processes can have."""
     import psutil
 
-    try:
-        return int(psutil.virtual_memory().available)
-    except (psutil.Error, OSError, RuntimeError):
-        return None
+    return int(psutil.virtual_memory().available)
 
 
 def needs_of(scenario: Scenario, cells: int) -> Needs:
@@ -100,16 +92,12 @@ def needs_of(scenario: Scenario, cells: int) -> Needs:
     agents, processes = len(plan_agents(scenario)), len(processes_of(scenario))
     trees = len(scenario.target_ids) * (1 + scenario.standbys.planner)
     moving = ticks * (agents * _AGENT_CORES_AT_5_HZ + vehicles * _VEHICLE_CORES_AT_5_HZ)
-    memory = processes * _PROCESS_BYTES + vehicles * _VEHICLE_BYTES
-    recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
-    return Needs(
-        processes=processes,
-        agents=agents,
-        cores=moving + trees * _PLANNER_CORES + _OTHERS_CORES,
-        memory_bytes=memory + cells * (_CELL_BYTES + trees * _TREE_CELL_BYTES),
-        disk_bytes=cells * _CELL_BYTES + recording,
-        recording_bytes=recording,
+    memory = (
+        processes * _PROCESS_BYTES + vehicles * _VEHICLE_BYTES + cells * (_CELL_BYTES + trees * _TREE_CELL_BYTES)
     )
+    recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
+    cores = moving + trees * _PLANNER_CORES + _OTHERS_CORES
+    return Needs(processes, agents, cores, memory, cells * _CELL_BYTES + recording, recording)
 
 
 def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iterator[Finding]:
@@ -123,13 +111,13 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
             f" at {hz:g} Hz keep about {needs.cores:.1f} cores busy, and there are {here.cores}: ticks will be"
             f" late;{fewer} fewer of them, a lower vehicles.tick_hz, or more machines (docs/scale-figures.md)",
         )
-    if here.free_bytes is not None and needs.memory_bytes > here.free_bytes:
+    if needs.memory_bytes > here.free_bytes:
         yield warning(
             "memory",
             f"about {size(needs.memory_bytes)} are needed and {size(here.free_bytes)} are free: a larger"
             " terrain.resolution_m, or fewer targets",
         )
-    if here.disk_bytes is not None and needs.disk_bytes > here.disk_bytes:
+    if needs.disk_bytes > here.disk_bytes:
         # One that is meant to be ended by Ctrl-C names a time that never comes.
         starts = needs.disk_bytes - needs.recording_bytes <= here.disk_bytes
         yield (warning if starts else failure)(
@@ -137,16 +125,25 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
             f"about {size(needs.disk_bytes)} are written to {runs} and {size(here.disk_bytes)} are free: another"
             " --runs, or a shorter run",
         )
-    folder = _nearest(runs)
-    if not folder.is_dir():
-        yield failure("runs", f"{folder} is not a folder; choose another --runs")
-    elif not os.access(folder, os.W_OK | os.X_OK):
-        yield failure("runs", f"{folder} cannot be written by this user; choose another --runs")
+    if (complaint := _unwritable(runs)) is not None:
+        yield failure("runs", complaint)
 
 
 def _nearest(runs: Path) -> Path:
     """A folder of runs, or what is there of the path to it."""
     return next(path for path in (runs.absolute(), *runs.absolute().parents) if path.exists())
+
+
+def _unwritable(runs: Path) -> str | None:
+    """Why no run can be left in a folder of runs; None if one can."""
+    folder = _nearest(runs)
+    if not folder.is_dir():
+        return f"{folder} is not a folder; choose another --runs"
+    try:
+        can_write(folder)
+    except OSError as error:
+        return f"{folder} cannot be written: {error.strerror or error}; choose another --runs"
+    return None
 
 
 # --- swarm doctor: each check says how it is, and what to do if that is not well
@@ -160,7 +157,7 @@ def examine(runs: Path) -> Iterator[Finding]:
         try:
             level, text = look(runs)
             yield Finding(level, about, text)
-        except (SwarmError, OSError, ValueError, ImportError) as error:
+        except (SwarmError, OSError, ValueError, ImportError, AttributeError) as error:
             yield warning(about, f"cannot be looked at: {error}")
 
 
@@ -231,8 +228,6 @@ def _cores(runs: Path) -> Said:
 
 def _memory(runs: Path) -> Said:
     free = available_bytes()
-    if free is None:
-        return "warning", "not known on this system; the demo takes about 0.6 GB"
     if free < _ENOUGH_BYTES:
         return "warning", f"{size(free)} are free; the demo takes about 0.6 GB: end something else first"
     return "ok", f"{size(free)} are free"
@@ -243,13 +238,6 @@ def _files(runs: Path) -> Said:
     if soft != resource.RLIM_INFINITY and soft < _ENOUGH_FILES:
         return "warning", f"{soft} at a time, too few for a router of many: `ulimit -n {min(4096, hard)}`"
     return "ok", "any number at a time" if soft == resource.RLIM_INFINITY else f"{soft} at a time"
-
-
-def _shared_memory(runs: Path) -> Said:
-    folder = Path("/dev/shm")
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        return "warning", "/dev/shm cannot be written; in a container, mount a tmpfs there"
-    return "ok", f"{size(shutil.disk_usage(folder).free)} are free"
 
 
 def _zenoh(runs: Path) -> Said:
@@ -280,45 +268,31 @@ def _ports(runs: Path) -> Said:
 
 
 def _clock(runs: Path) -> Said:
-    resolution_s = max(time.get_clock_info(name).resolution for name in ("monotonic", "time"))
-    if resolution_s > _COARSE_S:
-        return "warning", f"its resolution is {resolution_s * 1e3:g} ms, ticks need 1 ms"
     state = _clock_state()
     if state == _UNSYNCHRONISED:
         return "warning", "not synchronised (no NTP), which several machines need: start chrony or ntpd"
-    known = "whether it is synchronised is not known" if state is None else "synchronised"
-    return "ok", f"resolution {resolution_s * 1e9:.0f} ns, {known}"
+    return "ok", "synchronised" if state >= 0 else "whether it is synchronised is not known"
 
 
-def _clock_state() -> int | None:
-    """What the kernel says of its clock; None where it says nothing."""
+def _clock_state() -> int:
+    """What the kernel says of its clock; below 0 where it says nothing."""
+    # All zero asks and changes nothing.
+    return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
+
+
+def _browser(runs: Path) -> Said:
     try:
-        # All zero asks and changes nothing.
-        state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
-    except (OSError, AttributeError):
-        return None
-    return state if state >= 0 else None
-
-
-def _view(runs: Path) -> Said:
-    here = shutil.which("rerun")
-    native = f"; {here} opens recordings" if here else ""
-    try:
-        browser = webbrowser.get()
+        webbrowser.get()
     except webbrowser.Error:
         page = "open the page that `swarm up` names from another computer, by the ssh line beside it"
-        return "warning", f"no browser here: {page}{native}"
-    return "ok", f"a browser for the live view: {getattr(browser, 'name', None) or 'yes'}{native}"
+        return "warning", f"no browser here: {page}"
+    return "ok", "there is one for the live view"
 
 
 def _disk(runs: Path) -> Said:
+    if (complaint := _unwritable(runs)) is not None:
+        return "failure", complaint
     folder = _nearest(runs)
-    if not folder.is_dir():
-        return "failure", f"{folder} is not a folder; choose another --runs"
-    try:
-        can_write(folder)
-    except OSError as error:
-        return "failure", f"{folder} cannot be written: {error.strerror or error}; choose another --runs"
     free = shutil.disk_usage(folder).free
     if free < _ENOUGH_BYTES:
         return "warning", f"{size(free)} are free in {folder}; a minute of a large swarm writes some 20 MB"
@@ -332,11 +306,10 @@ CHECKS: dict[str, Callable[[Path], Said]] = {
     "cores": _cores,
     "memory": _memory,
     "open files": _files,
-    "shared memory": _shared_memory,
     "zenoh": _zenoh,
     "ports": _ports,
     "clock": _clock,
-    "view": _view,
+    "browser": _browser,
     "disk": _disk,
 }
 """What is looked at, in order."""

@@ -17,7 +17,7 @@ from launch_scripts.simulation.world.walks import Budget, TrueTerrain, WalkWorld
 from planner_service.strategy import Growths, StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from shared_map.arrays import Floats
-from shared_map.terrain.cost_layers import CostWorld, checked_layer, cost_world
+from shared_map.terrain.cost_layers import checked_layer, cost_world
 from swarm.config.explain import choice
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import PlannerConfig
@@ -30,8 +30,8 @@ from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 
-Broken = Iterator[str]
-"""Sentences, each on one promise that is not kept."""
+Tell = Callable[[str], object]
+"""Takes a sentence on a promise that is not kept."""
 SIDES = ((1, 1), (1, 9), (7, 1), (13, 17), (40, 30))
 """Rows and columns of the worlds."""
 _TARGETS, _TICK_S = 4, 0.1
@@ -73,14 +73,20 @@ def check_plugin(
     if kind not in PLUGIN_KINDS:
         raise ConfigError(f"no kind of plug-in {kind!r}{choice(kind, list(PLUGIN_KINDS))}")
     named = NamedPlugin(PLUGIN_KINDS[kind], kind, name, options or {})
-    broken: dict[str, None] = {}
+    broken: list[str] = []
     try:
         plugin = find_plugin(named, folder)
         for seed in seeds:
-            broken.update(dict.fromkeys(_CHECKS[kind](plugin, seed)))
+            answers = _ASKED[kind](plugin, seed, broken.append)
+            # A seed replays a run only if a plug-in answers the same when it is made and asked again.
+            if not broken and _ASKED[kind](plugin, seed, broken.append) != answers:
+                again = (
+                    "answers differently when it is made and asked again: take chance from its world's seed alone"
+                )
+                broken.append(f"{PLUGIN_KINDS[kind].method} {again}")
     except SwarmError as error:
-        broken[str(error)] = None
-    return list(broken)
+        broken.append(str(error))
+    return list(dict.fromkeys(broken))
 
 
 def _grounds(seed: int) -> Iterator[_Ground]:
@@ -95,104 +101,67 @@ def _grounds(seed: int) -> Iterator[_Ground]:
         yield _Ground(GridSpec(rows, cols, 10.0), pace, elevation_m, chance)
 
 
-def _same_twice(what: str, answers: Callable[[], object]) -> Broken:
-    """A seed replays a run only if a plug-in answers the same when it is made and asked again."""
-    if answers() != answers():
-        yield f"{what} answers differently when it is made and asked again: take chance from its world's seed alone"
-
-
-def _sensor(plugin: Plugin, seed: int) -> Broken:
-    told: list[str] = []
+def _sensor(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
+    answers: list[object] = []
     for ground in _grounds(seed):
-        world = SensorWorld(ground.grid, ground.pace, 35.0, "a0", seed)
+        sensor = sensor_of(plugin, SensorWorld(ground.grid, ground.pace, 35.0, "a0", seed), tell)
         cells = ground.chance.choice(ground.passable, 25).tolist()
         looks = [[], [0], [ground.grid.cells - 1], cells, cells[:1] * 3]
-
-        def see(world: SensorWorld = world, looks: list[list[int]] = looks) -> list[object]:
-            sensor = sensor_of(plugin, world, told.append)
-            return [(sight.cells.tolist(), sight.paces.tolist()) for sight in map(sensor.look, looks)]
-
-        yield from _same_twice("look", see)
-    yield from told
+        answers += [(sight.cells.tolist(), sight.paces.tolist()) for sight in map(sensor.look, looks)]
+    return answers
 
 
-def _walk(plugin: Plugin, seed: int) -> Broken:
-    told: list[str] = []
+def _walk(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
+    way: list[object] = []
     for ground in _grounds(seed):
-        terrain = TrueTerrain(ground.grid, ground.pace)
+        world = WalkWorld("t", TrueTerrain(ground.grid, ground.pace), random.Random(seed), Budget())
+        chosen = walk_of(plugin, world, tell)
         vehicles = ground.chance.choice(ground.passable, 5).astype(np.int64)
-        places = ground.chance.choice(ground.passable, 4).tolist()
-
-        def wander(
-            ground: _Ground = ground,
-            terrain: TrueTerrain = terrain,
-            vehicles: NDArray[np.int64] = vehicles,
-            places: list[int] = places,
-        ) -> list[int]:
-            chosen = walk_of(plugin, WalkWorld("t", terrain, random.Random(seed), Budget()), told.append)
-            way: list[int] = []
-            for cell in places:  # it is captured, and goes on from there
-                for n in range(100):
-                    to = chosen.choose(cell, vehicles if n % 2 else vehicles[:0])
-                    cell = cell if to is None else to
-                    way.append(cell)
-            return way
-
-        yield from _same_twice("choose", wander)
-    yield from told
+        for cell in ground.chance.choice(ground.passable, 4).tolist():  # it is captured, and goes on from there
+            for n in range(100):
+                to = chosen.choose(cell, vehicles if n % 2 else vehicles[:0])
+                cell = cell if to is None else to
+                way.append(cell)
+    return way
 
 
-def _cost_layer(plugin: Plugin, seed: int) -> Broken:
+def _cost_layer(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
+    answers: list[object] = []
     for ground in _grounds(seed):
         classes = ground.chance.integers(0, 9, ground.pace.shape).astype(np.uint8)
         photo = ground.chance.integers(0, 255, (*ground.pace.shape, 3)).astype(np.uint8)
         for shown in (photo, None):
             world = cost_world(ground.grid, ground.elevation_m, classes, shown, seed)
-
-            def cost(world: CostWorld = world, pace: Floats = ground.pace) -> bytes:
-                return checked_layer(plugin, world, pace).tobytes()
-
-            yield from _same_twice("cost", cost)
+            answers.append(checked_layer(plugin, world, ground.pace).tobytes())
+    return answers
 
 
-def _assignment(plugin: Plugin, seed: int) -> Broken:
-    told: list[str] = []
+def _assignment(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
     chance = np.random.default_rng(seed)
     ids = tuple(f"t{n}" for n in range(_TARGETS))
-    tables = []
+    assigner = assigner_of(plugin, AssignmentWorld("a0", "all", ids, seed), tell)
+    answers: list[object] = []
     for targets, vehicles in ((1, 1), (1, 9), (_TARGETS, 1), (_TARGETS, 25), (_TARGETS, 4)):
         costs_s = chance.uniform(0, 900, (targets, vehicles))
         costs_s[chance.random((targets, vehicles)) < 0.3] = np.inf
         current = tuple(chance.integers(-1, targets, vehicles).tolist())
         names = tuple(f"a0-{n:02d}" for n in range(vehicles))
-        tables.append(CostTable(ids[:targets], names, costs_s, current))
-        tables.append(CostTable(ids[:targets], names, np.full_like(costs_s, np.inf), current))
-
-    def assign() -> list[object]:
-        assigner = assigner_of(plugin, AssignmentWorld("a0", "all", ids, seed), told.append)
-        return [assigner.assign(table).tolist() for table in tables]
-
-    yield from _same_twice("assign", assign)
-    yield from told
+        for costs in (costs_s, np.full_like(costs_s, np.inf)):
+            answers.append(assigner.assign(CostTable(ids[:targets], names, costs, current)).tolist())
+    return answers
 
 
-def _strategy(plugin: Plugin, seed: int) -> Broken:
-    told: list[str] = []
+def _strategy(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
     config, grid = PlannerConfig(k_min=1), GridSpec(48, 48, 10.0)
     chance = np.random.default_rng(seed)
     asked = [Growths(10.0**n, 1e7, int(chance.integers(1, 512)), 4**n, 10.0**n / 3) for n in (3, 9, 5, 11, 4)]
     world = StrategyWorld("t", grid, config)
-
-    def choose() -> list[object]:
-        strategy = strategy_of(plugin, world, told.append)
-        return [strategy.row(growths) for growths in asked]
-
-    yield from _same_twice("row", choose)
+    answers: list[object] = list(map(strategy_of(plugin, world, tell).row, asked))
     pace = chance.uniform(0.1, 0.5, (grid.rows, grid.cols)).astype(np.float32)
     pace[chance.random(pace.shape) < 0.2] = np.inf
     pace[24] = 0.1
     asked_from = np.ascontiguousarray(np.flatnonzero(np.isfinite(pace))[::7])
-    tree = TargetTree(grid, config, chosen_by=strategy_of(plugin, world, told.append))
+    tree = TargetTree(grid, config, chosen_by=strategy_of(plugin, world, tell))
     for n, growths in enumerate(asked * 4):
         target = grid.cell(24, 10 + n)
         tree.update(pace, target, [], 0)
@@ -200,19 +169,19 @@ def _strategy(plugin: Plugin, seed: int) -> Broken:
         for route in tree.routes(asked_from):
             cells = walk(grid, route.start, route.directions)
             if route.status is RouteStatus.OK and (cells[-1] != target or np.isinf(pace.flat[cells]).any()):
-                yield f"a route under it leads from cell {route.start} to {cells[-1]} instead of {target}"
-                return
-    yield from told
+                tell(f"a route under it leads from cell {route.start} to {cells[-1]} instead of {target}")
+                return answers
+    return answers
 
 
-def _dynamics(plugin: Plugin, seed: int) -> Broken:
-    told: list[str] = []
+def _dynamics(plugin: Plugin, seed: int, tell: Tell) -> list[object]:
     grid = GridSpec(40, 40, 10.0)
+    took: list[object] = []
     for pace_s_per_m in (0.05, 0.2, 2.0):
         chance = random.Random(seed)
-        driven = dynamics_of(plugin, DynamicsWorld("a0", grid, seed), told.append)
+        driven = dynamics_of(plugin, DynamicsWorld("a0", grid, seed), tell)
         if driven is None:
-            return
+            return took
         cells = [grid.cell(20, 5)]
         while len(cells) < 16:
             row, col = grid.row_col(cells[-1])
@@ -231,14 +200,15 @@ def _dynamics(plugin: Plugin, seed: int) -> Broken:
                     done += 1
                     granted = granted[1:]
         if done < len(cells) - 1:
-            yield (
+            tell(
                 f"speed: a vehicle that was granted all its way over ground of {1 / pace_s_per_m:g} m/s came only "
                 f"{done} of {len(cells) - 1} cells in {most_s:.0f} s; let it crawl at least"
             )
-    yield from told
+        took.append(ticks)
+    return took
 
 
-_CHECKS: Mapping[str, Callable[[Plugin, int], Broken]] = {
+_ASKED: Mapping[str, Callable[[Plugin, int, Tell], list[object]]] = {
     "sensor": _sensor,
     "walk": _walk,
     "cost_layer": _cost_layer,
@@ -246,3 +216,4 @@ _CHECKS: Mapping[str, Callable[[Plugin, int], Broken]] = {
     "strategy": _strategy,
     "dynamics": _dynamics,
 }
+"""Kind -> what asks a plug-in of it in the worlds of a seed, and returns all answers."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from launch_scripts.check.findings import Finding, failure, refused, warning
+from launch_scripts.check.findings import Finding, failure, warning
 from launch_scripts.process_table import ROLES, certificate_names
 from shared_map.arrays import Bools, Floats
 from shared_map.class_grounds import ClassGround, class_grounds
@@ -136,7 +136,10 @@ def plugins(scenario: Scenario, roles: Collection[str] = ROLES) -> Iterator[Find
     """Plug-ins that cannot be imported, or do not take their options. Runs their modules."""
     for named in plugins_of(scenario):
         if named.kind.role in roles or named.kind.role == "any":
-            yield from refused(named.key, find_plugin, named, scenario.plugin_folder)
+            try:
+                find_plugin(named, scenario.plugin_folder)
+            except SwarmError as error:
+                yield failure(named.key, str(error).removeprefix(f"{named.key}: "))
 
 
 def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:

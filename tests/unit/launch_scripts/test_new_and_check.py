@@ -33,7 +33,7 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from vehicle_agent.placement import spawn_cells
 
-ROOMY = machine.Machine(64, None, None)
+ROOMY = machine.Machine(64, 1 << 40, 1 << 50)
 
 
 @pytest.fixture(autouse=True)
@@ -310,11 +310,11 @@ def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
     scenario = parse_scenario("[[groups]]\nvehicles = 1200\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
     wanted = machine.needs_of(scenario, 512**2)
-    (found,) = machine.against(scenario, wanted, machine.Machine(2, None, None), Path())
+    (found,) = machine.against(scenario, wanted, machine.Machine(2, 1 << 40, 1 << 50), Path())
     assert found.level == "warning"
     assert "1,200 vehicles of 48 agents and 10 targets at 5 Hz keep about 1.7 cores busy, and there" in found.text
     assert "there are 2: ticks will be late; a larger vehicles.per_agent, fewer of them, a lower" in found.text
-    assert list(machine.against(scenario, wanted, machine.Machine(4, None, None), Path())) == []
+    assert list(machine.against(scenario, wanted, machine.Machine(4, 1 << 40, 1 << 50), Path())) == []
 
 
 @pytest.mark.parametrize(
