@@ -23,7 +23,7 @@ from launch_scripts.deploy import certificates, revocations
 from launch_scripts.deploy.host_scenario import CERTIFICATES
 from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import keepers_before, write_kits
-from launch_scripts.deploy.machine_plan import COLUMNS, Plan, make_plan, rows
+from launch_scripts.deploy.machine_plan import Plan, ids_of, make_plan
 from launch_scripts.deploy.machine_plan import as_json as plan_fields
 from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
 from launch_scripts.deploy.size import (
@@ -33,11 +33,11 @@ from launch_scripts.deploy.size import (
     Needs,
     Swarm,
     fewest_machines,
-    measured_table,
+    reaches,
     too_much,
 )
 from launch_scripts.launcher.options import common_run_id, find_scenario, own_certificate, with_network
-from launch_scripts.process_table import admitting_all, certificate_names
+from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from swarm.bus.access_control import ROUTER, bearer, common_name
 from swarm.config.input_files import quoted
 from swarm.config.load import check_endpoint
@@ -126,12 +126,17 @@ def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Pa
 def _show(made: Plan, kit: KitName) -> None:
     # One column a machine: names of processes are many and short, machines few.
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    machines = rows(made)
     table.add_column("")
-    for machine in machines:
-        table.add_column(Text(machine[0]), overflow="fold")
-    for n, column in enumerate(COLUMNS[1:], 1):
-        table.add_row(Text(column, "dim"), *(Text(machine[n] or "-") for machine in machines))
+    for host in made.hosts:
+        table.add_column(Text(host.name), overflow="fold")
+    rows = {
+        "address": [host.address for host in made.hosts],
+        **{role: [", ".join(ids_of(host, role)) for host in made.hosts] for role in ROLES},
+        "load": [f"{host.load:.2f} of {host.cores:g}" for host in made.hosts],
+        "terrain": ["files" if host.has_files else "from a keeper" for host in made.hosts],
+    }
+    for label, texts in rows.items():
+        table.add_row(Text(label, "dim"), *(Text(text or "-") for text in texts))
     console = Console(highlight=False)
     console.print(table)
     lost = made.survive
@@ -150,8 +155,8 @@ def size(
     tick_hz: Annotated[float, typer.Option(min=0.1, max=100)] = 5.0,
     standbys: Annotated[int, typer.Option(min=0, max=3)] = 0,
     cores: Annotated[int, typer.Option(min=1)] = 16,
-    memory: Annotated[float, typer.Option(min=0.1)] = 64.0,
-    link: Annotated[float, typer.Option(min=1)] = 1000.0,
+    memory: Annotated[float, typer.Option(min=0.1, max=1e6)] = 64.0,
+    link: Annotated[float, typer.Option(min=1, max=1e9)] = 1000.0,
     as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> int:
     """How many machines a swarm needs, by a table of swarms that were measured.
@@ -177,21 +182,18 @@ def size(
     link       Link of a machine, Mbit/s.
     as_json    Print one JSON object instead of tables.
     """
-    for option, value in (("--memory", memory), ("--link", link)):
-        if not math.isfinite(value):
-            raise ConfigError(f"{option} is {value}, expected a number")
-    least, most = max(_LEAST_SIDE**2, 4 * vehicles), _MOST_SIDE**2
-    if cells is not None and not least <= cells <= most:
-        raise ConfigError(f"--map is {cells}, expected {least} to {most} cells for {vehicles} vehicles")
+    least = max(_LEAST_SIDE**2, 4 * vehicles)
+    if cells is not None and not least <= cells <= _MOST_SIDE**2:
+        raise ConfigError(f"--map is {cells}, expected {least} to {_MOST_SIDE**2} cells for {vehicles} vehicles")
     side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), _LEAST_SIDE)
     if cells is not None:
         side = math.isqrt(cells - 1) + 1
     agents = -(-vehicles // per_agent)
     swarm = Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
-    runs, machine = measured_table(), Machine(cores, memory, link)
-    found = fewest_machines(Estimate(runs, swarm, standbys), machine)
+    machine = Machine(cores, memory, link)
+    found = fewest_machines(Estimate(swarm, standbys), machine)
     full = too_much(found, machine)
-    beyond = found.machines > 1 or not runs.reaches(swarm)
+    beyond = found.machines > 1 or not reaches(swarm)
     if as_json:
         typer.echo(json.dumps({**msgspec.to_builtins(found), "full": full, "extrapolated": beyond}))
     else:

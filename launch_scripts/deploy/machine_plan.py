@@ -34,8 +34,6 @@ _CORES = {"router": 0.11, "keeper": 0.04, "monitor": 0.17, "targets": 0.09}
 _CORES_PER_VEHICLE = 0.00066
 """Of an agent; from the same table."""
 ROUTER, KEEPER, AGENT = "router", "keeper", "agent"
-COLUMNS = ("machine", "address", *ROLES, "load", "terrain")
-"""Of `rows`."""
 
 
 class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
@@ -289,22 +287,9 @@ def as_json(plan: Plan) -> dict[str, Any]:
     }
 
 
-def rows(plan: Plan) -> list[tuple[str, ...]]:
-    """For each machine one text for each of `COLUMNS`."""
-    return [
-        (
-            host.name,
-            host.address,
-            *(", ".join(_shortened([each.id for each in host.of(role)])) for role in ROLES),
-            f"{host.load:.2f} of {host.cores:g}",
-            "files" if host.has_files else "from a keeper",
-        )
-        for host in plan.hosts
-    ]
-
-
-def _shortened(ids: list[str]) -> Iterator[str]:
-    """Ids with runs of three and more consecutive numbers as first and last: "a0 to a7"."""
+def ids_of(host: PlannedHost, role: str) -> Iterator[str]:
+    """Ids of a machine's processes, runs of three and more consecutive numbers as first and last: "a0 to a7"."""
+    ids = [each.id for each in host.of(role)]
     starts = [0, *(n for n, (one, other) in enumerate(pairwise(ids), 1) if not _follows(one, other)), len(ids)]
     for first, end in pairwise(starts):
         run = ids[first:end]

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -43,6 +43,7 @@ _SPREAD = ("agent", "planner")
 """Roles whose processes are shared out over all machines."""
 _SMOOTHING = 0.1
 """Of the interpolation: two runs of nearly one size differ by what else the machine did."""
+_FIGURES = ("cpu_ms_per_s", "memory_mb", "messages_in", "messages_out", "bytes_in", "bytes_out")
 _RUNS = Path(__file__).with_name("measured_runs.toml")
 
 
@@ -104,48 +105,41 @@ class Needs(msgspec.Struct, frozen=True, kw_only=True):
     sessions: int
 
 
-class MeasuredTable:
-    """The measured runs, and what lies between them."""
-
-    def __init__(self, runs: Sequence[Measured]) -> None:
-        self._runs = runs
-
-    @cached_property
-    def _places(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        return np.array([_place(run) for run in self._runs])
-
-    def process(self, figure: str, role: str, swarm: Swarm) -> float:
-        """A figure of one process of a role, in a swarm of this size."""
-        taken = [getattr(run, figure)[role] / _count(run, role) for run in self._runs]
-        between = RBFInterpolator(self._places, np.log(taken), kernel="linear", degree=1, smoothing=_SMOOTHING)
-        return float(np.exp(between([_place(swarm)])[0]))
-
-    def reaches(self, swarm: Swarm) -> bool:
-        """Whether no side of a swarm is larger than in all measured runs."""
-        return all(
-            getattr(swarm, name) <= max(getattr(run, name) for run in self._runs)
-            for name in ("vehicles", "targets", "agents", "side")
-        )
+@cache
+def measured_runs() -> list[Measured]:
+    """The table of measured swarms."""
+    return msgspec.convert(tomllib.loads(_RUNS.read_text())["runs"], list[Measured])
 
 
-def measured_table() -> MeasuredTable:
-    return MeasuredTable(msgspec.convert(tomllib.loads(_RUNS.read_text())["runs"], list[Measured]))
+def reaches(swarm: Swarm) -> bool:
+    """Whether no side of a swarm is larger than in all measured runs."""
+    sides = ("vehicles", "targets", "agents", "side")
+    return all(getattr(swarm, side) <= max(getattr(run, side) for run in measured_runs()) for side in sides)
+
+
+def one_process(swarm: Swarm) -> dict[str, dict[str, float]]:
+    """Figure -> role -> what one process takes in a swarm of this size."""
+    runs = measured_runs()
+    columns = [(figure, role) for figure in _FIGURES for role in getattr(runs[0], figure)]
+    taken = [[getattr(run, figure)[role] / _count(run, role) for figure, role in columns] for run in runs]
+    places = np.array(list(map(_place, runs)))
+    between = RBFInterpolator(places, np.log(taken), kernel="linear", degree=1, smoothing=_SMOOTHING)
+    found: dict[str, dict[str, float]] = {figure: {} for figure in _FIGURES}
+    for (figure, role), value in zip(columns, np.exp(between([_place(swarm)])[0]).tolist(), strict=True):
+        found[figure][role] = value
+    return found
 
 
 class Estimate:
     """What the processes of one swarm take, asked of the table once for any number of machines."""
 
-    def __init__(self, table: MeasuredTable, swarm: Swarm, standbys: int = 0) -> None:
+    def __init__(self, swarm: Swarm, standbys: int = 0) -> None:
         self._swarm = swarm
         self._count = dict.fromkeys((*ROLES, LAUNCHER), 1)
         self._count |= {"agent": swarm.agents, "planner": swarm.targets * (1 + standbys)}
-        self._cpu = {role: table.process("cpu_ms_per_s", role, swarm) / 1000 for role in self._count}
-        self._memory_gb = {role: table.process("memory_mb", role, swarm) / 1000 for role in self._count}
-        speaking = (*_SPREAD, *_SINGLE)
-        self._messages_in, self._messages_out, self._bytes_in, self._bytes_out = (
-            {role: table.process(figure, role, swarm) for role in speaking}
-            for figure in ("messages_in", "messages_out", "bytes_in", "bytes_out")
-        )
+        self._one = one_process(swarm)
+        self._cpu = {role: self._one["cpu_ms_per_s"][role] / 1000 for role in self._count}
+        self._memory_gb = {role: self._one["memory_mb"][role] / 1000 for role in self._count}
 
     def on(self, machines: int) -> Needs:
         """What the swarm needs on so many machines."""
@@ -156,9 +150,10 @@ class Estimate:
         single = sum(min(self._cpu[role], 1.0) for role in (*_SINGLE, LAUNCHER))
         both = self._memory_gb[LAUNCHER] + self._memory_gb["router"]
         memory = both + spread * sum(self._memory_gb[role] * count[role] for role in _SPREAD)
-        messages, first_messages = self._enters(self._messages_in, self._messages_out, machines)
-        size, first_size = self._enters(self._bytes_in, self._bytes_out, machines)
-        leaves, said = (self._sum(sent, self._count) for sent in (self._bytes_out, self._messages_out))
+        one = self._one
+        messages, first_messages = self._enters(one["messages_in"], one["messages_out"], machines)
+        size, first_size = self._enters(one["bytes_in"], one["bytes_out"], machines)
+        leaves, said = (self._sum(one[sent], count) for sent in ("bytes_out", "messages_out"))
         return Needs(
             size=self._swarm,
             machines=machines,
