@@ -30,7 +30,7 @@ from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 
-Tell = Callable[[str], object]
+Tell = Callable[[str], None]
 """Takes a sentence on a promise that is not kept."""
 SIDES = ((1, 1), (1, 9), (7, 1), (13, 17), (40, 30))
 """Rows and columns of the worlds."""

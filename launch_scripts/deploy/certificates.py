@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import ipaddress
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -40,19 +40,18 @@ class Authority(NamedTuple):
 def authority(folder: Path) -> Authority:
     """The authority whose `ca.pem` and `ca.key` lie in the folder; made there if there is none. Raises
     StoreError where they cannot be read or written, do not belong together, or are not valid today."""
-    path = folder / f"{CA}.pem"
+    path, secret = folder / f"{CA}.pem", folder / f"{CA}.key"
     if path.exists():
-        return _read_authority(folder)
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = _name("swarm authority")
+        check_signed(path, path, secret)
+        key = _key(secret)
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise StoreError(f"{secret} is no key of an elliptic curve; {_NEW_AUTHORITY}")
+        return Authority(_read(path), key)
+    key, name = ec.generate_private_key(ec.SECP256R1()), _name("swarm authority")
     # Signs certificates and lists of revoked ones, and is for nothing else.
     usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
-    certificate = (
-        _begun(name, name, key.public_key(), _in_days(_CA_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(usage, critical=True)
-        .sign(key, hashes.SHA256())
-    )
+    extensions = {x509.BasicConstraints(ca=True, path_length=0): True, usage: True}
+    certificate = _begun(name, name, key, _in_days(_CA_DAYS), extensions).sign(key, hashes.SHA256())
     _write(folder, CA, certificate, key)
     return Authority(certificate, key)
 
@@ -80,32 +79,38 @@ def issue(
     # A certificate is refused once its authority has expired, so it promises no more than that.
     end = min(_in_days(days), signer.certificate.not_valid_after_utc)
     key = ec.generate_private_key(ec.SECP256R1())
-    begun = _begun(_name(called or name), signer.certificate.subject, key.public_key(), end)
-    begun = begun.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-    for extension in (
-        x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]),
-        x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]),
-        x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key()),
-    ):
-        begun = begun.add_extension(extension, critical=False)
-    certificate = begun.sign(signer.key, hashes.SHA256())
-    _write(folder, name, certificate, key)
+    extensions = {
+        x509.BasicConstraints(ca=False, path_length=None): True,
+        x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]): False,
+        x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]): False,
+        x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key()): False,
+    }
+    begun = _begun(_name(called or name), signer.certificate.subject, key, end, extensions)
+    _write(folder, name, begun.sign(signer.key, hashes.SHA256()), key)
     return path
 
 
 def _begun(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, end: datetime.datetime
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    end: datetime.datetime,
+    extensions: Mapping[x509.ExtensionType, bool],
 ) -> x509.CertificateBuilder:
-    return (
+    """A certificate to be signed. `extensions`: whether who does not know one has to refuse the certificate."""
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
-        .public_key(key)
+        .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(_in_days(0) - _CLOCKS_DIFFER)
         .not_valid_after(end)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
+    for extension, is_critical in extensions.items():
+        builder = builder.add_extension(extension, is_critical)
+    return builder
 
 
 def _name(common: str) -> x509.Name:
@@ -123,16 +128,6 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.DNSName(host)
     except ValueError as error:
         raise ConfigError(f"host {host!r} is neither an address nor a name in ASCII") from error
-
-
-def _read_authority(folder: Path) -> Authority:
-    with _pem(f"the authority in {folder} is no certificate and key"):
-        certificate = _certificate(folder / f"{CA}.pem")
-        key = _key(folder / f"{CA}.key")
-    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-        raise StoreError(f"{folder / CA}.key is not the key of {folder / CA}.pem")
-    _check_today(certificate, folder / f"{CA}.pem", _NEW_AUTHORITY)
-    return Authority(certificate, key)
 
 
 def hosts_of(path: Path) -> set[str]:

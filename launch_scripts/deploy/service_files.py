@@ -89,16 +89,6 @@ class Container(NamedTuple):
     image: str
     words: list[str]
 
-    @property
-    def lasting(self) -> bool:
-        """Whether what it writes must outlive the container."""
-        return TABLE[self.process.role].lasting
-
-    @property
-    def certificate_files(self) -> tuple[str, str, str]:
-        """Names of the authority's certificate, its own and its key."""
-        return "ca.pem", f"{self.process.certificate}.pem", f"{self.process.certificate}.key"
-
 
 def containers_of(plan: Plan, host: PlannedHost, image: str = "") -> list[Container]:
     """One for each process of a machine, in its order. `image`: of the roles; if empty, that of this version. A
@@ -142,9 +132,8 @@ def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Seque
         # One name for the machine and the run: the same folder may be unpacked anywhere.
         name=dns_label(f"swarm-{plan.run_id}-{host.name}"),
         containers=containers,
-        files=sorted({name for each in containers for name in each.certificate_files}),
         mounted=[_SCENARIO, *([PLUGINS] if plugin_files(plan.scenario) else []), *([GROUND] if ground else [])],
-        memory_mib={role: row.memory_mib for role, row in TABLE.items()},
+        table=TABLE,
         router=router_name(host),
         routers=[each.name for each in containers if each.process.role == ROUTER],
     )

@@ -22,6 +22,7 @@ from support.effort import few
 from launch_scripts.cli import command
 from launch_scripts.deploy.machine_plan import Plan
 from launch_scripts.deploy.service_files import COMPOSE_FILE, HEALTH_PORT, compose_files, containers_of, dns_label
+from launch_scripts.process_table import TABLE
 from swarm.config.load import parse_scenario
 
 LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
@@ -142,7 +143,7 @@ def test_each_process_of_a_machine_is_one_service_that_may_do_nothing_but_its_wo
             written = [volume["target"] for volume in service["volumes"] if volume["type"] == "volume"]
             in_memory = [mount.partition(":")[0] for mount in service["tmpfs"]]
             assert sorted((*written, *in_memory)) == ["/tmp", "/var/lib/swarm"]
-            assert ("/var/lib/swarm" in written) == each.lasting
+            assert ("/var/lib/swarm" in written) == TABLE[each.process.role].lasting
             assert all(volume.get("read_only") for volume in service["volumes"] if volume["type"] == "bind")
             assert set(service.get("depends_on", {})) <= set(compose["services"])
         used = {

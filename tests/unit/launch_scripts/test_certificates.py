@@ -74,7 +74,7 @@ def test_a_damaged_authority_is_told_of(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"ca.key is not the key of"):
         issue(tmp_path, "a1", [], 30)
     (tmp_path / "ca.key").write_text("nothing")
-    with pytest.raises(StoreError, match="is no certificate and key in PEM"):
+    with pytest.raises(StoreError, match="are not certificates and a key in PEM"):
         issue(tmp_path, "a1", [], 30)
     (tmp_path / "ca.key").unlink()
     with pytest.raises(StoreError, match=r"ca\.key: No such file"):
