@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +21,6 @@ from swarm.errors import ConfigError
 if TYPE_CHECKING:
     from launch_scripts.report.compare import LeftRun
     from launch_scripts.simulation.replay import Replayed
-    from swarm.recording.replaying import Difference
 
 app = typer.Typer()
 RunArgument = Annotated[
@@ -213,63 +213,44 @@ def replay(
     for row in replay_run(folder, process, until):
         rows.append(row)
         if not as_json:
-            typer.echo(_line(row))
+            typer.echo("\n".join(map(plain, _lines(row))))
     if as_json:
-        told = {
-            "run": str(folder),
-            "versions": others,
-            "processes": list(map(_fields, rows)),
-            "unreadable": refused,
-        }
-        typer.echo(json.dumps(told, indent=2))
+        told = {"versions": others, "processes": list(map(_fields, rows)), "unreadable": refused}
+        typer.echo(json.dumps({"run": str(folder), **told}, indent=2))
     else:
-        _explain(rows)
+        outcomes = [row.outcome for row in rows if row.outcome is not None]
+        events, outputs = (f"{sum(getattr(each, name) for each in outcomes):,}" for name in ("events", "outputs"))
+        same = f"{sum(row.same for row in rows)} of {len(rows)} recordings give the same"
+        typer.echo(f"{events} events, {outputs} outputs: {same}")
         for sentence in refused:
             typer.echo(plain(sentence))
     return int(bool(refused) or not all(row.same for row in rows))
 
 
-def _line(row: Replayed) -> str:
+def _lines(row: Replayed) -> Iterator[str]:
+    """A row of the table, and what explains it."""
     recorded, outcome = row.recorded, row.outcome
+    name = (recorded.process, recorded.life)
+    who = "{}, life {}".format(*name)
     if outcome is None:
-        return _ROW.format(recorded.process, recorded.life, "-", "-", "-", "not replayed")
-    if outcome.difference is not None:
-        result = f"differs at event {outcome.difference.event:,}"
+        yield _ROW.format(*name, "-", "-", "-", "not replayed")
+        yield f"{who}: {row.why}"
+        return
+    difference = outcome.difference
+    if difference is not None:
+        result = f"differs at event {difference.event:,}"
     elif outcome.damaged is not None:
         result = "damaged; same until there"
     else:
         result = "same" if outcome.ended == "ended as asked" else f"same ({outcome.ended})"
-    figures = (f"{outcome.events:,}", f"{outcome.outputs:,}", f"{outcome.seconds:.2f}")
-    return _ROW.format(recorded.process, recorded.life, *figures, plain(result))
-
-
-def _explain(rows: list[Replayed]) -> None:
-    for row in rows:
-        who = f"{row.recorded.process}, life {row.recorded.life}"
-        if row.outcome is None:
-            typer.echo(plain(f"{who}: {row.why}"))
-        elif row.outcome.difference is not None:
-            _show(who, row.outcome.difference)
-        elif row.outcome.damaged is not None:
-            typer.echo(plain(f"{who}: {row.recorded.path} is {row.outcome.damaged}"))
-    outcomes = [row.outcome for row in rows if row.outcome is not None]
-    same = sum(row.same for row in rows)
-    typer.echo(
-        f"{sum(each.events for each in outcomes):,} events, {sum(each.outputs for each in outcomes):,} outputs: "
-        f"{same} of {len(rows)} recordings give the same"
-    )
-
-
-def _show(who: str, difference: Difference) -> None:
-    typer.echo(plain(f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"))
-    typer.echo(f"    recorded: {_short(difference.recorded)}")
-    typer.echo(f"    replayed: {_short(difference.replayed)}")
-
-
-def _short(output: str | None) -> str:
-    if output is None:
-        return "nothing more"
-    return plain(output) if len(output) <= _SHOWN else f"{plain(output[:_SHOWN])} ..."
+    yield _ROW.format(*name, f"{outcome.events:,}", f"{outcome.outputs:,}", f"{outcome.seconds:.2f}", result)
+    if difference is not None:
+        yield f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"
+        for label, output in (("recorded", difference.recorded), ("replayed", difference.replayed)):
+            shown = "nothing more" if output is None else output[:_SHOWN]
+            yield f"    {label}: {shown}{' ...' if output and len(output) > _SHOWN else ''}"
+    elif outcome.damaged is not None:
+        yield f"{who}: {recorded.path} is {outcome.damaged}"
 
 
 def _fields(row: Replayed) -> dict[str, Any]:

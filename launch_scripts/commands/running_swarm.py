@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -150,18 +148,13 @@ def _network_of(folder: Path) -> NetworkConfig | None:
 def _newest_first(runs: Path) -> list[Path]:
     """Folders of runs: those that have left no report yet first, and of these the newest."""
     from launch_scripts.observe.run_folder import LAST, REPORT_FILE, RUN_FILE
-    from swarm.config.input_files import FileKind, read_text
-    from swarm.errors import SwarmError
-
-    def newness(folder: Path) -> tuple[bool, str, str]:
-        began = ""
-        # A folder whose file says nothing is sorted by its name alone.
-        with suppress(OSError, ValueError, KeyError, TypeError, RecursionError, SwarmError):
-            began = str(json.loads(read_text(folder / RUN_FILE, FileKind.RUN))["began"])
-        return not (folder / REPORT_FILE).exists(), began, folder.name
 
     try:
         folders = [each for each in runs.iterdir() if each.name != LAST and (each / RUN_FILE).is_file()]
     except OSError:
         return []
+
+    def newness(folder: Path) -> tuple[bool, float]:
+        return not (folder / REPORT_FILE).exists(), (folder / RUN_FILE).stat().st_mtime
+
     return sorted(folders, key=newness, reverse=True)[:_NEWEST]

@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-import signal
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -92,8 +90,6 @@ def _simulate_once(
 
     if name in WORLDS:
         raise ConfigError(f"{name!r} is a small world, which goes with --seeds A:B; without it give a scenario")
-    if trace is not None and not trace.parent.is_dir():
-        raise StoreError(f"cannot write --trace {trace}: there is no folder {trace.parent}")
     scenario = find_scenario(name)
     terminal = Terminal(as_json, plain=True)
     with contextlib.ExitStack() as stack:
@@ -231,15 +227,17 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
 
     from launch_scripts.simulation.study.study import study_path
     from launch_scripts.simulation.study.sweep import NUMBERS, Sweep
+    from launch_scripts.stop_requests import stop_requests
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
     kept = sweep.trials - len(sweep.missing)
     if kept:
         console.print(f"{kept:,} of {sweep.trials:,} trials are kept from before in {sweep.folder}")
-    stops = _hear_stops()
     try:
-        _run(sweep, console, workers or CPU_COUNT, scheduler, stops)
+        # SIGTERM, too, as a batch system or `timeout` ends a sweep: workers and their folder go with it.
+        with stop_requests() as stopping:
+            _run(sweep, console, workers or CPU_COUNT, scheduler, stopping)
     except KeyboardInterrupt:
         there = sum(trial.key in sweep.store.results for trial in sweep.missing) + kept
         with contextlib.suppress(KeyboardInterrupt):
@@ -253,26 +251,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     return not summary.failing and not summary.missing
 
 
-def _hear_stops() -> list[int]:
-    """The signals to stop that have come, to which more are added as they come. Each interrupts at once, too; but
-    what is raised while Python clears something away, as a future of Dask, is lost.
-
-    SIGTERM is one of them, as a batch system or `timeout` ends a sweep: workers and their folder go with it.
-    """
-    stops: list[int] = []
-    interrupt = signal.getsignal(signal.SIGINT)
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        stops.append(number)
-        if callable(interrupt):
-            interrupt(signal.SIGINT, frame)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
-    return stops
-
-
-def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, stops: list[int]) -> None:
+def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, stopping: Callable[[], bool]) -> None:
     from launch_scripts.launcher.console import progress
 
     failed, done = 0, sweep.trials - len(sweep.missing)
@@ -287,7 +266,7 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
             if result is None:
                 console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
             tell(f"{done:,} of {sweep.trials:,} trials, {failed:,} broke a law", done / sweep.trials)
-            if stops:
+            if stopping():
                 raise KeyboardInterrupt
 
         sweep.run(workers, scheduler, told)

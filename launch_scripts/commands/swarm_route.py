@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 
-from launch_scripts.commands.route_files import DescribedRoute, metres_along, write_route
+from launch_scripts.commands.terrain_routes import DescribedRoute, metres_along, write_route
 from launch_scripts.observe.run_observer import frame_of_run
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.classes import GROUND
