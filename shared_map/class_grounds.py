@@ -207,20 +207,19 @@ def _save(folder: Path, key: str, ground: ClassGround) -> None:
     arrays: dict[str, NDArray[Any]] = {"truth": ground.truth, "homes": ground.homes}
     if ground.terrain.flight_m is not None:
         arrays["flight"] = ground.terrain.flight_m
-    save_ground(folder / _META, ground.terrain, arrays, {"key": key})
+    save_ground(folder / _META, ground.terrain, arrays, key)
 
 
 def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str) -> ClassGround | None:
     """None if there is none, or one of another key. Raises TerrainError if it is damaged."""
-    meta_file, grid = folder / _META, common.grid
-    meta = read_meta(meta_file, key)
+    meta = read_meta(folder / _META, key)
     if meta is None:
         return None
-    shape = (grid.rows, grid.cols)
+    shape = common.grid.shape
     flight_m = read_array(folder, "flight", shape, np.float32) if flies(scenario, name) else None
     terrain = replace(
         common,
-        **read_ground(meta_file, meta, grid, common.elevation_m if flight_m is None else flight_m),
+        **read_ground(folder / _META, meta, common.elevation_m if flight_m is None else flight_m),
         flight_m=flight_m,
         zones=common.zones if flight_m is None else (),
         least_s_per_m=least_pace(class_named(scenario, name)),

@@ -105,6 +105,11 @@ class GridSpec:
             raise ValueError(f"resolution_m must be positive, not {self.resolution_m}")
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Of an array with an entry per cell."""
+        return self.rows, self.cols
+
+    @property
     def cells(self) -> int:
         """How many cells there are; valid cells are 0 to one less."""
         return self.rows * self.cols

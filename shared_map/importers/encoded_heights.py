@@ -5,9 +5,6 @@ Between two colours lies no height: one step of red is 6,553.6 m in Terrain-RGB 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -107,17 +104,12 @@ def _is_colours(dataset: Any) -> bool:
     return dataset.count in (3, 4) and all(dtype == "uint8" for dtype in dataset.dtypes)
 
 
-@contextmanager
-def heights_decoded(
-    dataset: Any, encoding: Encoding, path: Path, crs: Any, transform: Any
-) -> Iterator[tuple[Any, list[str]]]:
-    """(a dataset of the decoded heights at a place, NaN for no height; what people should know of it).
+def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> tuple[Floats, list[str]]:
+    """(heights of an image, float32 (rows, cols), m, NaN for none; what people should know of them).
 
     Raises TerrainError if the image is no such one, too large, or was compressed with loss, which leaves no height
     as it was.
     """
-    from rasterio.io import MemoryFile
-
     what = f"terrain {path}"
     if not _is_colours(dataset):
         raise TerrainError(
@@ -131,22 +123,13 @@ def heights_decoded(
     rows, cols = dataset.height, dataset.width
     if rows * cols > _MOST_CELLS:
         raise TerrainError(f"{what} has {rows} x {cols} pixels, {size(4 * rows * cols)} of heights; crop it")
-    profile = {"driver": "GTiff", "height": rows, "width": cols, "count": 1, "dtype": "float32", "nodata": math.nan}
-    profile |= {"crs": crs, "transform": transform}
-    voids = 0
-    with MemoryFile() as memory:
-        with memory.open(**profile) as copy:
-            for row0, row1 in bands(rows, READ_ROWS):
-                window = ((row0, row1), (0, cols))
-                heights = decoded(dataset.read((1, 2, 3), window=window), encoding)
-                heights[dataset.dataset_mask(window=window) == 0] = np.nan
-                voids += int(np.isnan(heights).sum())
-                copy.write(heights, 1, window=window)
-        notes = []
-        if voids:
-            notes.append(f"{voids / (rows * cols):.1%} of the image is black or transparent: no height")
-        with memory.open() as copy:
-            yield copy, notes
+    heights = np.empty((rows, cols), np.float32)
+    for row0, row1 in bands(rows, READ_ROWS):
+        window = ((row0, row1), (0, cols))
+        heights[row0:row1] = decoded(dataset.read((1, 2, 3), window=window), encoding)
+        heights[row0:row1][dataset.dataset_mask(window=window) == 0] = np.nan
+    void = float(np.isnan(heights).mean())
+    return heights, [f"{void:.1%} of the image is black or transparent: no height"] if void else []
 
 
 def _is_lossy(dataset: Any) -> bool:

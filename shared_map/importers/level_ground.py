@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.importers.level_patches import Patches, level_patches
-from shared_map.terrain.row_bands import bands, looked_up
+from shared_map.terrain.row_bands import bands
 from swarm.config.ground import TerrainConfig
 
 MOST_SAMPLED = 1 << 24
@@ -51,7 +51,6 @@ _AROUND_BLOCKS = 5
 _NOISY = 0.28
 """Water that a laser measured is rough by a decimetre or two, and level in the mean of 4 x 4 cells. From cell to
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
-_BLOCK_ROWS = 32
 _TOLD_SHARE = 0.001
 
 
@@ -87,19 +86,17 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     if not known.all():
         elevation_m = np.where(known, elevation_m, np.float32(np.nan))
     elevation_m = np.ascontiguousarray(elevation_m)
-    del known
     step_m = _step_m(elevation_m)
     coarse = step_m >= _COARSE_M
     found = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE, step_m)
     water, unsure = _judged(found, _STILL_M)
-    mask = looked_up(water, found.labels)
+    mask: Bools = water[found.labels]
     rippled = water & (found.ripple > _LEAST_RIPPLES * found.differ)
     if rippled.any():
         _add_ripples(elevation_m, found, rippled, mask)
     numbers = np.flatnonzero(water)
     patches = [(float(found.height_m[n]), int(found.cells[n])) for n in numbers.tolist()]
     uncertain = float(found.cells[unsure].sum() / elevation_m.size)
-    del found
     if step_m < _ROUGH_M / _BLOCK_CELLS:
         patches += _rough_water(elevation_m, mask)
     patches.sort(key=lambda patch: -patch[1])
@@ -130,83 +127,52 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     rows, cols = (length // side for length in elevation_m.shape)
     if rows < 1 or cols < 1:
         return []
-    mean_m = np.empty((rows, cols), np.float32)
-    rough, noisy = np.empty((rows, cols), np.bool_), np.zeros((rows, cols), np.bool_)
-    for row0, row1 in bands(rows, _BLOCK_ROWS):
-        part = elevation_m[row0 * side : row1 * side, : cols * side].reshape(row1 - row0, side, cols * side)
-        mean_m[row0:row1] = _of_columns(np.add, part.sum(axis=1)) / np.float32(side * side)
-        range_m = _of_columns(np.maximum, part.max(axis=1)) - _of_columns(np.minimum, part.min(axis=1))
-        with np.errstate(invalid="ignore"):
-            rough[row0:row1] = ~(range_m <= np.float32(_ROUGH_M))
-        row, col = np.nonzero(~rough[row0:row1])
-        blocks = part.reshape(row1 - row0, side, cols, side)[row, :, col, :]
-        steps_m = sum(np.abs(np.diff(blocks, axis=axis)).mean(axis=(1, 2)) for axis in (1, 2))
-        noisy[row + row0, col] = steps_m > np.float32(2 * _NOISY) * range_m[row, col]
+    blocks = elevation_m[: rows * side, : cols * side].reshape(rows, side, cols, side)
+    mean_m = blocks.mean(axis=(1, 3))
+    range_m = blocks.max(axis=(1, 3)) - blocks.min(axis=(1, 3))
+    with np.errstate(invalid="ignore"):
+        smooth = range_m <= np.float32(_ROUGH_M)
     # A rough block can be a shore, but no part of a patch.
-    still_m = np.where(rough, np.float32(np.nan), mean_m)
-    found = level_patches(still_m, _BLOCK_SAME_M, _LEAST_BLOCKS, 0.0, mean_m)
+    found = level_patches(np.where(smooth, mean_m, np.float32(np.nan)), _BLOCK_SAME_M, _LEAST_BLOCKS, 0.0, mean_m)
     water, _ = _judged(found, _BLOCK_STILL_M)
-    water &= 2 * np.bincount(found.labels[noisy], minlength=water.size) > found.cells
+    row, col = np.nonzero(smooth)
+    cells = blocks[row, :, col, :]
+    steps_m = sum(np.abs(np.diff(cells, axis=axis)).mean(axis=(1, 2)) for axis in (1, 2))
+    noisy = steps_m > np.float32(2 * _NOISY) * range_m[row, col]
+    water &= 2 * np.bincount(found.labels[row, col][noisy], minlength=water.size) > found.cells
     if not water.any():
         return []
+    total_m = np.bincount(found.labels.reshape(-1), np.nan_to_num(mean_m).reshape(-1), water.size)
+    height_m = np.where(water, total_m / np.maximum(found.cells, 1), np.nan).astype(np.float32)
+
+    def of_cells(blocks: NDArray[np.int32]) -> tuple[NDArray[np.int32], Floats]:
+        """The number of each cell's block, the last one's beyond whole blocks; how far off its height a cell is."""
+        whole = np.pad(blocks, ((0, 1), (0, 1)), "edge").repeat(side, axis=0).repeat(side, axis=1)
+        of_cell = whole[: elevation_m.shape[0], : elevation_m.shape[1]]
+        return of_cell, np.abs(elevation_m - height_m[of_cell])
+
     lakes = np.where(water[found.labels], found.labels, 0)
-    wide = ndimage.maximum_filter(lakes, _AROUND_BLOCKS)
-    # What is left beyond whole blocks is as the last one.
-    lakes, wide = (np.pad(each, ((0, 1), (0, 1)), "edge") for each in (lakes, wide))
-    height_m = _means_of(mean_m, found)
-    before, taken = np.zeros(water.size, np.int64), np.zeros(water.size, np.int64)
+    of_cell, off_m = of_cells(lakes)
+    taken = np.bincount(of_cell.reshape(-1), minlength=water.size)
     rough_m = np.zeros(water.size, np.float32)
-
-    def of_band(blocks: NDArray[np.int32], row0: int, row1: int) -> tuple[NDArray[np.int32], Floats, Bools]:
-        part, known = elevation_m[row0 * side : row1 * side], mask[row0 * side : row1 * side]
-        of_cell = blocks[row0:row1].repeat(side, axis=0)[: part.shape[0]].repeat(side, axis=1)[:, : part.shape[1]]
-        return of_cell, np.abs(part - height_m[of_cell]), known
-
-    for row0, row1 in bands(rows, _BLOCK_ROWS):
-        of_cell, off_m, known = of_band(lakes, row0, row1)
-        before += np.bincount(of_cell[known], minlength=water.size)
-        taken += np.bincount(of_cell.reshape(-1), minlength=water.size)
-        np.maximum.at(rough_m, of_cell, off_m)
+    np.maximum.at(rough_m, of_cell, off_m)
     # What is exactly level has been found, with its shore to the cell.
-    water &= 2 * before < taken
+    water &= 2 * np.bincount(of_cell[mask], minlength=water.size) < taken
     rough_m[~water] = -1
-    for row0, row1 in bands(rows + 1, _BLOCK_ROWS):
-        of_cell, off_m, known = of_band(wide, row0, row1)
-        with np.errstate(invalid="ignore"):
-            known |= off_m <= rough_m[of_cell]
+    of_cell, off_m = of_cells(ndimage.maximum_filter(lakes, _AROUND_BLOCKS))
+    with np.errstate(invalid="ignore"):
+        mask |= off_m <= rough_m[of_cell]
     return [(float(height_m[n]), int(taken[n])) for n in np.flatnonzero(water).tolist()]
-
-
-def _of_columns(ufunc: np.ufunc, values: Floats) -> Floats:
-    """Every `_BLOCK_CELLS` columns made one."""
-    found = values[:, ::_BLOCK_CELLS]
-    for n in range(1, _BLOCK_CELLS):
-        found = ufunc(found, values[:, n::_BLOCK_CELLS])
-    return found
-
-
-def _means_of(mean_m: Floats, found: Patches) -> Floats:
-    total = np.bincount(found.labels.reshape(-1), np.nan_to_num(mean_m).reshape(-1), len(found.cells))
-    means: Floats = (total / np.maximum(found.cells, 1)).astype(np.float32)
-    means[0] = np.nan
-    return means
 
 
 def _add_ripples(elevation_m: Floats, found: Patches, rippled: Bools, mask: Bools) -> None:
     """Add to a mask of lakes what lies lower right beside them."""
     from scipy import ndimage
 
-    ring = _RING_CELLS
-    for row0, row1 in bands(elevation_m.shape[0]):
-        above, below = max(row0 - ring, 0), min(row1 + ring, elevation_m.shape[0])
-        lakes = found.labels[above:below]
-        lakes = np.where(rippled[lakes], lakes, 0)
-        if not lakes.any():
-            continue
-        near = ndimage.maximum_filter(lakes, 2 * ring + 1)[row0 - above : row1 - above]
-        above_m = elevation_m[row0:row1] - found.height_m[near]
-        with np.errstate(invalid="ignore"):
-            mask[row0:row1] |= (above_m <= _SAME_M) & (above_m >= -_SUNK_M)
+    lakes = np.where(rippled[found.labels], found.labels, 0)
+    above_m = elevation_m - found.height_m[ndimage.maximum_filter(lakes, 2 * _RING_CELLS + 1)]
+    with np.errstate(invalid="ignore"):
+        mask |= (above_m <= _SAME_M) & (above_m >= -_SUNK_M)
 
 
 def looked_at(
@@ -298,7 +264,7 @@ def undeclared_voids(
     tuple of float
         Usual codes for "no height", and 0, where no other height is near them.
     """
-    codes = _codes_in(heights)
+    codes = sorted(code for code in _GAPS_M if (heights == code).any())
     if not codes:
         return ()
     nearest = dict.fromkeys(codes, np.inf)
@@ -321,19 +287,6 @@ def undeclared_voids(
     return tuple(code for code in codes if nearest[code] >= _GAPS_M[code] and nearest[code] > _ALONE * widest)
 
 
-def _codes_in(heights: NDArray[np.floating] | NDArray[np.integer]) -> list[float]:
-    """Which of the usual codes are among heights, the lowest first."""
-    found: set[float] = set()
-    fit = [code for code in _GAPS_M if np.array(code).astype(heights.dtype) == code]
-    for row0, row1 in bands(heights.shape[0]):
-        band = heights[row0:row1]
-        if band.size:
-            lowest, highest = np.fmin.reduce(band, axis=None), np.fmax.reduce(band, axis=None)
-            near = [code for code in fit if code not in found and lowest <= code <= highest]
-            found.update(code for code in near if (band == code).any())
-    return sorted(found)
-
-
 def without(heights: Floats, voids: Sequence[float]) -> Floats:
     """Heights as stored, with NaN for each value that stands for no height."""
     if not voids:
@@ -354,15 +307,10 @@ def voids_of(elevation_m: Floats) -> int:
     int
         Cells that are NaN now.
     """
-    count = 0
-    for row0, row1 in bands(elevation_m.shape[0]):
-        band = elevation_m[row0:row1]
-        with np.errstate(invalid="ignore"):
-            good = np.abs(band) <= np.float32(HIGHEST_M)
-        if not good.all():
-            band[~good] = np.nan
-            count += int(good.size - np.count_nonzero(good))
-    return count
+    with np.errstate(invalid="ignore"):
+        void = ~(np.abs(elevation_m) <= np.float32(HIGHEST_M))
+    elevation_m[void] = np.nan
+    return int(np.count_nonzero(void))
 
 
 def fill_voids(elevation_m: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """Patches of equal height in a height model: connected cells, each as high as the next.
 
 Rows are cut into runs of equal cells, and runs that touch are one patch: a sea is some thousand runs, and a steep
-slope has none, so that no array but the labels is as large as the model.
+slope has none. Models are looked at in a sample of at most `level_ground.MOST_SAMPLED` cells, so all are at hand.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
-from shared_map.terrain.row_bands import bands
 
 _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
 """So many of its eight neighbours are as high as a cell of a patch: those of a creek one cell wide are two. Among
 means of blocks a chain of equal ones is a contour line."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
-_RUNS_AT_ONCE = 1 << 18
 _COUNTS = ("edge", "differ", "beside", "below", "lower", "ripple", "terrace", "steep")
 _RIPPLE_CELLS, _RIPPLE = 3, 4.0
 """A cubic filter undershoots beside a rise by less than a quarter of it, and leaves no more than these cells."""
+
+Labels = NDArray[np.int32]
+Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,18 +44,18 @@ class Patches:
     border    bool (count + 1,): whether it reaches the border of the model
     """
 
-    labels: NDArray[np.int32]
+    labels: Labels
     height_m: Floats
     spread_m: Floats
-    cells: NDArray[np.int64]
-    edge: NDArray[np.int64]
-    differ: NDArray[np.int64]
-    beside: NDArray[np.int64]
-    below: NDArray[np.int64]
-    lower: NDArray[np.int64]
-    ripple: NDArray[np.int64]
-    terrace: NDArray[np.int64]
-    steep: NDArray[np.int64]
+    cells: Counts
+    edge: Counts
+    differ: Counts
+    beside: Counts
+    below: Counts
+    lower: Counts
+    ripple: Counts
+    terrace: Counts
+    steep: Counts
     border: NDArray[np.bool_]
 
 
@@ -82,51 +83,35 @@ def level_patches(
     labels, cells = _labelled(
         elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE if ripples else _LEAST_ALIKE_MEANS
     )
-    count = len(cells) - 1
-    lowest, highest = np.full(count + 1, np.inf, np.float32), np.full(count + 1, -np.inf, np.float32)
-    sides = np.zeros((len(_COUNTS), count + 1), np.int64)
-    first = np.full(count + 1, np.nan, np.float32)
-    if count:
-        for row0, row1 in bands(elevation_m.shape[0]):
-            at = np.flatnonzero(labels[row0:row1])
-            of_cell, height_m = labels[row0:row1].reshape(-1)[at], elevation_m[row0:row1].reshape(-1)[at]
-            np.minimum.at(lowest, of_cell, height_m)
-            np.maximum.at(highest, of_cell, height_m)
-            numbers, begins = np.unique(of_cell, return_index=True)
-            new = np.isnan(first[numbers])
-            first[numbers[new]] = height_m[begins[new]]
-            _count_sides(shore_m, labels, (row0, row1), (cells, same_m, step_m, ripples), sides)
-    border = np.zeros(count + 1, np.bool_)
+    many = len(cells)
+    at = np.flatnonzero(labels)
+    of_cell, height_m = labels.reshape(-1)[at], elevation_m.reshape(-1)[at]
+    lowest, highest = np.full(many, np.inf, np.float32), np.full(many, -np.inf, np.float32)
+    np.minimum.at(lowest, of_cell, height_m)
+    np.maximum.at(highest, of_cell, height_m)
+    first = np.full(many, np.nan, np.float32)
+    first[of_cell[::-1]] = height_m[::-1]  # of cells of one patch the last that is written stays
+    border = np.zeros(many, np.bool_)
     for line in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         border[line] = True
     border[0] = False
-    with np.errstate(invalid="ignore"):
-        spread_m = highest - lowest
-    counts: dict[str, NDArray[np.int64]] = dict(zip(_COUNTS, sides, strict=True))
-    return Patches(labels, first, spread_m, cells, border=border, **counts)
+    sides = _sides(shore_m, labels, cells, same_m, step_m, ripples)
+    return Patches(labels, first, highest - lowest, cells, border=border, **sides)
 
 
-def _count_sides(
-    elevation_m: Floats,
-    labels: NDArray[np.int32],
-    rows: tuple[int, int],
-    known: tuple[NDArray[np.int64], float, float, bool],
-    sides: NDArray[np.int64],
-) -> None:
-    """Add to the counts of `Patches`, `edge` and what follows it, what lies beyond the sides of a band's cells."""
-    cells, same_m, step_m, ripples = known
-    row0, row1 = rows
+def _sides(
+    elevation_m: Floats, labels: Labels, cells: Counts, same_m: float, step_m: float, ripples: bool
+) -> dict[str, Counts]:
+    """The counts of `Patches`, `edge` and what follows it: what lies beyond the sides of each patch's cells."""
     height, width = elevation_m.shape
+    total = {name: np.zeros(len(cells), np.int64) for name in _COUNTS}
     for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        first, end = max(row0, -down), min(row1, height - down)
-        left, stop = max(-right, 0), width - max(right, 0)
-        if first >= end:
-            continue
-        of_cell = labels[first:end, left:stop]
-        of_next = labels[first + down : end + down, left + right : stop + right]
+        top, left = max(-down, 0), max(-right, 0)
+        of_cell = labels[top : height - max(down, 0), left : width - max(right, 0)]
+        of_next = labels[max(down, 0) : height - top, max(right, 0) : width - left]
         row, col = np.nonzero((of_cell > 0) & (of_next != of_cell))
         patch, beyond = of_cell[row, col], of_next[row, col]
-        row, col = row + first, col + left
+        row, col = row + top, col + left
         height_m = elevation_m[row, col]
         above_m = elevation_m[row + down, col + right] - height_m
         far_row = np.clip(row + _RIPPLE_CELLS * down, 0, height - 1)
@@ -138,42 +123,41 @@ def _count_sides(
             low = differs & (above_m < 0)
             ripple = (far_m > -_RIPPLE * above_m) & ripples
         beside = differs & (beyond > 0) & (4 * cells[beyond] >= cells[patch])
-        low_land = low & ~beside
-        land = (low_land & ~ripple, low_land & ripple)
-        of_kind = (None, differs, beside, beside & low, *land, beside & near, differs & ~near)
-        for n, counted in enumerate(of_kind):
-            of_side = patch if counted is None else patch[counted]
-            sides[n] += np.bincount(of_side, minlength=len(cells))
+        land = low & ~beside
+        kinds = {
+            "edge": np.ones_like(low),
+            "differ": differs,
+            "beside": beside,
+            "below": beside & low,
+            "lower": land & ~ripple,
+            "ripple": land & ripple,
+            "terrace": beside & near,
+            "steep": differs & ~near,
+        }
+        for name, there in kinds.items():
+            total[name] += np.bincount(patch[there], minlength=len(cells))
+    return total
 
 
-def _labelled(
-    elevation_m: Floats, same_m: np.float32, least_cells: int, least_alike: int
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _labelled(elevation_m: Floats, same_m: np.float32, least_cells: int, least_alike: int) -> tuple[Labels, Counts]:
     """(labels, cells of each patch), numbered as they come from the north-west."""
-    rows, cols = elevation_m.shape
-    labels = np.zeros((rows, cols), np.int32)
     starts, ends = _runs(elevation_m, same_m, least_alike)
     if starts.size == 0:
-        return labels, np.zeros(1, np.int64)
-    of_run = _connected(starts.size, *_touching(elevation_m.reshape(-1), starts, ends, cols, same_m))
-    lengths = ends - starts + 1
-    cells = np.bincount(of_run, lengths).astype(np.int64)
-    number = np.zeros(cells.size, np.int32)
+        return np.zeros(elevation_m.shape, np.int32), np.zeros(1, np.int64)
+    of_run = _connected(starts.size, *_touching(elevation_m, starts, ends, same_m))
+    cells = np.bincount(of_run, ends - starts + 1).astype(np.int64)
     kept = np.flatnonzero(cells >= least_cells)
+    number = np.zeros(cells.size, np.int32)
     number[kept] = np.arange(1, kept.size + 1)
-    of_run = number[of_run]
-    large = np.flatnonzero(of_run)
-    flat = labels.reshape(-1)
-    for n in range(0, large.size, _RUNS_AT_ONCE):
-        some = large[n : n + _RUNS_AT_ONCE]
-        long = lengths[some].astype(np.int64)
-        before = np.cumsum(long) - long
-        at = np.arange(long.sum()) + np.repeat(starts[some] - before, long)
-        flat[at] = np.repeat(of_run[some], long)
+    # The number of a run is entered at its first cell, taken back behind its last, and summed up along the cells.
+    steps = np.zeros(elevation_m.size + 1, np.int32)
+    steps[starts] += number[of_run]
+    steps[ends + 1] -= number[of_run]
+    labels = np.cumsum(steps[:-1], dtype=np.int32).reshape(elevation_m.shape)
     return labels, np.concatenate((np.zeros(1, np.int64), cells[kept]))
 
 
-def _connected(count: int, one: NDArray[np.int32], other: NDArray[np.int32]) -> NDArray[np.int32]:
+def _connected(count: int, one: Labels, other: Labels) -> Labels:
     """Of each of `count` runs the number of its patch, by pairs of runs that touch; patches come as their first
     runs do."""
     from scipy.sparse import coo_array
@@ -183,50 +167,34 @@ def _connected(count: int, one: NDArray[np.int32], other: NDArray[np.int32]) -> 
     return np.asarray(connected_components(pairs.tocsr(), directed=False)[1], np.int32)
 
 
-def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[Labels, Labels]:
     """First and last cell of each run of cells that are as high as their neighbours, as flat numbers."""
-    rows, cols = elevation_m.shape
-    starts, ends = [], []
-    for row0, row1 in bands(rows):
-        above, below = max(row0 - 1, 0), min(row1 + 1, rows)
-        part = elevation_m[above:below]
-        alike = np.zeros(part.shape, np.uint8)
-        beside = np.zeros(part.shape, np.bool_)
-        for down, right in _STEPS:
-            first = (slice(None, part.shape[0] - down), slice(max(-right, 0), cols - max(right, 0)))
-            second = (slice(down, None), slice(max(right, 0), cols - max(-right, 0)))
-            same = np.abs(part[second] - part[first]) <= same_m
-            alike[first] += same
-            alike[second] += same
-            if (down, right) == (0, 1):
-                beside[first] = same
-        inner = slice(row0 - above, row1 - above)
-        level = alike[inner] >= least_alike
-        joined = beside[inner, :-1] & level[:, :-1] & level[:, 1:]
-        begins, finishes = level.copy(), level.copy()
-        begins[:, 1:] &= ~joined
-        finishes[:, :-1] &= ~joined
-        starts.append((np.flatnonzero(begins) + row0 * cols).astype(np.int32))
-        ends.append((np.flatnonzero(finishes) + row0 * cols).astype(np.int32))
-    return np.concatenate(starts), np.concatenate(ends)
+    cols = elevation_m.shape[1]
+    alike = np.zeros(elevation_m.shape, np.uint8)
+    for down, right in _STEPS:
+        first = np.s_[: len(alike) - down, max(-right, 0) : cols - max(right, 0)]
+        second = np.s_[down:, max(right, 0) : cols - max(-right, 0)]
+        same = np.abs(elevation_m[second] - elevation_m[first]) <= same_m
+        alike[first] += same
+        alike[second] += same
+    level = alike >= least_alike
+    joined = (np.abs(np.diff(elevation_m, axis=1)) <= same_m) & level[:, :-1] & level[:, 1:]
+    begins, finishes = level.copy(), level.copy()
+    begins[:, 1:] &= ~joined
+    finishes[:, :-1] &= ~joined
+    return np.flatnonzero(begins).astype(np.int32), np.flatnonzero(finishes).astype(np.int32)
 
 
-def _touching(
-    flat_m: Floats, starts: NDArray[np.int32], ends: NDArray[np.int32], cols: int, same_m: np.float32
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _touching(elevation_m: Floats, starts: Labels, ends: Labels, same_m: np.float32) -> tuple[Labels, Labels]:
     """Numbers of runs, and of runs in the row below that touch them, be it at a corner, and are as high."""
-    ones, others = [], []
-    for n in range(0, starts.size, _RUNS_AT_ONCE):
-        begin, end = starts[n : n + _RUNS_AT_ONCE], ends[n : n + _RUNS_AT_ONCE]
-        row = begin // cols
-        first = np.searchsorted(ends, np.maximum(begin + (cols - 1), (row + 1) * cols))
-        last = np.searchsorted(starts, np.minimum(end + (cols + 1), (row + 2) * cols - 1), "right")
-        many = np.maximum(last - first, 0)
-        above = np.repeat(np.arange(begin.size), many)
-        below = np.arange(above.size) + np.repeat(first - (np.cumsum(many) - many), many)
-        at = np.clip(starts[below] - cols, begin[above], end[above])
-        under = np.clip(at + cols, starts[below], ends[below])
-        same = np.abs(flat_m[at] - flat_m[under]) <= same_m
-        ones.append((above[same] + n).astype(np.int32))
-        others.append(below[same].astype(np.int32))
-    return np.concatenate(ones), np.concatenate(others)
+    flat_m, cols = elevation_m.reshape(-1), elevation_m.shape[1]
+    row = starts // cols
+    first = np.searchsorted(ends, np.maximum(starts + (cols - 1), (row + 1) * cols))
+    last = np.searchsorted(starts, np.minimum(ends + (cols + 1), (row + 2) * cols - 1), "right")
+    many = np.maximum(last - first, 0)
+    above = np.repeat(np.arange(starts.size, dtype=np.int32), many)
+    below = np.arange(above.size, dtype=np.int32) + np.repeat(first - (np.cumsum(many) - many), many)
+    at = np.clip(starts[below] - cols, starts[above], ends[above])
+    under = np.clip(at + cols, starts[below], ends[below])
+    same = np.abs(flat_m[at] - flat_m[under]) <= same_m
+    return above[same], below[same].astype(np.int32)

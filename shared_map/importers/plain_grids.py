@@ -11,7 +11,6 @@ import itertools
 import math
 import warnings
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -93,7 +92,8 @@ def read_asc(path: Path) -> PlainGrid:
         at, rest = file.tell(), file.read(200).split()
         if rest:
             file.seek(0)
-            line = 1 + sum(part.count(b"\n") for part in _parts(file, at))
+            parts = iter(lambda: file.read(min(max(at - file.tell(), 0), 1 << 20)), b"")
+            line = 1 + sum(part.count(b"\n") for part in parts)
             found = rest[0][:40].decode("ascii", "replace")
             raise TerrainError(
                 f"terrain {path}, line {line}: found {found!r}; its header says {rows} rows of {cols} numbers"
@@ -105,13 +105,6 @@ def read_asc(path: Path) -> PlainGrid:
     west = header["xllcorner"] if "xllcorner" in header else header.get("xllcenter", half) - half
     south = header["yllcorner"] if "yllcorner" in header else header.get("yllcenter", half) - half
     return PlainGrid(heights.reshape(rows, cols), None, (step, step), west, south + rows * step)
-
-
-def _parts(file: IO[bytes], length: int) -> Iterator[bytes]:
-    """The first bytes of a file, some at a time."""
-    while length > 0 and (part := file.read(min(length, 1 << 20))):
-        length -= len(part)
-        yield part
 
 
 def _asc_header(file: IO[bytes], path: Path) -> dict[str, float]:
@@ -156,8 +149,11 @@ def read_npz(path: Path) -> PlainGrid:
     """
     arrays, held = _members(path)
     heights = arrays.get("elevation")
-    if heights is None or heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
-        raise TerrainError(f"terrain {path} has no two-dimensional `elevation` of numbers; it has {held}")
+    if heights is None:
+        raise TerrainError(f"terrain {path} has no `elevation`; it has {held}")
+    if heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
+        found = f"{heights.shape} {heights.dtype}"
+        raise TerrainError(f"terrain {path}: elevation is {found}; expected numbers in two dimensions")
     check_cells(heights.shape[0], heights.shape[1], path)
     photo = arrays.get("photo")
     if photo is not None and (photo.shape != (*heights.shape, 3) or photo.dtype != np.uint8):
@@ -186,7 +182,7 @@ def check_step(step: float, path: Path) -> None:
 
 
 def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
-    """The arrays of `_NPZ_ARRAYS` in an .npz, and what it holds, for people. Others are never unpacked."""
+    """The arrays of `_NPZ_ARRAYS` in an .npz, and the names of what it holds. Others are never unpacked."""
     kind = FileKind.ARRAYS
     check_bytes(path, kind)
     try:
@@ -197,11 +193,8 @@ def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
             if total > kind.most_bytes:
                 most = size(kind.most_bytes)
                 raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
-            shown = [
-                f"{name[:40]} {_shape_of(archive, info)}" for name, info in sorted(members.items())[:_SHOWN_MEMBERS]
-            ]
-            arrays = {name: _array(archive, info) for name, info in wanted.items()}
-            return arrays, ", ".join(shown) or "nothing"
+            held = ", ".join(name[:40] for name in sorted(members)[:_SHOWN_MEMBERS])
+            return {name: _array(archive, info) for name, info in wanted.items()}, held or "nothing"
     except OSError as error:
         raise kind.unreadable(path, error) from error
     except BAD_ARCHIVE as error:
@@ -218,44 +211,28 @@ class _ShortReads(io.FileIO):
         return super().read(-1 if count is None else count) or b""
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """(shape, type) of an array of numpy's, of which the header is read. Raises ValueError."""
-    try:
-        first = np.lib.format.read_magic(file) == (1, 0)
-        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file, max_header_size=_HEADER_BYTES)
-    except BAD_ARCHIVE:
-        raise
-    except Exception as error:  # of damaged headers numpy raises whatever their evaluation runs into
-        raise ValueError("its header is none of numpy's") from error
-    return shape, dtype
-
-
-def _shape_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> str:
-    try:
-        with archive.open(info) as file:
-            return str(_header(file)[0])
-    except BAD_ARCHIVE:
-        return "of no numbers"
-
-
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     """A member, whose header is looked at before memory is taken. Raises ValueError, or what zipfile raises."""
     with archive.open(info) as file:
-        shape, dtype = _header(file)
-        head = file.tell()
-    if dtype.kind not in "iufb" or dtype.itemsize > 8:
-        raise ValueError(f"it holds {str(dtype)[:40]!r}; expected numbers of at most 8 bytes")
-    cells = math.prod(shape)
-    if cells > 3 * MAX_CELLS:
-        raise ValueError(f"its header says {' x '.join(map(str, shape))}; at most {MAX_CELLS} cells are read")
-    if head + cells * dtype.itemsize != info.file_size:
-        promised, has = size(cells * dtype.itemsize), size(max(info.file_size - head, 0))
-        raise ValueError(f"its header promises {promised} of numbers, and it has {has}")
-    with archive.open(info) as file:
-        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_HEADER_BYTES)
-        file.read(1)  # at its end the checksum is compared
-    return array
+        try:
+            first = np.lib.format.read_magic(file) == (1, 0)
+            read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+            shape, in_columns, dtype = read(file, max_header_size=_HEADER_BYTES)
+        except BAD_ARCHIVE:
+            raise
+        except Exception as error:  # of damaged headers numpy raises whatever their evaluation runs into
+            raise ValueError("its header is none of numpy's") from error
+        if dtype.kind not in "iufb" or dtype.itemsize > 8:
+            raise ValueError(f"it holds {str(dtype)[:40]!r}; expected numbers of at most 8 bytes")
+        cells, has = math.prod(shape), info.file_size - file.tell()
+        if cells > 3 * MAX_CELLS:
+            raise ValueError(f"its header says {' x '.join(map(str, shape))}; at most {MAX_CELLS} cells are read")
+        if cells * dtype.itemsize != has:
+            raise ValueError(
+                f"its header promises {size(cells * dtype.itemsize)} of numbers, and it has {size(max(has, 0))}"
+            )
+        # All that is left is read, at the end of which the checksum is compared.
+        return np.frombuffer(file.read(), dtype).reshape(shape, order="F" if in_columns else "C")
 
 
 # --- maps without heights -----------------------------------------------------------------------------------
@@ -286,18 +263,15 @@ def read_map(path: Path) -> PlainGrid:
     letters[list(b".GS")], letters[list(b"@OTW")] = 1.0, np.inf
     factor = np.empty((rows, cols), np.float32)
     row = 0
-    for line in lines:
-        if row == rows or not line.strip():
-            if line.strip():
-                raise TerrainError(f"terrain {path} has more rows than its header says, {rows}")
-            continue
+    for row, line in enumerate(filter(str.strip, lines), 1):
+        if row > rows:
+            raise TerrainError(f"terrain {path} has more rows than its header says, {rows}")
         if len(line) != cols:
-            raise TerrainError(f"terrain {path}, line {row + 5}: {len(line)} cells; its header says {cols}")
-        factor[row] = letters[np.frombuffer(line.encode("ascii"), np.uint8)]
-        if np.isnan(factor[row]).any():
-            col = int(np.isnan(factor[row]).argmax())
-            raise TerrainError(f"terrain {path}, line {row + 5}, column {col + 1}: {line[col]!r} is no ground")
-        row += 1
+            raise TerrainError(f"terrain {path}, line {row + 4}: {len(line)} cells; its header says {cols}")
+        factor[row - 1] = letters[np.frombuffer(line.encode("ascii"), np.uint8)]
+        if (unknown := np.isnan(factor[row - 1])).any():
+            col = int(unknown.argmax())
+            raise TerrainError(f"terrain {path}, line {row + 4}, column {col + 1}: {line[col]!r} is no ground")
     if row < rows:
         raise TerrainError(f"terrain {path} has {row} rows; its header says {rows}")
     return PlainGrid(None, factor, (0.0, 0.0), notes=(f"MovingAI map of type {kind}",))

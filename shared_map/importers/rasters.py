@@ -62,11 +62,11 @@ def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source
         if holds.is_cover:
             return _level_cover(dataset, place, path, config, progress)
         if holds.encoding is None:
-            return _heights(dataset, place, path, config, progress)
+            return _heights(dataset, None, place, path, config, progress)
+        heights, told = heights_decoded(dataset, holds.encoding, path)
         known = f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}"
-        with heights_decoded(dataset, holds.encoding, path, place.crs, place.transform) as (decoded, told):
-            place = _Place(place.crs, place.transform, (known, *place.notes, *told))
-            return _heights(decoded, place, path, config, progress)
+        place = _Place(place.crs, place.transform, (known, *place.notes, *told))
+        return _heights(dataset, heights, place, path, config, progress)
 
 
 def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -214,10 +214,17 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) 
 # --- heights ------------------------------------------------------------------------------------------------
 
 
-def _heights(dataset: Any, place: _Place, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+def _heights(
+    dataset: Any, whole: Floats | None, place: _Place, path: Path, config: TerrainConfig, progress: Progress
+) -> Source:
     """Heights on a square metric grid, a band of rows at a time. Bilinear; averaged where cells grow by half or
-    more."""
-    if dataset.count >= 3:
+    more.
+
+    whole  all heights as they are stored, NaN where there is none; None: they are read from the first band
+    """
+    import rasterio
+
+    if whole is None and dataset.count >= 3:
         raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
     if np.dtype(dataset.dtypes[0]).kind not in "iuf":
         raise TerrainError(f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
@@ -226,22 +233,38 @@ def _heights(dataset: Any, place: _Place, path: Path, config: TerrainConfig, pro
     factor, offset, told = _scale_of(dataset, place.crs, config)
     if dataset.count == 2:
         told.append("the file has two bands; heights are taken from the first")
-    voids, found, looks = looked_at(_sampled(dataset), config, factor, offset)
+    voids, found, looks = looked_at(_sampled(dataset) if whole is None else whole, config, factor, offset)
     level = _level_on(dataset, found, place, grid, target)
-    elevation_m = np.empty((grid.rows, grid.cols), np.float32)
-    heights = _whole_without(dataset, voids, path) if voids and target is not None else None
+    if voids and target is not None:
+        whole = without(_whole(dataset, voids, path) if whole is None else whole, voids)
+    given: dict[str, Any] = {"src_nodata": math.nan, "dst_nodata": math.nan}
+    if whole is not None:
+        given["src_transform"] = place.transform
+    elif dataset.nodata is not None or np.dtype(dataset.dtypes[0]).kind != "f":
+        given["src_nodata"] = dataset.nodata
+    how = "average" if grows(dataset, place.transform, place.crs, grid, target) else "bilinear"
+    elevation_m = np.empty(grid.shape, np.float32)
     for row0, row1 in bands(grid.rows, READ_ROWS):
         band = elevation_m[row0:row1]
-        if target is None:
-            _read_straight(dataset, row0, row1, band, voids)
+        if target is not None:
+            source = rasterio.band(dataset, 1) if whole is None else whole
+            warped(source, band, grid, place.crs, target, how, row0, **given)
         else:
-            _read_warped(dataset, heights, place, grid, target, row0, band)
+            band[:] = without(_rows_of(dataset, row0, row1) if whole is None else whole[row0:row1], voids)
         if (factor, offset) != (1.0, 0.0):
             band *= np.float32(factor)
             band += np.float32(offset)
         progress("reading heights", row1 / grid.rows)
     classes = np.zeros(elevation_m.shape, np.uint8)
     return Source(grid, elevation_m, classes, level=level, notes=(str(path), *place.notes, *notes, *told, *looks))
+
+
+def _rows_of(dataset: Any, row0: int, row1: int) -> Floats:
+    """Rows of the first band, float32, as stored; NaN where no height is declared."""
+    window = ((row0, row1), (0, dataset.width))
+    rows: Floats = dataset.read(1, window=window).astype(np.float32)
+    rows[dataset.read_masks(1, window=window) == 0] = np.nan
+    return rows
 
 
 def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:
@@ -279,17 +302,14 @@ def _sampled(dataset: Any) -> Floats:
     return sample
 
 
-def _whole_without(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
-    """The whole first band, float32, as stored, NaN where there is no height. GDAL warps one value of no height
-    only; of a second one it would make slopes."""
+def _whole(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
+    """The whole first band. GDAL warps one value of no height only; of a second one it would make slopes."""
     if dataset.height * dataset.width > MAX_CELLS:
         raise TerrainError(
             f"terrain {path} has voids that it does not declare ({', '.join(f'{v:g}' for v in voids)}) and is too"
             " large to mend here: gdal_calc or gdal_edit.py -a_nodata does it"
         )
-    heights: Floats = dataset.read(1).astype(np.float32)
-    heights[dataset.read_masks(1) == 0] = np.nan
-    return without(heights, voids)
+    return _rows_of(dataset, 0, dataset.height)
 
 
 def _level_on(dataset: Any, mask: Bools, place: _Place, grid: GridSpec, target: Any) -> Bools:
@@ -303,28 +323,3 @@ def _level_on(dataset: Any, mask: Bools, place: _Place, grid: GridSpec, target: 
     stretched = place.transform @ Affine.scale(dataset.width / cols, dataset.height / rows)
     source = mask.astype(np.uint8)
     return warped(source, placed, grid, place.crs, target, "nearest", src_transform=stretched) > 0
-
-
-def _read_straight(dataset: Any, row0: int, row1: int, band: Floats, voids: Sequence[float]) -> None:
-    from rasterio.windows import Window
-
-    window = Window(0, row0, dataset.width, row1 - row0)
-    np.copyto(band, dataset.read(1, window=window), casting="unsafe")
-    band[dataset.read_masks(1, window=window) == 0] = np.nan
-    if voids:
-        band[:] = without(band, voids)
-
-
-def _read_warped(
-    dataset: Any, heights: Floats | None, place: _Place, grid: GridSpec, target: Any, row0: int, band: Floats
-) -> None:
-    """heights  what to warp instead of the dataset's own, NaN where there is none"""
-    import rasterio
-
-    nodata = dataset.nodata
-    if heights is not None or (nodata is None and np.dtype(dataset.dtypes[0]).kind == "f"):
-        nodata = math.nan
-    source = rasterio.band(dataset, 1) if heights is None else heights
-    how = "average" if grows(dataset, place.transform, place.crs, grid, target) else "bilinear"
-    given = {"src_transform": None if heights is None else place.transform, "src_nodata": nodata}
-    warped(source, band, grid, place.crs, target, how, row0, **given, dst_nodata=math.nan)

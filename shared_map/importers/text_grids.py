@@ -7,7 +7,7 @@ points that do not come row by row.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,26 +34,24 @@ _Y = ("y", "lat", "latitude", "northing", "north", "n")
 _Z = ("z", "h", "height", "elevation", "elev", "alt", "altitude", "dem", "value")
 _DEGREES = ("lon", "long", "lng", "longitude", "lat", "latitude")
 
+_NO_NUMBERS = (ValueError, IndexError, OverflowError)
+"""What numpy raises on lines that are not as they should be."""
 Points = NDArray[np.float64]
 
 
 class _Layout(NamedTuple):
     """How a text is laid out.
 
-    delimiter      between numbers; None is any blank
-    decimal_comma  whether 1,5 is one number
-    trailing       whether each line ends with a delimiter
-    columns        of x, y and z; None for rows of heights
-    degrees        whether x and y are longitude and latitude
-    has_header     whether the first line names columns
+    delimiter  between numbers; None is any blank
+    header     number of the line that names columns; 0 if there is none
+    columns    of x, y and z; None for rows of heights
+    degrees    whether x and y are longitude and latitude
     """
 
     delimiter: str | None
-    decimal_comma: bool
-    trailing: bool
+    header: int
     columns: tuple[int, int, int] | None
-    degrees: bool
-    has_header: bool
+    degrees: bool = False
 
 
 def read_text_grid(path: Path) -> PlainGrid:
@@ -85,81 +83,64 @@ def read_text_grid(path: Path) -> PlainGrid:
 
 
 def _layout(path: Path) -> _Layout:
-    lines = (line for _, text in _chunks(path) for line in text.splitlines() if line.strip() and line[0] != "#")
-    first = next(lines, None)
-    if first is None:
+    number, first = next((each for lines in _lines(path) for each in lines.items()), (0, ""))
+    if not first:
         raise TerrainError(f"terrain {path} holds no numbers")
-    has_header = any(char.isalpha() for char in first.lower().replace("nan", "").replace("e", ""))
-    data = next(lines, "") if has_header else first
-    blanks = data.split()
-    decimal_comma = len(blanks) > 1 and ";" not in data and all(re.fullmatch(r"[-+]?\d+(,\d+)?", b) for b in blanks)
-    decimal_comma &= "," in data
-    delimiter = next((each for each in ";\t," if each in data), None)
-    if decimal_comma:
-        delimiter = None
-    elif delimiter == ";":
-        decimal_comma = "," in data
-    trailing = delimiter is not None and data.rstrip(" \r").endswith(delimiter)
-    header = [word.strip(" \"'\r").lower() for word in (first.strip("#").split(delimiter))]
-    if has_header:
-        x, y, z = (next((header.index(name) for name in names if name in header), None) for names in (_X, _Y, _Z))
+    delimiter = next((each for each in ";\t," if each in first), None)
+    words = [word.strip(" \"'").lower() for word in first.split(delimiter)]
+    try:
+        np.array([word or "nan" for word in words], np.float64)
+    except ValueError:
+        x, y, z = (next((words.index(name) for name in names if name in words), None) for names in (_X, _Y, _Z))
         if x is None or y is None or z is None:
             raise TerrainError(
-                f"terrain {path}, line 1: {first[:60]!r} are no numbers, and name no x, y, z or lon, lat, z"
-            )
-        degrees = header[x] in _DEGREES and header[y] in _DEGREES
-        return _Layout(delimiter, decimal_comma, trailing, (x, y, z), degrees, True)
-    count = len(data.split(delimiter)) - trailing
-    is_points = count == 3 or (path.suffix.lower() == ".xyz" and count > 3)
-    if path.suffix.lower() == ".xyz" and count < 3:
-        raise TerrainError(f"terrain {path}: its first line has {count} numbers; expected x, y and z")
-    return _Layout(delimiter, decimal_comma, trailing, (0, 1, 2) if is_points else None, False, False)
+                f"terrain {path}, line {number}: {first[:60]!r} are no numbers, and name no x, y, z or lon, lat, z"
+            ) from None
+        degrees = words[x] in _DEGREES and words[y] in _DEGREES
+        return _Layout(delimiter, number, (x, y, z), degrees)
+    is_xyz = path.suffix.lower() == ".xyz"
+    if is_xyz and len(words) < 3:
+        raise TerrainError(f"terrain {path}: its first line has {len(words)} numbers; expected x, y and z")
+    return _Layout(delimiter, 0, (0, 1, 2) if is_xyz or words[3:] in ([], [""]) else None)
 
 
-def _chunks(path: Path) -> Iterator[tuple[int, str]]:
-    """(number of the first line, whole lines) of a text, piece by piece."""
-    number, rest = 1, b""
+def _lines(path: Path) -> Iterator[dict[int, str]]:
+    """Number -> line of those that are neither empty nor a comment, piece by piece."""
+    number, rest, last = 1, b"", False
     try:
         with path.open("rb") as file:
-            while piece := file.read(_CHUNK_BYTES):
-                lines, newline, rest = (rest + piece).replace(b"\r\n", b"\n").rpartition(b"\n")
+            while not last:
+                piece = file.read(_CHUNK_BYTES)
+                last = not piece
+                whole, newline, rest = (rest + piece + b"\n" * last).rpartition(b"\n")
                 if len(rest) > MAX_LINE_BYTES:
                     raise _KIND.refusal(path, f"a line is longer than {size(MAX_LINE_BYTES)}")
-                if newline:
-                    yield number, _text(lines, path)
-                    number += lines.count(b"\n") + 1
-            if rest:
-                yield number, _text(rest, path)
+                lines = whole.decode("utf-8-sig" if number == 1 else "utf-8").split("\n") if newline else []
+                stripped = {n: line.strip(" \r") for n, line in enumerate(lines, number)}
+                yield {n: line for n, line in stripped.items() if line and not line.startswith("#")}
+                number += len(lines)
     except OSError as error:
         raise _KIND.unreadable(path, error) from error
-
-
-def _text(data: bytes, path: Path) -> str:
-    try:
-        return data.removeprefix(b"\xef\xbb\xbf").replace(b"\r", b"\n").decode("utf-8")
     except UnicodeDecodeError as error:
         raise TerrainError(f"terrain {path} is not text: {error.reason}") from error
 
 
 def _numbers(path: Path, layout: _Layout) -> Iterator[Points]:
-    """float64 (lines, columns) of the text, piece by piece."""
+    """float64 (lines, columns) of the text, piece by piece; empty fields are NaN."""
+    mark = layout.delimiter
+    empty = None if mark is None else re.compile(f"(?:(?<={mark})|^) *(?={mark}|$)")
 
-    def numbers_of(lines: list[str]) -> Points:
-        return np.loadtxt(
-            lines, np.float64, delimiter=layout.delimiter, usecols=layout.columns, ndmin=2, comments=None
-        )
+    def numbers_of(lines: Iterable[str]) -> Points:
+        filled = lines if empty is None else [empty.sub("nan", line) for line in lines]
+        return np.loadtxt(filled, np.float64, delimiter=mark, usecols=layout.columns, ndmin=2, comments=None)
 
-    for first, text in _chunks(path):
-        lines = {
-            number: line
-            for number, line in enumerate(_plain(text, layout).split("\n"), first)
-            if line and not line.startswith("#") and not (layout.has_header and number == 1)
-        }
+    for lines in _lines(path):
+        lines.pop(layout.header, None)
         if not lines:
             continue
         try:
-            yield numbers_of(list(lines.values()))
-        except (ValueError, IndexError, OverflowError) as error:
+            yield numbers_of(lines.values())
+        except _NO_NUMBERS as error:
             expected = "heights" if layout.columns is None else "x, y and z"
             raise _bad_line(path, lines, numbers_of, expected) from error
 
@@ -168,33 +149,19 @@ def _bad_line(
     path: Path, lines: dict[int, str], numbers_of: Callable[[list[str]], Points], expected: str
 ) -> TerrainError:
     """The error that names the first line that is not as the others, in numpy's words."""
-    wanted: int | None = None
+    widths = []
     for number, line in lines.items():
         try:
-            found = numbers_of([line]).shape[1]
-        except (ValueError, IndexError, OverflowError) as error:
+            widths.append(numbers_of([line]).shape[1])
+        except _NO_NUMBERS as error:
             why = re.sub(r"could not convert string (.*) to float64", r"\1 is no number", str(error))
             why = re.split(r" at row|: row", why)[0][:120]
             return TerrainError(f"terrain {path}, line {number}: {why}; expected {expected}")
-        if wanted is not None and found != wanted:
-            return TerrainError(f"terrain {path} is ragged: line {number} has {found} heights, others {wanted}")
-        wanted = found
+        if widths[-1] != widths[0]:
+            return TerrainError(
+                f"terrain {path} is ragged: line {number} has {widths[-1]} heights, others {widths[0]}"
+            )
     return TerrainError(f"terrain {path} holds what are no numbers")
-
-
-def _plain(text: str, layout: _Layout) -> str:
-    """The text with points in its numbers and "nan" in its empty fields."""
-    text = "\n".join(map(str.strip, text.split("\n"))) if layout.delimiter != "\t" else text
-    if layout.decimal_comma:
-        text = text.replace(",", ".")
-    mark = layout.delimiter
-    if mark is None:
-        return text
-    if layout.trailing:
-        text = f"{text}\n".replace(f"{mark}\n", "\n")
-    while f"{mark}{mark}" in text:
-        text = text.replace(f"{mark}{mark}", f"{mark}nan{mark}")
-    return re.sub(f"(?m)^{mark}", f"nan{mark}", re.sub(f"(?m){mark}$", f"{mark}nan", text))
 
 
 def _heights(numbers: Points) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 
 from shared_map.arrays import Bools, Bytes, CellsOf, Floats
 from shared_map.terrain.layers import LETHAL, TerrainClass
-from shared_map.terrain.row_bands import bands
+from shared_map.terrain.row_bands import counted
 from shared_map.terrain.synthetic.noise import fractal_noise
 from shared_map.terrain.zones import paint_zones
 from swarm.config.ground import CostConfig, HiddenConfig
@@ -68,66 +68,29 @@ def _flooded(truth: Floats, elevation_m: Floats, share: float, rng: np.random.Ge
 
 
 class _Parts:
-    """The connected passable parts of a ground that is closed block by block. A block is looked at by itself: only
-    where its surroundings do not tell whether it cuts a part in two are the parts of the whole found again."""
+    """The connected passable parts of a ground that is closed block by block."""
 
     def __init__(self, truth: Floats) -> None:
         self.truth = truth
-        self._find()
+        self.largest = self._largest()
+        """Cells of the largest part."""
 
-    def _find(self) -> None:
+    def _largest(self) -> int:
         from scipy import ndimage
 
-        self._labels, count = ndimage.label(np.isfinite(self.truth))
-        self._sizes = np.zeros(count + 1, np.int64)
-        for row0, row1 in bands(len(self.truth)):  # bincount copies what it counts
-            self._sizes += np.bincount(self._labels[row0:row1].ravel(), minlength=count + 1)
-        self._sizes[0] = 0
-
-    @property
-    def largest(self) -> int:
-        """Cells of the largest part."""
-        return int(self._sizes.max())
+        labels, count = ndimage.label(np.isfinite(self.truth))
+        return int(counted(labels, count + 1)[1:].max(initial=0))
 
     def close(self, block: tuple[slice, slice], least: float) -> bool:
         """Make a block lethal, unless that leaves fewer than `least` cells in the largest part. Whether it did."""
-        kept, closed = self.truth[block].copy(), self._labels[block].copy()
-        lost = np.bincount(closed.ravel(), minlength=len(self._sizes))
-        lost[0] = 0
+        kept = self.truth[block].copy()
         self.truth[block] = LETHAL
-        if self._cuts(block):
-            before = self._labels, self._sizes
-            self._find()
-            if self.largest >= least:
-                return True
-            self._labels, self._sizes = before
-        elif int((self._sizes - lost).max()) >= least:
-            self._sizes -= lost
-            self._labels[block] = 0
+        left = self._largest()
+        if left >= least:
+            self.largest = left
             return True
         self.truth[block] = kept
         return False
-
-    def _cuts(self, block: tuple[slice, slice]) -> bool:
-        """Whether a block that is lethal now may have cut a part: true unless all cells beside it that were of one
-        part still reach each other near it."""
-        from scipy import ndimage
-
-        rows, cols = block
-        row0, col0 = max(rows.start - _NEAR, 0), max(cols.start - _NEAR, 0)
-        near = np.s_[row0 : rows.stop + _NEAR, col0 : cols.stop + _NEAR]
-        beside = np.zeros(self._labels[near].shape, np.bool_)
-        inner = np.s_[rows.start - row0 : rows.stop - row0, cols.start - col0 : cols.stop - col0]
-        beside[inner] = True
-        beside = ndimage.binary_dilation(beside) & ~beside & (self._labels[near] > 0)
-        here, _ = ndimage.label(np.isfinite(self.truth[near]))
-        # Pairs (part of the whole, part near the block): a part that occurs twice is in pieces here.
-        pairs = np.unique(np.stack((self._labels[near][beside], here[beside])), axis=1)
-        return bool(len(np.unique(pairs[0])) < pairs.shape[1])
-
-
-_NEAR = 12
-"""Cells around a block in which ways around it are looked for."""
 
 
 def _close_roads(

@@ -26,13 +26,13 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands
-from shared_map.terrain.slope_rules import along_slope_factor, factor_bounds, slope_factor
+from shared_map.terrain.slope_rules import along_slope_factor, slope_factor
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
@@ -114,20 +114,24 @@ def gradient_of_padded(padded_m: Floats, resolution_m: float) -> tuple[Floats, F
     return east, north
 
 
-def _gradient_beside_voids(padded_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
-    scale = np.float32(1.0 / (8.0 * resolution_m))
+def _neighbours(padded_m: Floats) -> Iterator[tuple[int, int, Floats]]:
+    """(rows down, columns right, heights there) of the eight neighbours of the cells within the border."""
     rows, cols = padded_m.shape[0] - 2, padded_m.shape[1] - 2
-    centre = padded_m[1:-1, 1:-1]
-    east = np.zeros((rows, cols), np.float32)
-    north = np.zeros((rows, cols), np.float32)
     for dr in (-1, 0, 1):
         for dc in (-1, 0, 1):
-            if dr == dc == 0:
-                continue
-            rise = padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - centre
-            np.copyto(rise, np.float32(0), where=np.isnan(rise))
-            east += np.float32(dc * (2 - abs(dr))) * rise
-            north -= np.float32(dr * (2 - abs(dc))) * rise
+            if dr or dc:
+                yield dr, dc, padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols]
+
+
+def _gradient_beside_voids(padded_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
+    scale = np.float32(1.0 / (8.0 * resolution_m))
+    centre = padded_m[1:-1, 1:-1]
+    east, north = np.zeros(centre.shape, np.float32), np.zeros(centre.shape, np.float32)
+    for dr, dc, beside_m in _neighbours(padded_m):
+        rise = beside_m - centre
+        np.copyto(rise, np.float32(0), where=np.isnan(rise))
+        east += np.float32(dc * (2 - abs(dr))) * rise
+        north -= np.float32(dr * (2 - abs(dc))) * rise
     return east * scale, north * scale
 
 
@@ -159,14 +163,11 @@ def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
     The array brings its own border of one cell; a void beside a cell does not count.
     """
     east, north = gradient_of_padded(padded_m, resolution_m)
-    rows, cols = east.shape
     centre = padded_m[1:-1, 1:-1]
-    most = np.zeros((rows, cols), np.float32)
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            plane = centre + (east * np.float32(dc) - north * np.float32(dr)) * np.float32(resolution_m)
-            off = np.abs(padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - plane)
-            np.fmax(most, off, out=most)
+    most = np.zeros(east.shape, np.float32)
+    for dr, dc, beside_m in _neighbours(padded_m):
+        plane = centre + (east * np.float32(dc) - north * np.float32(dr)) * np.float32(resolution_m)
+        np.fmax(most, np.abs(beside_m - plane), out=most)
     return most
 
 
@@ -176,14 +177,9 @@ def along_slope_of_padded(padded_m: Floats, resolution_m: float, cost: CostConfi
     A cell is as steep as its steepest step, if its slope is less: so no step gets more back than its cell has paid.
     """
     steepness = grade_of_padded(padded_m, resolution_m)
-    rows, cols = steepness.shape
-    centre = padded_m[1:-1, 1:-1]
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            if dr or dc:
-                run = np.float32(resolution_m * math.hypot(dr, dc))
-                rise = np.abs(padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - centre) / run
-                np.fmax(steepness, rise, out=steepness)
+    for dr, dc, beside_m in _neighbours(padded_m):
+        run = np.float32(resolution_m * math.hypot(dr, dc))
+        np.fmax(steepness, np.abs(beside_m - padded_m[1:-1, 1:-1]) / run, out=steepness)
     return along_slope_factor(steepness, cost)
 
 
@@ -236,22 +232,7 @@ def terrain_pace(
     road = classes == TerrainClass.ROAD
     if road.any():
         np.copyto(pace, np.float32(1 / cost.road_speed_m_per_s), where=road & np.isfinite(pace))
-    if _may_leave_bounds(cost):
-        lethal = np.isinf(pace)
-        np.clip(pace, np.float32(PACE_LEAST), np.float32(PACE_MOST), out=pace)
-        pace[lethal] = LETHAL
-    return pace
-
-
-def _may_leave_bounds(cost: CostConfig) -> bool:
-    """Whether a pace may be one that marks cannot tell. Where it cannot be, none is looked for: that takes time."""
-    least, most = factor_bounds(cost)
-    factors = class_factors(cost)[: max(TerrainClass) + 1] if cost.classes else np.ones(1, np.float32)
-    finite = factors[np.isfinite(factors)]
-    if cost.rough_per_m or not finite.size:
-        return True
-    level = 1 / cost.flat_speed_m_per_s
-    return bool(least * finite.min() * level < PACE_LEAST or most * finite.max() * level > PACE_MOST)
+    return np.clip(pace, np.float32(PACE_LEAST), np.float32(PACE_MOST), out=pace, where=np.isfinite(pace))
 
 
 def polygon_mask(polygon_m: Sequence[tuple[float, float]], grid: GridSpec) -> Bools:

@@ -22,9 +22,6 @@ from swarm.config.values import SlopeRule
 MOST_FACTOR = 100.0
 """No slope raises a pace more, unless `steep_factor` says so: costly is not lethal."""
 
-_LEAST_FACTOR = 0.35
-"""No rule goes below it, but a table may."""
-
 Factor = Callable[[Floats, Floats, CostConfig], Floats]
 """Pace relative to level ground, float32, by rise over run (negative is downhill), its sine, and the settings."""
 
@@ -85,13 +82,6 @@ def along_slope_factor(steepness: Floats, cost: CostConfig) -> Floats:
     factor: Floats = np.float32(1) + np.float32(_cross_slope(cost)) * (sine * sine)
     np.copyto(factor, np.float32(1), where=np.isnan(sine))
     return factor
-
-
-def factor_bounds(cost: CostConfig) -> tuple[float, float]:
-    """(least, most) that `slope_factor` gives of ground that is not too steep; they need not be reached."""
-    least = min((factor for _, factor in cost.slope_table), default=_LEAST_FACTOR)
-    most = cost.steep_factor if cost.slope_rule in ("linear", "quadratic") else max(MOST_FACTOR, cost.steep_factor)
-    return least, most * cost.cross_slope_factor * (1 + 1e-5)
 
 
 def said_of_cost(cost: CostConfig) -> str:

@@ -18,7 +18,6 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -64,6 +63,32 @@ def scenario_key(scenario: Scenario) -> str:
     return hashlib.blake2b(payload, digest_size=8).hexdigest()
 
 
+class Description(msgspec.Struct, frozen=True, kw_only=True):
+    """What stands beside the arrays of a prepared terrain, or of the ground of a class, in a file of JSON.
+
+    key       `scenario_key` of what they were made from
+    steepest  of its climb; None where steps cost the same both ways
+    arrays    names of the files beside it
+    """
+
+    format: int
+    key: str
+    digest: str
+    grid: GridSpec
+    vehicle_radius_m: float
+    steepest: float | None
+    wind: Wind | None
+    arrays: list[str]
+    notes: tuple[str, ...]
+
+
+class _Stamp(msgspec.Struct, frozen=True):
+    """The part of every description, older ones too, that says whether the rest is of use."""
+
+    format: int = 0
+    key: str = ""
+
+
 def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") -> None:
     """Write a terrain and its truth where `load_prepared` finds them. The description is written last."""
     arrays: dict[str, NDArray[Any]] = {
@@ -73,32 +98,31 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         "truth": truth,
         "homes": homes_of(terrain.pace_s_per_m, truth),
     }
-    save_ground(folder / _META, terrain, arrays, {"key": key, "grid": msgspec.to_builtins(terrain.grid)})
+    save_ground(folder / _META, terrain, arrays, key)
 
 
-def save_ground(
-    meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[Any]], facts: Mapping[str, Any]
-) -> None:
+def save_ground(meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[Any]], key: str) -> None:
     """Leave the ground of a terrain, and other arrays, in the folder of a description, which is written last.
-    Raises TerrainError if that is not possible.
 
-    facts  what the description says beside what `read_ground` needs
+    Raises TerrainError if the folder cannot be written.
     """
     every = {**arrays, "pace": terrain.pace_s_per_m}
     if terrain.ground_s_per_m is not terrain.pace_s_per_m:
         every["ground"] = terrain.ground_s_per_m
-    if terrain.climb is not None:
-        every["climb"] = terrain.climb.factors
-    meta = {
-        "format": FORMAT,
-        **facts,
-        "digest": terrain.digest,
-        "vehicle_radius_m": terrain.vehicle_radius_m,
-        "steepest": None if terrain.climb is None else terrain.climb.steepest,
-        "wind": None if terrain.climb is None or terrain.climb.wind is None else asdict(terrain.climb.wind),
-        "arrays": sorted(every),
-        "notes": list(terrain.notes),
-    }
+    climb = terrain.climb
+    if climb is not None:
+        every["climb"] = climb.factors
+    meta = Description(
+        format=FORMAT,
+        key=key,
+        digest=terrain.digest,
+        grid=terrain.grid,
+        vehicle_radius_m=terrain.vehicle_radius_m,
+        steepest=climb and climb.steepest,
+        wind=climb and climb.wind,
+        arrays=sorted(every),
+        notes=terrain.notes,
+    )
     folder = meta_file.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -106,7 +130,7 @@ def save_ground(
         for name, array in every.items():
             save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
         partial = meta_file.with_name(f"{meta_file.name}.part")
-        partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
+        partial.write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
         partial.rename(meta_file)
     except OSError as error:
         raise TerrainError(
@@ -114,39 +138,26 @@ def save_ground(
         ) from error
 
 
-def read_ground(meta_file: Path, meta: Mapping[str, Any], grid: GridSpec, heights_m: Floats) -> dict[str, Any]:
+def read_ground(meta_file: Path, meta: Description, heights_m: Floats) -> dict[str, Any]:
     """What `save_ground` left of the ground, as fields of a `Terrain`; arrays are mapped read-only.
 
     heights_m  by which steps climb
 
     Raises TerrainError if it is damaged.
     """
-    folder = meta_file.parent
-    try:
-        digest, radius_m, notes = (
-            str(meta["digest"]),
-            float(meta["vehicle_radius_m"]),
-            tuple(map(str, meta["notes"])),
-        )
-        has_ground, steepest = "ground" in meta["arrays"], meta["steepest"]
-        wind = None if meta["wind"] is None else Wind(float(meta["wind"]["south"]), float(meta["wind"]["east"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise TerrainError(
-            f"prepared {meta_file.stem} {meta_file} is damaged ({error}); delete the folder"
-        ) from error
-    shape = (grid.rows, grid.cols)
+    folder, shape = meta_file.parent, meta.grid.shape
     pace = read_array(folder, "pace", shape, np.float32)
     climb = None
-    if steepest is not None:
+    if meta.steepest is not None:
         factors = read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
-        climb = Climb(grid, heights_m, factors, float(steepest), wind)
+        climb = Climb(meta.grid, heights_m, factors, meta.steepest, meta.wind)
     return {
         "pace_s_per_m": pace,
-        "ground_s_per_m": read_array(folder, "ground", shape, np.float32) if has_ground else pace,
-        "digest": digest,
-        "vehicle_radius_m": radius_m,
+        "ground_s_per_m": read_array(folder, "ground", shape, np.float32) if "ground" in meta.arrays else pace,
+        "digest": meta.digest,
+        "vehicle_radius_m": meta.vehicle_radius_m,
         "climb": climb,
-        "notes": notes,
+        "notes": meta.notes,
     }
 
 
@@ -157,18 +168,13 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
     meta = read_meta(folder / _META, key)
     if meta is None:
         return None
-    try:
-        grid = GridSpec(**meta["grid"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise TerrainError(f"prepared terrain {folder / _META} is damaged ({error}); delete the folder") from error
-    shape = (grid.rows, grid.cols)
-    elevation_m = read_array(folder, "elevation", shape, np.float32)
+    elevation_m = read_array(folder, "elevation", meta.grid.shape, np.float32)
     return Terrain(
-        grid=grid,
+        grid=meta.grid,
         elevation_m=elevation_m,
-        photo=read_array(folder, "photo", (*shape, 3), np.uint8),
-        classes=read_array(folder, "classes", shape, np.uint8),
-        **read_ground(folder / _META, meta, grid, elevation_m),
+        photo=read_array(folder, "photo", (*meta.grid.shape, 3), np.uint8),
+        classes=read_array(folder, "classes", meta.grid.shape, np.uint8),
+        **read_ground(folder / _META, meta, elevation_m),
     )
 
 
@@ -176,26 +182,26 @@ def load_beside(folder: Path, name: str, key: str = "") -> NDArray[Any] | None:
     """The "truth", or "homes" (`homes_of` terrain and truth), that `save_prepared` left beside a terrain, mapped
     read-only; None if it is not there."""
     meta = read_meta(folder / _META, key)
-    if meta is None or name not in meta["arrays"]:
+    if meta is None or name not in meta.arrays:
         return None
-    grid = GridSpec(**meta["grid"])
-    return read_array(folder, name, (grid.rows, grid.cols), np.bool_ if name == "homes" else np.float32)
+    return read_array(folder, name, meta.grid.shape, np.bool_ if name == "homes" else np.float32)
 
 
-def read_meta(meta_file: Path, key: str) -> dict[str, Any] | None:
+def read_meta(meta_file: Path, key: str) -> Description | None:
     """A description that `save_ground` left; None if there is none, or one of another key. Raises TerrainError if
     it is unreadable."""
+    if not meta_file.exists():
+        return None
     try:
-        if not meta_file.exists():
+        text = read_text(meta_file, FileKind.PREPARED)
+        stamp = msgspec.json.decode(text, type=_Stamp)
+        if stamp.format != FORMAT or (key and stamp.key != key):
             return None
-        meta = json.loads(read_text(meta_file, FileKind.PREPARED))
-    except (TerrainError, ValueError, RecursionError) as error:
+        return msgspec.json.decode(text, type=Description)
+    except (TerrainError, msgspec.MsgspecError, RecursionError) as error:
         raise TerrainError(
             f"prepared {meta_file.stem} {meta_file} is damaged ({error}); delete the folder"
         ) from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT or (key and meta.get("key") != key):
-        return None
-    return meta
 
 
 def read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:

@@ -149,6 +149,6 @@ def find_terrain(digest: str, folder: Path | None, runs: Path) -> Terrain | None
     for meta in metas[:_NEWEST]:
         with suppress(SwarmError):  # another run's damage is no business of ours
             known = read_meta(meta, "")
-            if known is not None and known.get("digest") == digest and (found := load_prepared(meta.parent)):
+            if known is not None and known.digest == digest and (found := load_prepared(meta.parent)):
                 return found
     return None

@@ -1,15 +1,13 @@
-"""Patches of equal height: what a plain search over heights finds, whatever the bands."""
+"""Patches of equal height: what a plain search over heights finds."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from support.effort import few
 
-from shared_map.importers import level_patches as module
 from shared_map.importers.level_patches import level_patches
 
 EIGHT = np.ones((3, 3), np.int8)
@@ -64,15 +62,3 @@ def test_patches_are_those_of_a_search_height_by_height(seed: int, rows: int, co
         assert found.edge[number] == sides
         touched = np.concatenate((patch[0], patch[-1], patch[:, 0], patch[:, -1])).any()
         assert found.border[number] == touched
-
-
-@pytest.mark.parametrize("band_rows", [1, 7, 1000])
-def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch, band_rows: int) -> None:
-    heights = stairs(3, 90, 70, 6.0)
-    expected = level_patches(heights, 0.005, 5, 1.0)
-    monkeypatch.setattr(
-        module, "bands", lambda rows: [(n, min(n + band_rows, rows)) for n in range(0, 90, band_rows)]
-    )
-    found = level_patches(heights, 0.005, 5, 1.0)
-    for name in vars(expected):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))

@@ -18,7 +18,6 @@ from shared_map.terrain.slope_rules import (
     SLOPE_RULES,
     along_slope_factor,
     directional_factor,
-    factor_bounds,
     slope_factor,
 )
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -143,15 +142,6 @@ def test_the_default_rule_is_the_same_bit_for_bit() -> None:
     plain = sine * sine * np.float32(5 / limit**2) + np.float32(1)
     plain[sine > np.float32(limit)] = np.inf
     np.testing.assert_array_equal(slope_factor(grades, CostConfig()), plain)
-
-
-@pytest.mark.parametrize("rule", SLOPE_RULES)
-@pytest.mark.parametrize("cross_slope_factor", [1.0, 5.0])
-def test_no_factor_leaves_the_bounds_that_are_told_of_its_rule(rule: str, cross_slope_factor: float) -> None:
-    cost = ruled(rule, cross_slope_factor=cross_slope_factor)
-    found = slope_factor(np.linspace(0, 1.7, 3000).astype(np.float32), cost)
-    least, most = factor_bounds(cost)
-    assert least <= found.min() <= found.max() <= most
 
 
 @given(
