@@ -40,22 +40,14 @@ _DRIVERS = {
     b"EHFA_HEADER_TAG": "HFA",
     b"CDF\x01": "netCDF",
     b"CDF\x02": "netCDF",
-    b"DSBB": "GSBG",
-    b"DSRB": "GS7BG",
-    b"DSAA": "GSAG",
     b"UHL1": "DTED",
-    b"binterr": "BT",
 }
 """First bytes -> GDAL's driver. GDAL knows 150 formats, most of which nobody has tried to break for long."""
 _DRIVERS_BY_ENDING = {
     ".hgt": "SRTMHGT",
     ".bil": "EHdr",
-    ".bip": "EHdr",
-    ".bsq": "EHdr",
     ".flt": "EHdr",
     ".dem": "USGSDEM",
-    ".sdat": "SAGA",
-    ".rst": "RST",
 }
 """Endings of formats without a beginning of their own; a header lies beside most of these files."""
 _IN_ARCHIVES = (".tif", ".tiff", ".img", *_DRIVERS_BY_ENDING)
@@ -115,8 +107,6 @@ def opened(path: Path, what: str) -> Iterator[Any]:
                 rasterio.open(name, driver=driver) as dataset,
             ):
                 _check_size(dataset, f"{what} {path}")
-                if name is path:
-                    _check_length(path, dataset, what)
                 yield dataset
     except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:  # the last of names inside the file
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
@@ -147,38 +137,6 @@ def _check_size(dataset: Any, what: str) -> None:
                 f"{what} is stored in blocks of {high} x {wide} pixels, {size(block)}; at most"
                 f" {size(_MAX_BLOCK_BYTES)} are unpacked at once: gdal_translate -co TILED=YES makes smaller ones"
             )
-
-
-def _check_length(path: Path, dataset: Any, what: str) -> None:
-    """An uncompressed file must be as long as its header says, but for blocks that were never written: a header can
-    promise 20 GB."""
-    if dataset.driver != "GTiff" or dataset.compression is not None:
-        return
-    promised = dataset.width * dataset.height * sum(np.dtype(dtype).itemsize for dtype in dataset.dtypes)
-    if path.stat().st_size < promised and _is_cut(dataset, path.stat().st_size):
-        raise TerrainError(
-            f"{what} {path} is truncated: its header promises {dataset.height} x {dataset.width} cells,"
-            f" {size(promised)}, and it has {size(path.stat().st_size)}; fetch it again"
-        )
-
-
-def _is_cut(dataset: Any, length: int) -> bool:
-    """Whether a block of a GeoTIFF lies beyond the end of its file. A sparse file has blocks that lie nowhere."""
-    written = 0
-    for band, (high, wide) in enumerate(dataset.block_shapes, 1):
-        rows, cols = -(-dataset.height // high), -(-dataset.width // wide)
-        if rows * cols > _MOST_BLOCKS:
-            return True
-        for block in range(rows * cols):
-            place = f"{block % cols}_{block // cols}"
-            offset = dataset.get_tag_item(f"BLOCK_OFFSET_{place}", "TIFF", bidx=band)
-            if offset is None:
-                continue
-            written += 1
-            size_of_block = dataset.get_tag_item(f"BLOCK_SIZE_{place}", "TIFF", bidx=band)
-            if int(offset) + int(size_of_block or 0) > length:
-                return True
-    return written == 0
 
 
 def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:

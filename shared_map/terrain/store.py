@@ -118,8 +118,8 @@ def save_ground(meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[
         digest=terrain.digest,
         grid=terrain.grid,
         vehicle_radius_m=terrain.vehicle_radius_m,
-        steepest=climb and climb.steepest,
-        wind=climb and climb.wind,
+        steepest=None if climb is None else climb.steepest,
+        wind=None if climb is None else climb.wind,
         arrays=sorted(every),
         notes=terrain.notes,
     )

@@ -17,7 +17,7 @@ from swarm.places import bounds_of, extent_of
 _MOST_SIDE = 2048
 """Slopes and parts of larger terrains are taken from every second, third, ... cell."""
 _JOINED_SIDE = 1024
-"""One-way steps are followed on terrains of up to the square of so many cells: a second or less."""
+"""Of larger terrains one-way steps are followed in a square of so many cells a side: a second or less."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
 _STEEP_DEG = 60.0
 _LOWEST_LAND_M = -450.0
@@ -64,17 +64,15 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
 
 def _facts_of_steps(climb: Climb, passable: Bools) -> dict[str, float]:
     """Of all steps between passable neighbours the share that is too steep, and the largest part of the passable
-    cells in which there is a way from each cell to each other. Of a large terrain the share of its middle alone."""
+    cells in which there is a way from each cell to each other. Of a large terrain both are those of its middle."""
     if np.isfinite(climb.factors).all():
         return {}
-    cells = np.arange(passable.size, dtype=np.int32).reshape(passable.shape)
+    row0, col0 = (max(side - _JOINED_SIDE, 0) // 2 for side in passable.shape)
+    middle = np.s_[row0 : row0 + _JOINED_SIDE, col0 : col0 + _JOINED_SIDE]
+    cells = np.arange(passable.size).reshape(passable.shape)[middle]
+    passable = passable[middle]
     allowed: list[tuple[Any, Any]] = []
     counted = steep = 0
-    keep = passable.size <= _JOINED_SIDE**2
-    if not keep:
-        row0, col0 = (max(side - _JOINED_SIDE, 0) // 2 for side in passable.shape)
-        middle = np.s_[row0 : row0 + _JOINED_SIDE, col0 : col0 + _JOINED_SIDE]
-        cells, passable = cells[middle], passable[middle]
     # East, south, and both diagonals to the south: each pair of neighbours once, driven both ways.
     for here, there in (
         (np.s_[:, :-1], np.s_[:, 1:]),
@@ -87,19 +85,18 @@ def _facts_of_steps(climb: Climb, passable: Bools) -> dict[str, float]:
         for tails, heads in ((one, other), (other, one)):
             free = np.isfinite(climb.along(tails, heads))
             counted, steep = counted + free.size, steep + int(free.size - np.count_nonzero(free))
-            if keep:
-                allowed.append((tails[free], heads[free]))
-    facts = {"too_steep_steps_share": round(steep / max(counted, 1), 4)}
-    if keep:
-        facts["both_ways_share"] = round(_largest_strong_part(allowed, passable), 4)
-    return facts
+            allowed.append((tails[free], heads[free]))
+    tails, heads = (np.searchsorted(cells.reshape(-1), np.concatenate(each)) for each in zip(*allowed, strict=True))
+    return {
+        "too_steep_steps_share": round(steep / max(counted, 1), 4),
+        "both_ways_share": round(_largest_strong_part(tails, heads, passable), 4),
+    }
 
 
-def _largest_strong_part(steps: list[tuple[Any, Any]], passable: Bools) -> float:
+def _largest_strong_part(tails: Any, heads: Any, passable: Bools) -> float:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    tails, heads = (np.concatenate(each) for each in zip(*steps, strict=True))
     graph = coo_array((np.ones(tails.size, np.bool_), (tails, heads)), shape=(passable.size,) * 2)
     _, labels = connected_components(graph.tocsr(), connection="strong")
     return float(np.bincount(labels[passable.reshape(-1)]).max() / passable.sum())

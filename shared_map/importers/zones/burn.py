@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
+from shared_map.arrays import Floats
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 
@@ -26,39 +26,32 @@ _NUDGE = (1.3e-4, 0.7e-4)
 drives from one to the other between closed cells. Only coordinates that somebody rounded to cells do that."""
 
 
-@dataclass
-class Drawing:
-    """Simple shapes, each with a value and a width.
+class Drawn(NamedTuple):
+    """A simple shape in cells, its value, and the width of a line or point in cells; an area has its own."""
+
+    shape: Any
+    value: float
+    width_cells: float
+
+
+def burn(
+    drawing: Sequence[Drawn], grid: GridSpec, what: str, *, everywhere: bool = False, least_wins: bool = False
+) -> tuple[Window, Floats]:
+    """The window of cells around a drawing, and their values, float32, NaN where there is none.
 
     everywhere  whether an area covers all cells that it touches, or those whose middle it holds. A line covers all
                 that it passes in either case, so that it has no gaps, and as an area those within half its width
-    widths      in cells; of polygons without meaning
-    """
-
-    everywhere: bool
-    shapes: list[Any] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-    widths: list[float] = field(default_factory=list)
-
-    def add(self, shape: Any, value: float, width_cells: float) -> None:
-        self.shapes.append(shape)
-        self.values.append(value)
-        self.widths.append(width_cells)
-
-
-def burn(drawing: Drawing, grid: GridSpec, what: str, *, least_wins: bool = False) -> tuple[Window, Floats]:
-    """The window of cells around a drawing, and their values, float32, NaN where there is none.
-
     least_wins  where shapes overlap the least value counts, else the largest
 
     Raises TerrainError, which `what` begins, if shapes lie upon each other too often.
     """
     import shapely
 
-    shapes = np.array(drawing.shapes, object)
-    if not len(shapes):
+    if not drawing:
         return Window(0, 0, 0, 0), np.zeros((0, 0), np.float32)
-    values, halves = np.array(drawing.values), np.array(drawing.widths) / 2
+    shapes = np.array([each.shape for each in drawing], object)
+    values = np.array([each.value for each in drawing])
+    halves = np.array([each.width_cells for each in drawing]) / 2
     areas = shapely.get_type_id(shapes) == _POLYGON
     halves[areas] = 0.0
     window = _window(shapes, halves, grid, what)
@@ -73,17 +66,11 @@ def burn(drawing: Drawing, grid: GridSpec, what: str, *, least_wins: bool = Fals
         nudged = shapely.transform(shapes[lines], lambda points: points + _NUDGE)
         _rasterize(nudged, values[lines], passed, window, everywhere=True)
         # The middle of a cell that a line does not pass is half a cell away from it, at least.
-        wide = some[areas[some] | (halves[some] > (0.0 if drawing.everywhere else 0.5))]
+        wide = some[areas[some] | (halves[some] > (0.0 if everywhere else 0.5))]
         widened, of = _widened(shapes[wide], halves[wide])
-        _rasterize(widened, values[wide][of], held, window, everywhere=drawing.everywhere)
+        _rasterize(widened, values[wide][of], held, window, everywhere=everywhere)
     (np.fmin if least_wins else np.fmax)(passed, held, out=passed)
     return window, passed
-
-
-def burn_mask(drawing: Drawing, grid: GridSpec, what: str) -> tuple[Window, Bools]:
-    """As `burn`, whether there is anything."""
-    window, values = burn(drawing, grid, what)
-    return window, ~np.isnan(values)
 
 
 def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, what: str) -> Window:

@@ -59,12 +59,12 @@ class Features:
 
     ids         what people call each, such as way/4711, or its number in the file
     geometries  shapely geometries without heights, curves made of lines; None where there is none
-    columns     name -> value of each feature, None where it has none
+    tags        attributes of each as texts, without those that are not set
     """
 
     ids: list[str]
     geometries: NDArray[Any]
-    columns: dict[str, list[Any]]
+    tags: list[dict[str, str]]
 
 
 def is_vector(path: Path) -> bool:
@@ -147,18 +147,14 @@ def read_features(layer: Layer, bounds: tuple[float, float, float, float], colum
         )
     with np.errstate(all="ignore"):
         geometries = shapely.from_wkb(stored, on_invalid="ignore")
-    found = {str(name): _plain(values) for name, values in zip(meta["fields"], fields, strict=True)}
-    ids = [str(number) for number in numbers]
-    for name in _IDS:
-        if name in found:
-            ids = [str(given)[:60] if given is not None else id for given, id in zip(found[name], ids, strict=True)]
-            break
-    return Features(ids, geometries, found)
-
-
-def _plain(values: NDArray[Any]) -> list[Any]:
-    """Values of a column, None where there is none."""
-    return [None if value is None or value != value else value for value in values.tolist()]
+    tags: list[dict[str, str]] = [{} for _ in numbers]
+    for name, values in zip(meta["fields"], fields, strict=True):
+        for row, value in zip(tags, values.tolist(), strict=True):
+            if value is not None and value == value and value != "":
+                row[str(name)] = str(value)
+    id_column = next((name for name in _IDS if name in wanted), "")
+    ids = [row.get(id_column, str(number))[:60] for row, number in zip(tags, numbers, strict=True)]
+    return Features(ids, geometries, tags)
 
 
 @contextlib.contextmanager
@@ -241,25 +237,3 @@ def _check_table(path: Path, layer: str, what: str) -> None:
         raise TerrainError(f"{what} is damaged: {error}") from error
     if found is not None and found[0] != "table":
         raise TerrainError(f"{what}: layer {layer!r} is a {found[0]}, expected a table; ogr2ogr makes a copy of it")
-
-
-def columns_of(features: Features, names: Sequence[str]) -> list[dict[str, str]]:
-    """Attributes of each feature as texts, without those that are not set."""
-    present = [name for name in names if name in features.columns]
-    rows: list[dict[str, str]] = [{} for _ in features.ids]
-    for name in present:
-        for row, value in zip(rows, features.columns[name], strict=True):
-            if value is not None and value != "":
-                row[name] = str(value)
-    return rows
-
-
-def number(value: object) -> float | None:
-    """A number, or a text that is one; None else."""
-    if isinstance(value, bool) or value is None:
-        return None
-    try:
-        found = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        return None
-    return found if np.isfinite(found) else None

@@ -70,7 +70,7 @@ class Placing:
 
     def __init__(self, grid: GridSpec, layer: Layer, crs: str | None, margin_m: float) -> None:
         self.grid, self.layer = grid, layer
-        self._target, self._crs = _systems(grid, layer, crs)
+        self._target, self._crs = systems_of(grid, layer.crs, crs, layer.what)
         self._margin_cells = margin_m / grid.resolution_m + 2.0
         with self._reprojecting():
             self._box = self._extent()
@@ -187,32 +187,36 @@ class Placing:
         return np.stack([(xs - grid.west_m) / grid.resolution_m, (grid.north_m - ys) / grid.resolution_m], axis=1)
 
 
-def _systems(grid: GridSpec, layer: Layer, given: str | None) -> tuple[Any, Any]:
-    """(the terrain's system, the layer's); (None, None) if the layer is in the terrain's own metres."""
+def systems_of(grid: GridSpec, own: str, given: str | None, what: str) -> tuple[Any, Any]:
+    """(the terrain's system, a file's); (None, None) if the file is in the terrain's own metres.
+
+    own    the file's system as it says; empty if it does not
+    given  what the scenario says that it is
+    """
     import rasterio
 
     if given == "local":
         return None, None
     found = None
     if given is not None:
-        found = system_named(given, f"{layer.what}: crs")
-    elif layer.crs:
+        found = system_named(given, f"{what}: crs")
+    elif own:
         with suppress(TerrainError):
-            found = system_named(layer.crs, layer.what)
+            found = system_named(own, what)
     if found is None:
         raise TerrainError(
-            f"{layer.what} does not say in which coordinate system it is; set crs, for example 'EPSG:4326', or"
-            " 'local' for metres of the terrain's own map"
+            f"{what} does not say in which coordinate system it is; set crs, for example 'EPSG:4326', or 'local'"
+            " for metres of the terrain's own map"
         )
     if grid.crs == "local":
         if is_local(found):
             return None, None
         raise TerrainError(
-            f"{layer.what} is in {crs_name(found)}, and the terrain has no place; set terrain.crs, or crs = 'local'"
-            " if its coordinates are metres of the terrain's own map"
+            f"{what} is in {crs_name(found)}, and the terrain has no place; set terrain.crs, or crs = 'local' if"
+            " its coordinates are metres of the terrain's own map"
         )
     if not found.is_geographic and not found.is_projected:
-        raise TerrainError(f"{layer.what} is in {crs_name(found)}, which has no place on the Earth; set crs")
+        raise TerrainError(f"{what} is in {crs_name(found)}, which has no place on the Earth; set crs")
     return rasterio.CRS.from_user_input(grid.crs), found
 
 

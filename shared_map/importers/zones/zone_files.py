@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import math
 from collections import Counter
@@ -13,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from shared_map.arrays import Bools, Floats
-from shared_map.importers.georeference import crs_name, system_named
+from shared_map.importers.georeference import crs_name
 from shared_map.importers.onto_grid import grows, overlap, warped
 from shared_map.importers.raster_files import is_raster, opened
-from shared_map.importers.zones import vector_files, way_classes
-from shared_map.importers.zones.burn import Drawing, burn, burn_mask
+from shared_map.importers.zones import way_classes
+from shared_map.importers.zones.burn import Drawn, burn
 from shared_map.importers.zones.vector_files import Features, Layer, is_vector, open_layer, read_features
-from shared_map.importers.zones.vector_shapes import Placing, Shapes
+from shared_map.importers.zones.vector_shapes import Placing, Shapes, systems_of
 from shared_map.importers.zones.way_classes import COLUMNS, PACKED, TAGS, Kind, Way
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
@@ -91,7 +92,9 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     layer = open_layer(path, zone.layer, what)
     facts = FileFacts(path.name, layer.name, zone.crs or layer.crs or "none", layer.features)
     worth = _Worth(zone, layer, facts)
-    values, lethal, bridges = Drawing(False), Drawing(True), Drawing(False)
+    values: list[Drawn] = []
+    lethal: list[Drawn] = []
+    bridges: list[Drawn] = []
     if layer.bounds is not None:
         placing = Placing(grid, layer, zone.crs, zone.width_m or _WIDEST_M / 2)
         facts.crs = placing.crs
@@ -102,14 +105,16 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
             placed = placing.place(features, box, shift)
             for shape, id, way, bridge in worth.of(features, placed):
                 used.add(id)
-                drawing, value = (lethal, 1.0) if way.factor is None else (values, way.factor)
-                drawing.add(shape, value, way.width_m / grid.resolution_m)
+                drawn = Drawn(shape, way.factor or 1.0, way.width_m / grid.resolution_m)
+                (lethal if way.factor is None else values).append(drawn)
                 if bridge:
-                    bridges.add(shape, 1.0, way.width_m / grid.resolution_m)
+                    bridges.append(drawn)
         facts.used, facts.outside = len(used), max(layer.features - read, 0)
         worth.check_used()
+    closed, closes = burn(lethal, grid, what, everywhere=True)
+    over, deck = burn(bridges, grid, what)
     burnt = burn(values, grid, what, least_wins=zone.kind == "road")
-    return Burnt(facts, burnt, burn_mask(lethal, grid, what), burn_mask(bridges, grid, what))
+    return Burnt(facts, burnt, (closed, ~np.isnan(closes)), (over, ~np.isnan(deck)))
 
 
 class _Worth:
@@ -167,10 +172,9 @@ class _Worth:
                 of = f"{self._layer.what}: feature {id} of a {zone.kind} zone"
                 raise TerrainError(f"{of} cannot be used: {why}; mend or remove it")
             facts.skip(why, id)
-        rows = vector_files.columns_of(features, self.columns)
         ways = {}
         for n in sorted(set(placed.of.tolist())):
-            tags = way_classes.unpacked(rows[n])
+            tags = way_classes.unpacked(features.tags[n])
             way = self._way(tags, features.ids[n])
             if way is not None:
                 bridge = self._kind == "road" and way_classes.is_bridge(tags)
@@ -213,13 +217,15 @@ class _Worth:
 
     def _stated(self, tags: dict[str, str], id: str) -> Way | None:
         """The value that a feature's own attribute states."""
-        name, kind = self._zone.attribute or "", self._zone.kind
-        value = vector_files.number(tags.get(name))
-        if value is None or not _LEAST <= value <= _MOST:
-            shown = tags.get(name, "nothing")[:40]
-            self._facts.skip(f"whose {name} is no {kind} of {_LEAST:g} to {_MOST:g}", f"{id} ({shown})")
-            return None
-        return Way(0.0, value)
+        name = self._zone.attribute or ""
+        stated = tags.get(name, "nothing")
+        with contextlib.suppress(ValueError):
+            if _LEAST <= float(stated) <= _MOST:
+                return Way(0.0, float(stated))
+        self._facts.skip(
+            f"whose {name} is no {self._zone.kind} of {_LEAST:g} to {_MOST:g}", f"{id} ({stated[:40]})"
+        )
+        return None
 
     def check_used(self) -> None:
         """Raises TerrainError if features are on the terrain, and none counts for what they are."""
@@ -238,15 +244,14 @@ class _Worth:
 
 def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt:
     """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
-    from shared_map.importers.zones.zone_files import values_on
-
     what = f"{where} {path}"
     if zone.kind not in ("pace", "factor"):
         raise TerrainError(f"{what} is a raster, which goes with kind pace or factor, found {zone.kind!r}")
     given = [key for key in ("layer", "attribute", "width_m", "classes", "value") if getattr(zone, key)]
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")
-    values, crs = values_on(path, grid, zone.crs, where)
+    with opened(path, where) as dataset:
+        values, crs = _values_on(dataset, grid, zone.crs, what)
     lethal = values == np.inf
     values[lethal] = np.nan
     known = values[~np.isnan(values)]
@@ -256,53 +261,39 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
             f"{what} holds {worst:g}, expected a {zone.kind} of {_LEAST:g} to {_MOST:g}, or inf where nothing"
             " drives; declare what stands for no value as nodata"
         )
-    facts = FileFacts(path.name, "", crs, features=int(known.size + lethal.sum()))
-    facts.used = facts.features
-    if known.size + int(lethal.sum()) == 0:
+    count = int(known.size + lethal.sum())
+    if not count:
         raise TerrainError(f"{what} has no value on the terrain")
-    window, empty = grid.window, Window(0, 0, 0, 0)
-    nothing: Any = np.zeros((0, 0), np.bool_)
-    return Burnt(facts, (window, values), (window, lethal), (empty, nothing))
+    facts = FileFacts(path.name, "", crs, features=count, used=count)
+    nothing = (Window(0, 0, 0, 0), np.zeros((0, 0), np.bool_))
+    return Burnt(facts, (grid.window, values), (grid.window, lethal), nothing)
 
 
-# --- rasters onto the grid ------------------------------------------------------------------------------------
-
-
-def values_on(path: Path, grid: GridSpec, crs: str | None, where: str) -> tuple[Floats, str]:
-    """The first band of a raster on a grid, float32, NaN where it has no value, and the name of its system. The
+def _values_on(dataset: Any, grid: GridSpec, crs: str | None, what: str) -> tuple[Floats, str]:
+    """The one band of a raster on a grid, float32, NaN where it has no value, and the name of its system. The
     nearest cell counts, or the mean where cells of the grid are half as large again.
 
     crs  its system, where the file does not say it; "local" is that of a terrain without a place
 
-    Raises TerrainError if it cannot be read, has several bands, or does not touch the grid.
+    Raises TerrainError if it has several bands, is too large, or does not touch the grid.
     """
     import rasterio
 
-    what = f"{where} {path}"
-    with opened(path, where) as dataset:
-        if dataset.count != 1:
-            raise TerrainError(f"{what} has {dataset.count} bands, expected one")
-        if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-            raise TerrainError(f"{what} holds {dataset.dtypes[0]} values, expected whole or real numbers")
-        if dataset.height * dataset.width > MAX_CELLS:
-            raise TerrainError(
-                f"{what} has {dataset.height} x {dataset.width} pixels; at most {MAX_CELLS} are read"
-            )
-        own = dataset.crs if crs in (None, "local") else system_named(str(crs), f"{what}: crs")
-        if crs == "local":
-            own = rasterio.CRS.from_epsg(3857)  # metres of the terrain's own map: which one does not matter
-        elif own is None:
-            raise TerrainError(f"{what} does not say in which coordinate system it is; set crs, or 'local'")
-        elif grid.crs == "local":
-            raise TerrainError(f"{what} is in {crs_name(own)}, and the terrain has no place; set crs = 'local'")
-        target = own if crs == "local" else rasterio.CRS.from_user_input(grid.crs)
-        overlap(dataset, own, target, grid, what)
-        stored: Floats = dataset.read(1).astype(np.float32)
-        stored[dataset.read_masks(1) == 0] = np.nan
-        stored *= np.float32(dataset.scales[0] or 1.0)
-        stored += np.float32(dataset.offsets[0] or 0.0)
-        how = "average" if grows(dataset, dataset.transform, own, grid, target) else "nearest"
-        values = np.full((grid.rows, grid.cols), np.nan, np.float32)
-        place = {"src_transform": dataset.transform, "src_nodata": math.nan, "dst_nodata": math.nan}
-        warped(stored, values, grid, own, target, how, **place)
-        return values, "local" if crs == "local" else crs_name(own)
+    if dataset.count != 1 or np.dtype(dataset.dtypes[0]).kind not in "iuf":
+        found = f"{dataset.count} bands of {dataset.dtypes[0]}"
+        raise TerrainError(f"{what} has {found}, expected one of whole or real numbers")
+    if dataset.height * dataset.width > MAX_CELLS:
+        raise TerrainError(f"{what} has {dataset.height} x {dataset.width} pixels; at most {MAX_CELLS} are read")
+    target, own = systems_of(grid, str(dataset.crs or ""), crs, what)
+    if own is None:
+        target = own = rasterio.CRS.from_epsg(3857)  # metres of the terrain's own map: which one does not matter
+    overlap(dataset, own, target, grid, what)
+    stored: Floats = dataset.read(1).astype(np.float32)
+    stored[dataset.read_masks(1) == 0] = np.nan
+    stored *= np.float32(dataset.scales[0] or 1.0)
+    stored += np.float32(dataset.offsets[0] or 0.0)
+    how = "average" if grows(dataset, dataset.transform, own, grid, target) else "nearest"
+    values = np.full(grid.shape, np.nan, np.float32)
+    place = {"src_transform": dataset.transform, "src_nodata": math.nan, "dst_nodata": math.nan}
+    warped(stored, values, grid, own, target, how, **place)
+    return values, "local" if crs == "local" else crs_name(own)

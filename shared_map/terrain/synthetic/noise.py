@@ -5,9 +5,8 @@ Only additions, products and square roots of seeded numbers, so that a seed give
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ class Noise:
 
     rows: int
     cols: int
-    octaves: Sequence[tuple[float, Lattice]]
+    octaves: Sequence[tuple[float, _ValueLattice | _GradientLattice]]
     total: float
     ridged: bool
 
@@ -58,12 +57,6 @@ class Noise:
         return field
 
 
-class Lattice(Protocol):
-    def part(self, row0: int, row1: int, col0: int, col1: int) -> Floats:
-        """The noise of one scale in a part of the terrain. A new array."""
-        ...
-
-
 def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
     """Smooth noise of many scales.
 
@@ -82,7 +75,7 @@ def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: floa
     -------
     Noise, within -1..1
     """
-    return _octaves(_ValueLattice.drawn, 0.5, rng, rows, cols, coarsest, ridged)
+    return _octaves(_ValueLattice, 0.5, rng, rows, cols, coarsest, ridged)
 
 
 def mountain_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
@@ -91,11 +84,11 @@ def mountain_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: flo
 
     Values are roughly within -1..1.
     """
-    return _octaves(_GradientLattice.drawn, 0.45, rng, rows, cols, coarsest, ridged)
+    return _octaves(_GradientLattice, 0.45, rng, rows, cols, coarsest, ridged)
 
 
 def _octaves(
-    drawn: Callable[[np.random.Generator, int, int, float], Lattice],
+    lattice: type[_ValueLattice | _GradientLattice],
     decay: float,
     rng: np.random.Generator,
     rows: int,
@@ -107,7 +100,7 @@ def _octaves(
     octaves = []
     amplitude, scale, total = 1.0, float(coarsest), 0.0
     while scale >= 2.0 and amplitude > 0.01:
-        octaves.append((amplitude, drawn(rng, rows, cols, scale)))
+        octaves.append((amplitude, lattice.drawn(rng, rows, cols, scale)))
         total += amplitude
         amplitude *= decay
         scale /= 2.0

@@ -183,7 +183,7 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
     with pytest.raises(TerrainError, match="is a raster, which goes with kind pace or factor, found 'road'"):
         painted([ZoneConfig(kind="road", file=file)])
     nowhere = raster(tmp_path / "e.tif", values, from_origin(500_100, 5_199_900, 10.0, 10.0), None)
-    with pytest.raises(TerrainError, match="does not say in which coordinate system it is; set crs, or 'local'"):
+    with pytest.raises(TerrainError, match="does not say in which coordinate system it is; set crs, for example"):
         painted([ZoneConfig(kind="factor", file=nowhere)])
     local = GridSpec(UTM.rows, UTM.cols, 10.0, UTM.west_m, UTM.north_m)
     pace, _ = painted([ZoneConfig(kind="factor", file=nowhere, crs="local")], local)

@@ -303,7 +303,7 @@ def photo_of_nan(folder: Path) -> dict[str, Any]:
         (photo_elsewhere, "photo .*p.tif does not overlap the terrain: it covers x 600000"),
         (photo_without_place, "georeference both, or make them the same size"),
         (a_photo_as_terrain, r"3 bands: a photo\? Name it in terrain\.photo"),
-        (truncated, "truncated: its header promises 400 x 400 cells, 0.6 MB, and it has 0.2 MB"),
+        (truncated, "truncated or no raster"),
         (truncated_compressed, "truncated or no raster"),
         (promise_of_20_gb, "has 100000 x 100000 pixels; at most 4294967296 are read"),
         (promise_in_16384, "truncated"),
