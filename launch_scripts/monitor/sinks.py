@@ -151,14 +151,6 @@ class Pen:
         style = rr.LineStrips3D.from_fields(colors=colours, radii=[screen(radius)])
         self.log(entity, style, static=True)
 
-    def texts(
-        self, entity: str, places: Floats, texts: list[str], colours: Sequence[Colour] | Bytes, *, static: bool
-    ) -> None:
-        """Labels without a ball."""
-        labels = [shown(text, 60) for text in texts]
-        points = rr.Points3D(places, labels=labels, colors=colours, radii=[screen(0.1)], show_labels=True)
-        self.log(entity, points, static=static)
-
     def label_style(self, entity: str, colour: Colour = LABEL_COLOUR) -> None:
         """An entity is labels that are always shown."""
         style = rr.Points3D.from_fields(colors=[colour], radii=[screen(0.1)], show_labels=True)

@@ -85,21 +85,18 @@ def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:
 
     labels  name in the report -> what people call it
     """
-    rows: list[Row] = []
-    for name, label in labels.items():
-        values = [run.report.get(name) for run in runs]
-        parts = dict.fromkeys(part for value in values if isinstance(value, Mapping) for part in value)
-        if not parts:
-            rows.append((label, values))
-        for part in parts:
-            of_part = [value.get(part) if isinstance(value, Mapping) else None for value in values]
-            rows.append((f"{label}, {part}", of_part))
-    for name, label in _SUMMED.items():
-        rows.append((label, [_sum(run.report.get("by_group"), name) for run in runs]))
-    targets = dict.fromkeys(id for run in runs for id in _table(run.report.get("by_target")))
-    for id in targets:
-        told = [_table(_table(run.report.get("by_target")).get(id)) for run in runs]
-        rows.append((f"captures of {id}", [each.get("captures") for each in told]))
+    told: list[dict[str, Any]] = []
+    for report in (run.report for run in runs):
+        named = _flat({label: report.get(name) for name, label in labels.items()}, "")
+        told.append(
+            {key.replace(".", ", "): value for key, value in named.items()}
+            | {label: _sum(report.get("by_group"), name) for name, label in _SUMMED.items()}
+            | {
+                f"captures of {id}": _table(row).get("captures")
+                for id, row in _table(report.get("by_target")).items()
+            }
+        )
+    rows = [(key, [each.get(key) for each in told]) for key in dict.fromkeys(key for each in told for key in each)]
     return [row for row in rows if any(value is not None for value in row[1])]
 
 

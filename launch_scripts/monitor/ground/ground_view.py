@@ -38,7 +38,7 @@ from launch_scripts.monitor.live_layout import (
     legend_picture,
 )
 from launch_scripts.monitor.movers.styles import Look, RateLimit
-from launch_scripts.monitor.sinks import Pen, screen
+from launch_scripts.monitor.sinks import Pen, even, ragged, shown
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones
@@ -126,7 +126,9 @@ class GroundView:
         movers: Sequence[Look] = (),
     ) -> None:
         self._pen, self._mesh, self._cost_map, self._replica = scene.pen, scene.pen.mesh, cost_map, replica
-        self._shown, self._zones, self._movers = scene.layers, list(scene.zones), movers
+        self._shown, self._movers = scene.layers, movers
+        self._planned, self._zones = scene.zones, scene.zones
+        """Zones of the scenario, and all that stand."""
         self._target_ids, self._classes = scenario.target_ids, list(class_numbers(scenario))
         now, prior = cost_map.ground_s_per_m, cost_map.prior_s_per_m
         self._colours = colours = GroundColours(self._mesh, terrain, now, scene.truth, prior)
@@ -147,11 +149,10 @@ class GroundView:
         self.samples = CostSamples(terrain.grid, self._to_target and self._to_target.target)
         self._pictures = TargetPictures(self._mesh, colours, self.samples)
         self._limit = RateLimit(_EVERY_S)
-        self._ordered: list[Area] = []
         self._zones_version = 0
 
     def begin(self) -> None:
-        """Draws all of it. What never changes is static: the shape of the ground, legends, the scenario's zones."""
+        """Draws all of it. What never changes is static: the shape of the ground, legends, styles."""
         self._pen.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
@@ -159,14 +160,17 @@ class GroundView:
             for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in self._tiled else whole):
                 self._pen.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
             self._legend(layer)
-        self._draw_margin()
-        self._draw_zones("planned", self._zones, static=True)
+        self._pen.style("world/zones", _LINE_PX)
+        self._pen.style("world/margin", _LINE_PX, _MARGIN_COLOUR)
+        self._pen.label_style("world/zones/names")
+        self._pen.label_style("world/margin/texts", _MARGIN_COLOUR)
         self.draw_anew()
         self.finish()
 
     def draw_anew(self) -> None:
         """All is drawn once more when it is due, as the pen has forgotten it."""
-        self._draw_zones("ordered", self._ordered, static=False)
+        self._draw_margin()
+        self._draw_zones()
         self._stale = {layer.name: dict.fromkeys(range(self._mesh.tiles)) for layer in self._tiled}
         self._limit.all_due()
 
@@ -197,9 +201,9 @@ class GroundView:
         self._take_changes()
         if self._zones_version != self._replica.zones_version:
             self._zones_version = self._replica.zones_version
-            self._ordered = ordered_areas(self._replica, now_ns, self._classes)
-            self._colours.close(closed_cells([*self._zones, *self._ordered]))
-            self._draw_zones("ordered", self._ordered, static=False)  # they come and go
+            self._zones = [*self._planned, *ordered_areas(self._replica, now_ns, self._classes)]
+            self._colours.close(closed_cells(self._zones))
+            self._draw_zones()
         for layer in self._tiled:
             if self._limit.due(layer.name, now_ns, slower):
                 self._draw_tiles(layer, _TILES_AT_ONCE)
@@ -250,17 +254,15 @@ class GroundView:
         if self._pictures.full_s != before_s:
             self._legend(layer)
 
-    def _draw_zones(self, whose: str, zones: Sequence[Area], *, static: bool) -> None:
-        parts = [borders(self._mesh, area) for area in zones]
-        strips = np.concatenate([np.empty((0, 2, 3), np.float32), *parts])
-        per_zone = np.array([ZONE_COLOURS[area.rule] for area in zones], np.uint8).reshape(-1, 3)
+    def _draw_zones(self) -> None:
+        parts = [borders(self._mesh, area) for area in self._zones]
+        per_zone = np.array([ZONE_COLOURS[area.rule] for area in self._zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
-        path = f"world/zones/{whose}"
-        self._pen.log(path, rr.LineStrips3D(strips, colors=colours, radii=[screen(_LINE_PX)]), static=static)
-        named = zones[:_NAMES_SHOWN]
+        self._pen.lines("world/zones", even(np.concatenate([np.empty((0, 2, 3), np.float32), *parts])), colours)
+        named = self._zones[:_NAMES_SHOWN]
+        places, titles = title_places(self._mesh, named), [shown(area.title, 60) for area in named]
         pale = (per_zone[:_NAMES_SHOWN].astype(np.uint16) + 2 * 255) // 3  # on their own hatches names would drown
-        titles, places = [area.title for area in named], title_places(self._mesh, named)
-        self._pen.texts(f"{path}/names", places, titles, pale.astype(np.uint8), static=static)
+        self._pen.points("world/zones/names", positions=places, labels=titles, colors=pale.astype(np.uint8))
 
     def _draw_margin(self) -> None:
         """Draws what a map has south of it, level with its lowest ground: a bar of known length in the west, an
@@ -273,15 +275,15 @@ class GroundView:
             [(east, south, 0), (east, north, 0)],
             [(east - unit, north - unit, 0), (east, north, 0), (east + unit, north - unit, 0)],
         ]
-        margin = rr.LineStrips3D(shapes, colors=[_MARGIN_COLOUR], radii=[screen(_LINE_PX)])
-        self._pen.log("world/margin", margin, static=True)
+        corners = np.array([corner for shape in shapes for corner in shape], np.float32)
+        self._pen.lines("world/margin", ragged(corners, [len(shape) for shape in shapes]))
         texts = {
             said_length(length_m): (length_m / 2, south, 0),
             mesh.said_heights: (mesh.width_m / 2, south, 0),
             "N": (east - 2.2 * unit, north, 0),
         }
         places = np.array(list(texts.values()), np.float32)
-        self._pen.texts("world/margin/texts", places, list(texts), [_MARGIN_COLOUR], static=True)
+        self._pen.points("world/margin/texts", positions=places, labels=list(texts))
 
 
 def _mesh(tile: MeshTile) -> rr.Mesh3D:
