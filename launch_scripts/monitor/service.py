@@ -21,8 +21,7 @@ from launch_scripts.monitor.live_layout import (
     summary_markdown,
 )
 from launch_scripts.monitor.movers.movers_view import MoversView
-from launch_scripts.monitor.movers.styles import RateLimit
-from launch_scripts.monitor.sinks import Pen, RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.sinks import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.web.server import Audience

@@ -291,6 +291,28 @@ class Sinks:
             stream.disconnect()
 
 
+class RateLimit:
+    """When each of several things is done next, each at its own pace.
+
+    every_s  name -> seconds from one time to the next
+    """
+
+    def __init__(self, every_s: Mapping[str, float]) -> None:
+        self._every_ns = {name: int(seconds * NS_PER_S) for name, seconds in every_s.items()}
+        self.all_due()
+
+    def all_due(self) -> None:
+        """Lets each thing be due, whenever it was done last."""
+        self._next_ns = dict.fromkeys(self._every_ns, 0)
+
+    def due(self, name: str, now_ns: int, slower: int = 1) -> bool:
+        """Whether it is time; if so, the next time is counted from now, and comes so many times as late."""
+        if now_ns < self._next_ns[name]:
+            return False
+        self._next_ns[name] = now_ns + slower * self._every_ns[name]
+        return True
+
+
 class RecordingWatch:
     """Notices that a recording has ended for want of space, says so, and begins another when there is some. Rerun's
     file sink ends at the first error, with a line in its own log only.
@@ -303,27 +325,23 @@ class RecordingWatch:
         self._begin = begin
         self._size, self._still = -1, 0
         """Bytes of the file, and checks that found as many, without a break."""
-        self._told_ns: int | None = None
-        """When it was last said that the recording has ended; None while it goes on."""
-        self._retry_ns = self._due_ns = 0
+        self._limit = RateLimit({"look": 1.0, "try": _RETRY_S, "say": SAY_EVERY_S})
 
     def check(self, now_ns: int) -> tuple[str | None, bool]:
         """What is to be told, if anything, and whether a new file has begun, in which nothing is drawn yet."""
-        if now_ns < self._due_ns:
+        if not self._limit.due("look", now_ns) or not self._has_ended():
             return None, False
-        self._due_ns = now_ns + NS_PER_S
-        if self._told_ns is None:
-            return (self._tell(now_ns), False) if self._has_ended() else (None, False)
-        if now_ns >= self._retry_ns:
-            self._retry_ns = now_ns + int(_RETRY_S * NS_PER_S)
+        if self._limit.due("say", now_ns):
+            return f"the recording {self._path} has ended: {self._why()}; another begins when there is space", False
+        if self._limit.due("try", now_ns):
             with contextlib.suppress(OSError, StoreError):
                 check_space(self._path.parent)
                 self._path = new_recording_path(self._path.parent)
                 self._begin(self._path)
-                self._size, self._still, self._told_ns = -1, 0, None
-        if self._told_ns is None:
-            return f"the recording goes on in {self._path}", True
-        return (self._tell(now_ns) if now_ns - self._told_ns >= SAY_EVERY_S * NS_PER_S else None), False
+                self._size, self._still = -1, 0
+                self._limit.all_due()
+                return f"the recording goes on in {self._path}", True
+        return None, False
 
     def _has_ended(self) -> bool:
         before = self._size
@@ -332,14 +350,12 @@ class RecordingWatch:
         self._still = self._still + 1 if self._size == before else 0
         return self._still >= STILL_CHECKS
 
-    def _tell(self, now_ns: int) -> str:
-        self._told_ns = now_ns
-        why = "it does not grow"
+    def _why(self) -> str:
         try:
             check_space(self._path.parent)
         except OSError as error:
-            why = error.strerror or str(error)
-        return f"the recording {self._path} has ended: {why}; another begins when there is space"
+            return error.strerror or str(error)
+        return "it does not grow"
 
 
 def check_space(folder: Path) -> None:

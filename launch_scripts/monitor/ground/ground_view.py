@@ -37,8 +37,8 @@ from launch_scripts.monitor.live_layout import (
     Scale,
     legend_picture,
 )
-from launch_scripts.monitor.movers.styles import Look, RateLimit
-from launch_scripts.monitor.sinks import Pen, even, ragged, shown
+from launch_scripts.monitor.movers.styles import Look
+from launch_scripts.monitor.sinks import Pen, RateLimit, even, ragged, shown
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones

@@ -16,7 +16,7 @@ from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMes
 from launch_scripts.monitor.movers import styles
 from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, Strips, even, screen, shown
+from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
 from launch_scripts.observe.latest_state import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_alarms import Alarm
@@ -87,7 +87,7 @@ class MoversView:
         self._crew: frozenset[tuple[str, str]] = frozenset()
         """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
         self._fleets_new = False
-        self._limit = styles.RateLimit({"pins": 0.2, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
+        self._limit = RateLimit({"pins": 0.2, "trails": 0.5, "bodies": 0.2, "beliefs": 0.5})
 
     def begin(self) -> None:
         """Logs styles; all else is drawn anew."""

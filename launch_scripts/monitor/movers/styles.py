@@ -6,7 +6,7 @@ vehicle is, brightness how it does, shape what something is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from launch_scripts.monitor.ground.terrain_mesh import Bytes
 from launch_scripts.monitor.sinks import Colour
 from launch_scripts.observe import palette
-from swarm.clock import NS_PER_S
 from swarm.wire.messages.vehicles import VehicleState
 
 Shape = Literal["ball", "ring", "line", "fill", "hatch"]
@@ -177,25 +176,3 @@ LEVELS = (
 def level_for(vehicles: int) -> Level:
     """The level of detail for so many vehicles."""
     return next(level for level in LEVELS if vehicles <= level.most)
-
-
-class RateLimit:
-    """When each of several things is done next, each at its own pace.
-
-    every_s  name -> seconds from one time to the next
-    """
-
-    def __init__(self, every_s: Mapping[str, float]) -> None:
-        self._every_ns = {name: int(seconds * NS_PER_S) for name, seconds in every_s.items()}
-        self.all_due()
-
-    def all_due(self) -> None:
-        """Lets each thing be due, whenever it was done last."""
-        self._next_ns = dict.fromkeys(self._every_ns, 0)
-
-    def due(self, name: str, now_ns: int, slower: int = 1) -> bool:
-        """Whether it is time; if so, the next time is counted from now, and comes so many times as late."""
-        if now_ns < self._next_ns[name]:
-            return False
-        self._next_ns[name] = now_ns + slower * self._every_ns[name]
-        return True

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
-from launch_scripts.monitor.movers.styles import Level, Looks, RateLimit, dimmed
-from launch_scripts.monitor.sinks import Pen, Strips, even, ragged
+from launch_scripts.monitor.movers.styles import Level, Looks, dimmed
+from launch_scripts.monitor.sinks import Pen, RateLimit, Strips, even, ragged
 from launch_scripts.observe.counts import percent
 from launch_scripts.observe.latest_state import LatestState, VehicleColumns
 from swarm.clock import NS_PER_S
