@@ -24,9 +24,8 @@ from swarm.wire.messages.map_data import PACE_MOST, MarkKind, MarkSet
 
 MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""
-
-
 _MANY_BOXES = 8 * MAX_WINDOWS
+"""Beyond so many boxes around changed cells one around all of them is kept: merging is quadratic in them."""
 
 
 class CostSnapshot(NamedTuple):

@@ -19,7 +19,9 @@ from swarm.wire.fields import LONGEST_LEASE_S
 from swarm.wire.messages.planning import Sighted, TargetPose
 
 LONGEST_NS = 120 * NS_PER_S
+"""A tracker that was lost for two minutes says nothing any more about where its target is."""
 _MOST = 10_000
+"""Targets of whom a sighting is kept: what strangers may make up."""
 
 
 @dataclass(frozen=True, slots=True)

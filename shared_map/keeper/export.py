@@ -22,6 +22,7 @@ from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 
 FORMAT = "swarm-map/1"
 NOTHING_SAID_BAND = 255
+"""Above every MarkKind: the value that a GIS is told to leave out."""
 
 
 class _Mark(msgspec.Struct, array_like=True, gc=False):

@@ -15,6 +15,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.role import RoleSetup
 
 TICK_HZ = 10.0
+"""Marks wait a tenth of a second for the disk at most, and one commit takes in what came meanwhile."""
 
 
 def run(

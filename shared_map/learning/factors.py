@@ -27,7 +27,7 @@ _Value = TypeVar("_Value")
 SLOPE_BINS = 6
 """0-5, 5-10 ... 20-25 degrees, and all that is steeper."""
 SLOPE_BIN_DEG = 5
-
+"""Finer bins would be driven too seldom in a run of minutes to say anything of themselves."""
 _PRIOR_VARIANCE = ONE * 49 // 100
 """Of ln(factor) before anything is measured: tau of 0.7."""
 _USUAL_VARIANCE = ONE // 10

@@ -71,6 +71,7 @@ _ALL_FOR = 5
 """In periods of whole digests: how long a keeper or author counts as near after it spoke; how often and how long
 everybody is listened to. The last is longer than an author is silent before it counts as gone."""
 _MOST_NAMES = 1024
+"""Keepers and authors that are remembered, of each: a swarm has some hundred; names cost a sender nothing."""
 
 
 class DigestInterest:

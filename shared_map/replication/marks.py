@@ -230,6 +230,7 @@ class HybridClock:
 MAX_BULK_BYTES = 1 << 18
 """A message is cut off at about this size: while the reader merges one, the next is packed and sent."""
 _BULK_SETS = 4096
+"""Sets in one message: many tombstones have no bytes by which it would be cut off."""
 
 
 def packed(sets: Iterable[MarkSet]) -> Iterator[MarkSets]:
