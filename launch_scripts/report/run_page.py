@@ -62,8 +62,15 @@ def write_page(folder: Path) -> Path:
 
 
 def page_of(folder: Path, report: Mapping[str, Any]) -> str:
-    """The page's text. What comes from files is escaped by the template."""
-    environment = environment_of_pages()
+    """The page's text. The template escapes all that it is given, and raises where something is missing."""
+    environment = Environment(
+        loader=PackageLoader("launch_scripts.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(percent=percent, count=count)
     scenario = folder / SCENARIO_FILE
     recording = folder / "run.rrd"  # without a byte where the monitor ended before it drew anything
     notes = list(report.get("notes") or [])
@@ -90,19 +97,6 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         scenario=read_text(scenario, FileKind.SCENARIO) if scenario.exists() else None,
         recording=recording.is_file() and recording.stat().st_size > 0,
     )
-
-
-def environment_of_pages() -> Environment:
-    """Templates that escape all that they are given, and raise where something is missing."""
-    environment = Environment(
-        loader=PackageLoader("launch_scripts.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(percent=percent, count=count)
-    return environment
 
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
@@ -168,22 +162,22 @@ def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
     width_km, height_km = size_km(tracks.grid)
     scale = _MAP_IN / max(width_km, height_km)
 
-    files = {"ground": (GROUND_FILE, "image/webp"), "learned": (LEARNED_FILE, "image/png")}
     return {
         "svg": _svg(
             (width_km * scale, height_km * scale), (0, 0, 1, 1), lambda axes: draw_map(axes, tracks, report)
         ),
         "groups": colours_of_groups(report),
         "marks": len(tracks.marks.cells),
-        **{
-            name: _data_uri(kind, read_bytes(folder / file, FileKind.RUN)) if (folder / file).exists() else None
-            for name, (file, kind) in files.items()
-        },
+        "ground": _picture(folder / GROUND_FILE, "image/webp"),
+        "learned": _picture(folder / LEARNED_FILE, "image/png"),
     }
 
 
-def _data_uri(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+def _picture(path: Path, kind: str) -> str | None:
+    """A file as an address that holds it; None where there is none."""
+    if not path.exists():
+        return None
+    return f"data:{kind};base64,{base64.b64encode(read_bytes(path, FileKind.RUN)).decode()}"
 
 
 def _svg(
