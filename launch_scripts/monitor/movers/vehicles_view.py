@@ -6,7 +6,7 @@ Few entities with many instances each; of each only what has changed: see docs/d
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,39 +70,37 @@ def cells_at(grid: GridSpec, east_m: Floats, south_m: Floats) -> Cells:
 class RouteNow:
     """A route that a vehicle has begun, or what is left of it.
 
-    cells     int64 (n,)
-    places    float64 (n, 2)  rows and columns that it leads over, whole numbers in the middles of cells; those of a
+    cells     int32 (n,)
+    places    float32 (n, 2)  rows and columns that it leads over, whole numbers in the middles of cells; those of a
               pulled route lie on the straight lines between the cells in which it turns
     gap       its cost over its proven lower bound; None if nothing is proven
     begun_ns  when that was heard
     """
 
     target: str
-    cells: Cells
-    places: NDArray[np.float64]
+    cells: NDArray[np.int32]
+    places: Floats
     gap: float | None = None
     begun_ns: int = 0
 
     @classmethod
     def of(cls, followed: Followed, grid: GridSpec, now_ns: int) -> RouteNow:
         """The route that a vehicle told. Raises ValueError or OutsideGridError where it leaves the grid."""
-        cells = np.array(walk(grid, followed.start, followed.directions), np.int64)
-        places = np.stack(np.divmod(cells, grid.cols), axis=1).astype(np.float64)
+        cells = np.array(walk(grid, followed.start, followed.directions), np.int32)
+        places = np.stack(np.divmod(cells, grid.cols), axis=1).astype(np.float32)
         turns = np.cumsum([0, *np.frombuffer(followed.legs, "<u4")])
         if turns[-1] == len(cells) - 1:
             at = np.arange(len(cells))
-            places = np.stack([np.interp(at, turns, places[turns, axis]) for axis in (0, 1)], axis=1)
+            straight = [np.interp(at, turns, places[turns, axis]) for axis in (0, 1)]
+            places = np.stack(straight, axis=1).astype(np.float32)
         gap = followed.cost_s / followed.lower_bound_s if followed.lower_bound_s > 0 else None
         return cls(followed.target, cells, places, gap, now_ns)
 
     def ahead_of(self, cell: int) -> RouteNow:
         """The route from a cell on; the whole route if the cell is not on it."""
         found = np.flatnonzero(self.cells == cell)
-        return self.part(slice(found[-1], None)) if len(found) else self
-
-    def part(self, which: slice | NDArray[np.intp]) -> RouteNow:
-        """Some of its places."""
-        return RouteNow(self.target, self.cells[which], self.places[which], self.gap, self.begun_ns)
+        first = int(found[-1]) if len(found) else 0
+        return replace(self, cells=self.cells[first:], places=self.places[first:])
 
 
 class RouteLines:
@@ -119,14 +117,16 @@ class RouteLines:
 
     def lines(self, routes: Iterable[RouteNow]) -> Strips:
         """Each route up to where it meets one that is drawn already, the longest first."""
-        parts, drawn = [np.empty((0, 2))], self._drawn
-        for route in sorted(routes, key=lambda route: len(route.cells), reverse=True):
+        parts, drawn = [np.empty((0, 2), np.float32)], self._drawn
+        longest_first = sorted(routes, key=lambda route: len(route.cells), reverse=True)
+        for route in longest_first:
             met = np.flatnonzero(drawn[route.cells])
             end = int(met[0]) if len(met) else len(route.cells) - 1
             if end > 0:
                 drawn[route.cells[: end + 1]] = True
                 parts.append(route.places[np.append(np.arange(0, end, self._stride), end)])
-        drawn[:] = False
+        for route in longest_first:
+            drawn[route.cells] = False
         south_m, east_m = ((np.concatenate(parts) + 0.5) * self._mesh.grid.resolution_m).astype(np.float32).T
         lengths = [len(part) for part in parts[1:]]
         return ragged(self._mesh.place(east_m, south_m, 0.2 * self._mesh.scale_m), lengths)

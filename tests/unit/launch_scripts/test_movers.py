@@ -62,8 +62,9 @@ def columns(states: list[VehicleState], targets: list[int], target_ids: list[str
 
 def route(*cells: int, target: str = "t0", cols: int = 1000, **more: Any) -> RouteNow:
     """A route over these cells of a grid which has so many columns."""
-    places = np.stack(np.divmod(np.array(cells), cols), axis=1).astype(np.float64)
-    return RouteNow(target, np.array(cells), places, **more)
+    of_grid = np.array(cells, np.int32)
+    places = np.stack(np.divmod(of_grid, cols), axis=1).astype(np.float32)
+    return RouteNow(target, of_grid, places, **more)
 
 
 def followed(start: int, directions: bytes, *legs: int) -> Followed:
