@@ -16,17 +16,13 @@ from typing import Any, TypeVar
 import msgspec
 
 from launch_scripts.parent_death import end_with_parent
-from launch_scripts.process_table import SIMULATED_ROLES, processes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import BrokenLaw, LawBook
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import MIXED, world
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.agents import plan_agents
-from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
-from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
 from swarm.runtime.process import collected_rarely
 
 T = TypeVar("T")
@@ -71,18 +67,6 @@ def replay_of(name: str, seed: int, seconds: float, usual_s: float, option: str 
     return f"swarm simulate {name} --{option} {seeds}{longer}"
 
 
-def nodes_of(scenario: Scenario) -> list[str]:
-    return [spec.name for spec in processes_of(scenario, SIMULATED_ROLES)]
-
-
-def few_of_layer(scenario: Scenario) -> list[str]:
-    """The nodes of agents that are less than three on the ground, or in the air: each has its own right of way."""
-    layers: dict[bool, list[str]] = {}
-    for plan in plan_agents(scenario):
-        layers.setdefault(flies(scenario, plan.group.vehicle_class), []).append(f"agent-{plan.id}")
-    return [name for layer in layers.values() if len(layer) < FEWEST_FOR_MAJORITY for name in layer]
-
-
 def try_seed(
     name: str, seed: int, seconds: float = SECONDS, given: Scenario | None = None
 ) -> tuple[Verdict, dict[str, Any]]:
@@ -97,7 +81,7 @@ def try_seed(
     else:
         scenario = msgspec.structs.replace(given, seed=seed)
         terrain = build_terrain(scenario)
-    plan = random_plan(seed, nodes_of(scenario), seconds, few_of_layer(scenario))
+    plan = random_plan(scenario, seed, seconds)
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
     began_s = time.perf_counter()
     book = LawBook(simulation)

@@ -6,10 +6,15 @@ Nodes are named as processes are: "keeper-0", "planner-t3", "agent-a1". Times ar
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from launch_scripts.process_table import SIMULATED_ROLES, processes_of
 from swarm.clock import NS_PER_S
+from swarm.config.agents import plan_agents
+from swarm.config.classes import flies
+from swarm.config.scenario import Scenario
+from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
 
 RELINK_S = 0.3
 """Seconds until a client has found its router again: the retry period, and a session's start."""
@@ -174,18 +179,18 @@ def _apart(partition: Partition, source: str, destination: str) -> bool:
     return (source in partition.nodes) != (destination in partition.nodes)
 
 
-def random_plan(seed: int, nodes: Sequence[str], seconds: float, few: Collection[str] = ()) -> FaultPlan:
-    """Draws a plan for a run of these nodes: everything at once in the first three fifths, nothing in the rest.
+def random_plan(scenario: Scenario, seed: int, seconds: float) -> FaultPlan:
+    """Draws a plan for a run of a scenario: everything at once in the first three fifths, nothing in the rest.
 
     Crashes of any process; cuts that nobody notices, cuts that all do, also of one way; hangs; clocks that are
     wrong and steps of them; second lives of agents; messages lost, late, repeated and out of order. A seed may
     leave any of them out, so that a failure shows what it needs.
 
-    few  agents with at most one other in their layer, on the ground or in the air: a plot of theirs has one member,
-         and nobody can tell which of its files is the first, so they have no second life elsewhere
+    Agents with at most one other in their layer, on the ground or in the air, have no second life elsewhere: a plot
+    of theirs has one member, and nobody can tell which of its files is the first.
     """
     chance = random.Random(f"faults/{seed}")
-    names = sorted(nodes)
+    names = sorted(spec.name for spec in processes_of(scenario, SIMULATED_ROLES))
     agents = [name for name in names if name.startswith("agent-")]
     quiet_s = seconds * 3 / 5
 
@@ -207,7 +212,7 @@ def random_plan(seed: int, nodes: Sequence[str], seconds: float, few: Collection
         from_s, until_s = span(4.0)
         partitions.append(Partition(from_s, until_s, (name,), chance.random() < 0.3))
         twin = Twin(chance.uniform(from_s, until_s), name)
-        twins += [twin] if name not in few else []
+        twins += [twin] if name not in few_of_layer(scenario) else []
     for crash in crashes:
         if chance.random() < 0.3:
             by_s = chance.choice((-3600.0, 3600.0, -43_200.0, 43_200.0, 5.0, -5.0))
@@ -228,6 +233,14 @@ def random_plan(seed: int, nodes: Sequence[str], seconds: float, few: Collection
         twins=tuple(twins),
     )
     return replace(plan, clock_steps=_within_half_a_day(clock_steps, plan.skews_ms))
+
+
+def few_of_layer(scenario: Scenario) -> list[str]:
+    """The nodes of agents that are less than three on the ground, or in the air: each has its own right of way."""
+    layers: dict[bool, list[str]] = {}
+    for plan in plan_agents(scenario):
+        layers.setdefault(flies(scenario, plan.group.vehicle_class), []).append(f"agent-{plan.id}")
+    return [name for layer in layers.values() if len(layer) < FEWEST_FOR_MAJORITY for name in layer]
 
 
 def _within_half_a_day(steps: Sequence[ClockStep], skews_ms: Mapping[str, float]) -> tuple[ClockStep, ...]:

@@ -7,7 +7,6 @@ import math
 import msgspec
 import pytest
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
@@ -26,7 +25,7 @@ ROVERS = (
 def driven(kind: str, seed: int, seconds: float, faults: bool) -> tuple[LawBook, dict[str, int]]:
     scenario, terrain = crowd(kind, seed, vehicles=40, per_agent=10, side=24)
     scenario = msgspec.structs.replace(scenario, rovers=ROVERS)
-    plan = random_plan(seed, nodes_of(scenario), seconds) if faults else None
+    plan = random_plan(scenario, seed, seconds) if faults else None
     simulation = Simulation(scenario, terrain=terrain, faults=plan)
     law = LawBook(simulation)
     simulation.run_until(seconds)

@@ -12,7 +12,6 @@ from support.class_world import captures_by_class, made
 from support.effort import few
 from support.simulated import OrderedSimulation, agents, cells, vehicles
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
@@ -112,7 +111,7 @@ def test_whatever_a_class_may_drive_and_whatever_goes_wrong_it_enters_nothing_el
         text = text.replace(was, now)
     scenario = parse_scenario(f"{text}\n[map]\nlearning = {str(learning).lower()}")
     scenario = msgspec.structs.replace(scenario, seed=seed)
-    simulation = OrderedSimulation(scenario, faults=random_plan(seed, nodes_of(scenario), 6.0))
+    simulation = OrderedSimulation(scenario, faults=random_plan(scenario, seed, 6.0))
     try:
         laws, driven = LawBook(simulation), driven_by(simulation)
     except ConfigError:  # there are too few cells that so poor a class can drive

@@ -6,7 +6,6 @@ from __future__ import annotations
 import pytest
 from support.simulated import cells
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
@@ -22,7 +21,7 @@ SECONDS = 24.0
 )
 def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
     scenario, terrain = crowd(kind, 1, vehicles=100, per_agent=13, side=30)
-    plan = random_plan(1, nodes_of(scenario), SECONDS)
+    plan = random_plan(scenario, 1, SECONDS)
     assert plan.crashes and plan.partitions and plan.hangs  # noqa: PT018
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
     assert LawBook(simulation).run(SECONDS) == []

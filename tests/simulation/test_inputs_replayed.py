@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from launch_scripts.cli import app
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.replay import keep, recordings_of, replay_run
 from launch_scripts.simulation.simulate import simulate
@@ -38,7 +37,7 @@ SECONDS = 6
 
 
 def record(folder: Path, seed: int, seconds: float = SECONDS) -> Path:
-    plan = random_plan(seed, nodes_of(SMALL), seconds)
+    plan = random_plan(SMALL, seed, seconds)
     simulate(SMALL, seed, seconds, plan, record_to=folder)
     return folder
 
@@ -155,7 +154,7 @@ def test_recording_a_run_does_not_change_it(tmp_path: Path) -> None:
     logs = []
     for folder in (None, tmp_path):
         trace = io.StringIO()
-        simulate(SMALL, 4, 2, random_plan(4, nodes_of(SMALL), 2), trace, record_to=folder)
+        simulate(SMALL, 4, 2, random_plan(SMALL, 4, 2), trace, record_to=folder)
         logs.append(trace.getvalue())
     assert logs[0] == logs[1]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import seeded
@@ -35,7 +34,7 @@ def maps_of(simulation: Simulation) -> dict[str, CostMap]:
 @pytest.mark.parametrize("seed", [1])
 def test_the_swarm_learns_what_its_prior_has_wrong_and_all_maps_agree(seed: int) -> None:
     scenario = scenario_of(seed)
-    simulation = Simulation(scenario, faults=random_plan(seed, nodes_of(scenario), SECONDS))
+    simulation = Simulation(scenario, faults=random_plan(scenario, seed, SECONDS))
     simulation.run_until(SECONDS + 10.0)
     maps = maps_of(simulation)
     assert len(maps) >= 4

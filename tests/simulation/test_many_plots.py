@@ -6,7 +6,6 @@ import msgspec
 import pytest
 from support.simulated import agents, vehicles
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
@@ -34,7 +33,7 @@ def test_agents_listen_to_the_plots_near_their_vehicles_and_keep_every_law():
 @pytest.mark.seeds(2)
 def test_nobody_meets_where_plots_are_larger_than_regions(seed):
     wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, plot_regions=2))
-    simulation = Simulation(seeded(seed, wide), faults=random_plan(seed, nodes_of(wide), SECONDS))
+    simulation = Simulation(seeded(seed, wide), faults=random_plan(wide, seed, SECONDS))
     laws = LawBook(simulation)
     messages = {"standing": 0, "table": 0}
     simulation.network.trace = lambda _, source, destination, topic, payload: messages.update(

@@ -9,7 +9,6 @@ import sys
 
 import pytest
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.worlds import SMALL, seeded
@@ -17,12 +16,11 @@ from launch_scripts.simulation.worlds import SMALL, seeded
 RUN = """
 import json, sys
 from launch_scripts.simulation.faults import random_plan
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.worlds import SMALL
 from launch_scripts.simulation.simulate import simulate
 with open(sys.argv[1], "w") as trace:
     seed = int(sys.argv[2])
-    result = simulate(SMALL, seed, 12, random_plan(seed, nodes_of(SMALL), 12), trace)
+    result = simulate(SMALL, seed, 12, random_plan(SMALL, seed, 12), trace)
 print(json.dumps(result.report))
 """
 
@@ -50,7 +48,7 @@ def test_a_run_is_the_same_byte_for_byte_whatever_the_hash_seed_is(seed, tmp_pat
 
 def test_watching_a_run_does_not_change_it():
     trace = io.StringIO()
-    plan = random_plan(3, nodes_of(SMALL), 4)
+    plan = random_plan(SMALL, 3, 4)
     one = simulate(seeded(3), seconds=4, faults=plan, trace=trace)
     other = simulate(seeded(3), seconds=4, faults=plan)
     assert one.report == other.report

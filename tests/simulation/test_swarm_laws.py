@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.simulated import agents, cells
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation, simulate
@@ -45,7 +44,7 @@ def test_a_run_in_which_nothing_goes_wrong_keeps_every_law_and_does_its_work():
 
 @pytest.mark.seeds(4)
 def test_the_laws_hold_under_seeded_faults(seed):
-    simulation = Simulation(seeded(seed), faults=random_plan(seed, nodes_of(SMALL), SECONDS))
+    simulation = Simulation(seeded(seed), faults=random_plan(SMALL, seed, SECONDS))
     check_all(simulation)
     report = simulation.report(SECONDS)
     assert report["vehicles_routed"] == 10

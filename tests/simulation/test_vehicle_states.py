@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from support.vehicle_states import record, table
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import world
@@ -19,6 +18,6 @@ def test_simulated_vehicles_make_no_transition_but_those_of_the_table(
 ) -> None:
     made = record(monkeypatch)
     scenario, terrain = world(name, seed)
-    Simulation(scenario, faults=random_plan(seed, nodes_of(scenario), SECONDS), terrain=terrain).run_until(SECONDS)
+    Simulation(scenario, faults=random_plan(scenario, seed, SECONDS), terrain=terrain).run_until(SECONDS)
     assert made - table() == set()
     assert {event for _, event, _ in made} >= {"assign", "give_route"}

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
@@ -46,7 +45,7 @@ def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
 
 def simulation_of(name: str, seed: int) -> Simulation:
     scenario, terrain = world(name, seed)
-    faults = random_plan(seed, nodes_of(scenario), SECONDS)
+    faults = random_plan(scenario, seed, SECONDS)
     return Simulation(scenario, faults=faults, terrain=terrain)
 
 

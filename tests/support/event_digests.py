@@ -14,7 +14,6 @@ from typing import Any
 import msgspec
 
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.simulation.campaign import few_of_layer, nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import WORLDS, world
@@ -45,7 +44,7 @@ def digest_of(name: str, seed: int, seconds: float = SECONDS) -> tuple[int, str]
     log: Any = _Digest()
     if name in WORLDS:
         scenario, terrain = world(name, seed)
-        plan = random_plan(seed, nodes_of(scenario), seconds, few_of_layer(scenario))
+        plan = random_plan(scenario, seed, seconds)
         simulation = Simulation(scenario, faults=plan, terrain=terrain, trace=log)
     else:
         scenario = msgspec.structs.replace(find_scenario(name), seed=seed, seconds=seconds)

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 from support.simulated import Guest, OrderedSimulation, cells
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
@@ -120,8 +119,7 @@ class Interplay:
         else:
             scenario, terrain = crowd(self.kind, seed, vehicles=16, per_agent=4, side=20)
         scenario = msgspec.structs.replace(scenario, rovers=_ROVERS)
-        names = nodes_of(scenario)
-        self.plan = plan = random_plan(seed, names, 20.0)
+        self.plan = plan = random_plan(scenario, seed, 20.0)
         self.quiet_s = quiet_s = plan.quiet_s or 18.0
         cuts = list(plan.partitions)
         for name in ("robot-0", "robot-1", ADDED):

@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import random
 
-from launch_scripts.simulation.campaign import few_of_layer, nodes_of
-from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
+from launch_scripts.process_table import SIMULATED_ROLES, processes_of
+from launch_scripts.simulation.faults import (
+    OBSERVER,
+    RELINK_S,
+    FaultPlan,
+    FaultyLinks,
+    Partition,
+    few_of_layer,
+    random_plan,
+)  # fmt: skip
+from launch_scripts.simulation.worlds import SMALL
 from shared_map.replication.marks import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -97,9 +106,9 @@ def far_off(plan: FaultPlan) -> float:
 
 
 def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
-    nodes = ["keeper-0", "planner-t0", "agent-a0", "agent-a1", "agent-a2"]
-    assert random_plan(3, nodes, 30) == random_plan(3, nodes[::-1], 30)
-    plans = [random_plan(seed, nodes, 30) for seed in range(200)]
+    nodes = [spec.name for spec in processes_of(SMALL, SIMULATED_ROLES)]
+    assert random_plan(SMALL, 3, 30) == random_plan(SMALL, 3, 30)
+    plans = [random_plan(SMALL, seed, 30) for seed in range(200)]
     for plan in plans:
         assert plan.quiet_s == 18
         assert all(crash.at_s < 18 and crash.node in nodes for crash in plan.crashes)
@@ -123,7 +132,6 @@ def test_agents_that_nobody_can_tell_apart_have_no_second_life():
     for per_agent, few in ((25, {"agent-a3"}), (50, {"agent-a0", "agent-a1", "agent-a2"})):
         scenario = parse_scenario(text.replace("{}", str(per_agent)) + air + "\nvehicles = 1")
         assert set(few_of_layer(scenario)) == few
-        names = nodes_of(scenario)
-        plans = [random_plan(seed, names, 30, few_of_layer(scenario)) for seed in range(300)]
+        plans = [random_plan(scenario, seed, 30) for seed in range(300)]
         assert not any(twin.node in few for plan in plans for twin in plan.twins)
         assert any(plan.twins for plan in plans) is (len(few) == 1)

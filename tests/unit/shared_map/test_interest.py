@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.simulation.campaign import nodes_of
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
@@ -121,7 +120,7 @@ def check_interest(simulation: Simulation) -> tuple[int, int]:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_agents_hold_what_is_near_their_vehicles_and_all_of_it(seed: int) -> None:
-    faults = random_plan(seed, nodes_of(NEAR), 20.0)
+    faults = random_plan(NEAR, seed, 20.0)
     simulation = Simulation(seeded(seed, NEAR), faults=faults)
     laws = LawBook(simulation)
     simulation.run_until(18)
