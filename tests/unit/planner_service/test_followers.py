@@ -163,6 +163,15 @@ def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
     assert is_news(4, 3, 3, 3, 3, 3)
 
 
+def test_that_there_is_no_way_is_told_once() -> None:
+    followers = Followers("t", GRID, 10, 0)
+    none = Route(status=RouteStatus.UNREACHABLE, start=7, cost_s=math.inf, lower_bound_s=math.inf)
+    followers.given("v", none, 0, 0, 0)
+    (follower,) = followers.all()
+    assert not followers.is_news(follower, RouteOutline(RouteStatus.UNREACHABLE, 7, b"", 0.0))
+    assert followers.is_news(follower, RouteOutline(RouteStatus.OK, 7, b"\x02", 0.0))
+
+
 @pytest.mark.parametrize("away", range(4))
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("across", [False, True])

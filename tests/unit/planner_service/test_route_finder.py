@@ -99,3 +99,12 @@ def test_a_change_that_is_refused_changes_nothing() -> None:
         with pytest.raises(ValueError, match=r"inside|NaN"):
             finder.change(block, row, col)
     np.testing.assert_array_equal(finder.cost_to_go_s(), before)
+
+
+@pytest.mark.parametrize(
+    ("block", "row", "col"), [(np.full((1, 3), np.inf), 5, 4), (np.full((3, 1), np.inf), 3, 6)]
+)
+def test_a_block_may_end_at_the_border_of_the_grid(block: Any, row: int, col: int) -> None:
+    finder = RouteFinder(np.ones((6, 7)), target=(0, 0))
+    finder.change(block, row, col)
+    assert np.isinf(finder.cost_to_go_s()).sum() == 3

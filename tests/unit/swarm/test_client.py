@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from support.bus_world import answering
 from support.client_rig import Program, run_info
 from support.effort import few
+from support.made_up_swarm import some_fleet
 from support.map_strategies import GRID as MAP_GRID
 from support.map_strategies import Composite
 from support.planner_swarm import GRID, Swarm, driven_s, rough
@@ -37,7 +38,7 @@ from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.vehicles import Body
 from swarm.wire.routes import Route as WireRoute
 from swarm.wire.routes import RouteStatus
-from swarm.wire.topics import BODY, NOTE, POSE, RUN
+from swarm.wire.topics import BODY, FLEET, NOTE, POSE, RUN
 
 LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE
 NOWHERE = [(math.nan, 5.0), (5.0, math.inf), (-0.1, -5.0), (5.0, 0.1), (1e12, -5.0), (500.1, -5.0), (5.0, -400.1)]
@@ -540,11 +541,29 @@ def test_an_observer_sees_vehicles_targets_marks_and_captures(world: Swarm) -> N
     rover.leave()
     world.run(3.0)
     assert "rover" not in watching.vehicles
-    late = Program(world, "late").swarm.observer()
-    world.run(1.0)
-    assert list(late.marks) == [] or list(late.marks) == [77]
     watching.leave()
     assert list(watching.notes) == []
+
+
+def test_an_observer_sees_the_vehicles_of_an_agent_until_it_is_silent(world: Swarm) -> None:
+    watching = Program(world, "watcher").swarm.observer()
+    fleet = some_fleet("a0", 0, 1, [GRID.cell(2, 3)], [35.0], [25.0], ["t"])
+    world.ear.bus.publish(FLEET, fleet, region=0, author=fleet.author)
+    world.run(0.5)
+    (seen,) = watching.vehicles.values()
+    assert (seen.id, seen.target) == ("a0-00", "t")
+    world.run(10.0)
+    assert watching.vehicles == {}
+
+
+@pytest.mark.parametrize(("targets", "given"), [(None, ([], True)), ([], ([], False)), (["t"], (["t"], False))])
+def test_a_group_chases_what_it_is_told_or_again_what_the_scenario_says(
+    world: Swarm, monkeypatch: pytest.MonkeyPatch, targets: list[str] | None, given: tuple[list[str], bool]
+) -> None:
+    orders, told = Program(world).swarm.orders(), []
+    monkeypatch.setattr(orders, "_give", lambda **order: told.append((order["targets"], order["off"])))
+    orders.chase("red", targets)
+    assert told == [given]
 
 
 def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> None:
@@ -720,4 +739,4 @@ def test_poses_of_a_target_go_out_twice_a_second(world: Swarm) -> None:
     world.bus("ear2").subscribe(POSE, heard.append, target="x")
     Program(world).swarm.target("x").at(5.0, -5.0)
     world.run(3.0)
-    assert len(heard) >= 7
+    assert 7 <= len(heard) <= 8

@@ -19,7 +19,7 @@ from swarm.grid import GridSpec, walk
 from swarm.wire.routes import RouteStatus
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.traffic.steering import Steering
 
@@ -159,3 +159,15 @@ def test_steps_of_a_route_around_corners_are_judged_together_as_they_are_one_by_
         cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))
     one_by_one = [steering.passable(tail, head) for tail, head in pairwise(cells)]
     assert steering.passable_steps(cells) == [*one_by_one, False].index(False)
+
+
+def test_one_that_stands_though_its_route_goes_on_is_blocked_and_one_that_moves_is_not() -> None:
+    steering, vehicle = steering_on(climb_on(np.zeros((8, 8)))), Vehicle("v", GRID, 0)
+    assert not steering.blocked(vehicle, 0)
+    vehicle.assign("t", 0)
+    assert vehicle.give_route(GivenRoute("t", (0, 1, 2), 1.0, 1.0, partial=False), [0], 0) is not None
+    assert steering.blocked(vehicle, 1)
+    assert steering.waiting_ns == {"v": (0, 1)}
+    vehicle.motion.at_rest = False
+    assert not steering.blocked(vehicle, 2)
+    assert steering.waiting_ns == {}
