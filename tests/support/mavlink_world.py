@@ -18,9 +18,9 @@ ROVER, COPTER, PLANE = 10, 2, 1
 MANUAL = 0
 TICK_NS = NS_PER_S // 20
 START = GRID.cell(40, 10)
-TO_THE_EAST = Way(tuple(GRID.centre_m(GRID.cell(40, col)) for col in range(10, 40)), "ok")
-WITH_A_TURN = Way((*TO_THE_EAST.points_m, *(GRID.centre_m(GRID.cell(row, 39)) for row in range(39, 20, -1))), "ok")
-NOWHERE = Way((), "unreachable")
+TO_THE_EAST: Way = tuple(GRID.centre_m(GRID.cell(40, col)) for col in range(10, 40))
+WITH_A_TURN: Way = (*TO_THE_EAST, *(GRID.centre_m(GRID.cell(row, 39)) for row in range(39, 20, -1)))
+NOWHERE: Way = ()
 
 
 @dataclass

@@ -5,8 +5,8 @@ from __future__ import annotations
 from msgspec import Struct
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
-from launch_scripts.gateways.mavlink.arming import Kind, kind_of
-from launch_scripts.gateways.mavlink.guidance import Driver, Way, Wishes, driver_of, flies
+from launch_scripts.gateways.mavlink.arming import Arming, Kind, kind_of
+from launch_scripts.gateways.mavlink.guidance import Missions, Setpoints, Way, Wishes, arming_of, flies, guide_of
 from swarm.client import ConfigError, Frame
 from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
@@ -78,12 +78,16 @@ class Adapter:
         self._there = False
         self._reported: codec.Position | None = None
         """The newest that was told to the swarm; None while the vehicle is nowhere for it."""
-        self._way: Way | None = None
+        self._way: Way = ()
         self._swarm_up = True
-        self._driver: Driver | None = None
+        self._guide: Missions | Setpoints | None = None
+        """None: the vehicle is not driven."""
+        self._arming: Arming | None = None
+        """None: arming and modes are somebody else's."""
         self._tells: list[str] = []
-        self._said_ns: dict[str, int] = {}
-        """Sentence -> when it was told last."""
+        self._told: set[str] = set()
+        """Sentences of this minute."""
+        self._minute_ends_ns = 0
         self._beat_due_ns = self._report_due_ns = self._ask_due_ns = self._warn_due_ns = 0
 
     # --- what comes -----------------------------------------------------------------------------------------------
@@ -99,8 +103,11 @@ class Adapter:
                 if now_ns >= self._warn_due_ns:
                     self._warn_due_ns = now_ns + _WARN_NS
                     self._tells.append(f"the vehicle says: {text}")
-            case _ if self._driver is not None:
-                self._tells += self._driver.hear(message)
+            case codec.CommandAnswered() if self._arming is not None:
+                self._tells += self._arming.hear(message)
+            case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, Missions):
+                if self._guide.upload is not None:
+                    self._guide.upload.hear(message)
 
     def hear_way(self, way: Way) -> None:
         """Takes in a route to the target that is followed."""
@@ -120,11 +127,11 @@ class Adapter:
             self.kind = kind
             armed = "armed" if beat.armed else "disarmed"
             self._tells.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
-            driver = None if self._wishes.target is None else driver_of(kind, self._frame, self._wishes)
-            if isinstance(driver, str):
-                self._tells.append(f"the vehicle is not driven: {driver}")
-            else:
-                self._driver = driver
+            guide = None if self._wishes.target is None else guide_of(kind, self._frame, self._wishes)
+            if isinstance(guide, str):
+                self._tells.append(f"the vehicle is not driven: {guide}")
+            elif guide is not None:
+                self._guide, self._arming = guide, arming_of(kind, self._wishes)
         if kind != self.kind:
             self._tells.append("another kind of vehicle speaks under the same number: it is ignored")
             return
@@ -136,7 +143,6 @@ class Adapter:
             self._frame.cell(*place)
         except ConfigError:
             self._place = None
-            self._tells.append("the vehicle is outside the terrain")
         else:
             self._place = place
         self._position, self._position_ns = position, now_ns
@@ -154,24 +160,57 @@ class Adapter:
             self._ask_due_ns = now_ns + _ASK_NS
             actions.append(codec.Command(codec.SET_MESSAGE_INTERVAL, (codec.GLOBAL_POSITION_INT, _POSITIONS_US)))
         actions += self._come_or_go(now_ns)
-        if self._there and self._beat is not None and self._position is not None and self._place is not None:
-            actions += self._report(self._position, self._place, now_ns)
-            if self._driver is not None:
-                way = self._way if self._swarm_up else None
-                for said in self._driver.tick(way, self._beat, self._position, self._place, now_ns):
-                    if isinstance(said, str):
-                        self._tells.append(said)
-                    else:
-                        actions.append(said)
-        return actions + self._told(now_ns)
+        beat, position, place = self._beat, self._position, self._place
+        if self._there and beat is not None and position is not None and place is not None:
+            actions += self._report(position, place, now_ns)
+            if self._guide is not None:
+                actions += self._drive(self._guide, beat, position, place, now_ns)
+        return actions + self._news(now_ns)
 
     def stop(self, now_ns: int) -> list[Action]:
         """Returns the last words to the vehicle: it is to stop, as nobody avoids it any more."""
         self._swarm_up = False
-        if not self._there or self._driver is None or self._beat is None or self._position is None:
+        if not self._there or self._guide is None or self._beat is None or self._position is None:
             return []
-        held = self._driver.hold(self._beat, self._position, now_ns, last=True)
-        return [each for each in held if not isinstance(each, str)]
+        return self._hold(self._guide, self._beat, self._position, now_ns, last=True)
+
+    def _drive(
+        self, guide: Missions | Setpoints, beat: codec.Beat, position: codec.Position, place: Point, now_ns: int
+    ) -> list[Action]:
+        """Returns what lets the vehicle follow the way, or hold where there is none."""
+        said: list[Action] = []
+        if self._way and self._swarm_up:
+            for each in guide.lead(self._way, position, place, now_ns):
+                if isinstance(each, str):
+                    self._tells.append(each)
+                else:
+                    said.append(each)
+            if self._arming is not None and guide.ready(now_ns):
+                command = self._arming.drive(beat, position.height_m, now_ns)
+                said += [] if command is None else [command]
+        else:
+            said = self._hold(guide, beat, position, now_ns)
+        if self._arming is not None and self._arming.why:
+            why = self._arming.why
+            self._arming = None
+            self._tells.append(f"the vehicle's mode and motors are left alone from now on: {why}")
+        return said
+
+    def _hold(
+        self,
+        guide: Missions | Setpoints,
+        beat: codec.Beat,
+        position: codec.Position,
+        now_ns: int,
+        *,
+        last: bool = False,
+    ) -> list[Action]:
+        """Returns what lets the vehicle stay where it is, as far as that is ours.
+
+        last  nothing is said after it
+        """
+        command = self._arming.hold(beat, now_ns, last=last) if self._arming is not None else None
+        return [*guide.stay(position, now_ns), *([] if command is None else [command])]
 
     def _come_or_go(self, now_ns: int) -> list[Action]:
         why = self._why_gone(now_ns)
@@ -183,9 +222,9 @@ class Adapter:
             return []
         self._tells.append(f"{why}: the vehicle is left to its own fail-safe")
         actions: list[Action] = []
-        if self._driver is not None:
-            self._driver.forget()
-            self._way = None
+        if self._guide is not None:
+            self._guide.forget()
+            self._way = ()
             actions.append(Unfollow())
         if self._place is None or (self.kind is not None and flies(self.kind, self._wishes.altitude_m)):
             actions.append(Withdraw())
@@ -211,19 +250,20 @@ class Adapter:
         self._report_due_ns = now_ns + REPORT_NS
         first, self._reported = self._reported is None, position
         actions: list[Action] = [Report(*place, position.heading_rad, _speed(position))]
-        if first and self._driver is not None and self._wishes.target is not None:
+        if first and self._guide is not None and self._wishes.target is not None:
             actions.append(Follow(self._wishes.target))
         return actions
 
-    def _told(self, now_ns: int) -> list[Action]:
-        """Returns what is to be told, each sentence of the last minute once."""
+    def _news(self, now_ns: int) -> list[Action]:
+        """Returns what is to be told, each sentence once a minute."""
+        if now_ns >= self._minute_ends_ns:
+            self._minute_ends_ns = now_ns + _SAY_AGAIN_NS
+            self._told.clear()
         sentences, self._tells = self._tells, []
-        if sentences:
-            self._said_ns = {each: ns for each, ns in self._said_ns.items() if now_ns - ns < _SAY_AGAIN_NS}
         told: list[Action] = []
         for sentence in sentences:
-            if sentence not in self._said_ns and len(self._said_ns) < _MOST_SAID:
-                self._said_ns[sentence] = now_ns
+            if sentence not in self._told and len(self._told) < _MOST_SAID:
+                self._told.add(sentence)
                 told.append(Tell(sentence))
         return told
 

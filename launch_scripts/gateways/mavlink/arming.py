@@ -49,47 +49,51 @@ class Modes:
 class Kind:
     """How one make of vehicle wants to be driven.
 
-    name        for people
-    flies       by its MAV_TYPE; None if that says nothing
-    modes       None: it has none that we know, and none is ever set
-    first_item  of a mission: before it lies home
-    streams     guided needs ten setpoints a second, and ends without them
-    starts      a mission begins with MISSION_START
-    terrain     it can keep a height above the terrain
+    make   MAV_AUTOPILOT
+    flies  by its MAV_TYPE; None if that says nothing
+    modes  None: it has none that we know, and none is ever set
     """
 
-    name: str
+    make: int
     flies: bool | None
     modes: Modes | None
-    first_item: int = 0
-    streams: bool = False
-    starts: bool = True
-    terrain: bool = False
+
+    @property
+    def name(self) -> str:
+        return _NAMES.get(self.make, "an autopilot without modes that are known here")
+
+    @property
+    def first_item(self) -> int:
+        """Of a mission: before it ArduPilot has home."""
+        return int(self.make == ARDUPILOT)
+
+    @property
+    def streams(self) -> bool:
+        """Guided needs ten setpoints a second, and ends without them."""
+        return self.make == PX4
 
     def set_mode(self, mode: int) -> codec.Command:
         """DO_SET_MODE: PX4 has main and sub-mode in parameters of their own."""
-        if self.first_item:
-            return codec.Command(codec.DO_SET_MODE, (1, mode))
-        return codec.Command(codec.DO_SET_MODE, (1, mode >> 16 & 0xFF, mode >> 24 & 0xFF))
+        if self.make == PX4:
+            return codec.Command(codec.DO_SET_MODE, (1, mode >> 16 & 0xFF, mode >> 24 & 0xFF))
+        return codec.Command(codec.DO_SET_MODE, (1, mode))
 
 
-_PX4_MODES = Modes(mission=4 << 16 | 4 << 24, guided=6 << 16, hold=4 << 16 | 3 << 24)
-_ARDUPILOT_MODES = (
-    (_DRIVES, Modes(mission=10, guided=15, hold=15, arms=15)),
-    (_COPTERS, Modes(mission=3, guided=4, hold=4, arms=4)),
-    (_PLANES, Modes(mission=10, guided=None, hold=15, arms=15)),
+_NAMES = {PX4: "PX4", ARDUPILOT: "ArduPilot"}
+_MODES = (
+    (PX4, frozenset(range(256)), Modes(mission=4 << 16 | 4 << 24, guided=6 << 16, hold=4 << 16 | 3 << 24)),
+    (ARDUPILOT, _DRIVES, Modes(mission=10, guided=15, hold=15, arms=15)),
+    (ARDUPILOT, _COPTERS, Modes(mission=3, guided=4, hold=4, arms=4)),
+    (ARDUPILOT, _PLANES, Modes(mission=10, guided=None, hold=15, arms=15)),
 )
+"""MAV_AUTOPILOT, MAV_TYPE of vehicles, and their modes."""
 
 
 def kind_of(beat: codec.Beat) -> Kind:
     """The kind of vehicle which a heartbeat tells of."""
     flies = None if beat.type == _UNKNOWN_TYPE else beat.type not in _DRIVES
-    if beat.autopilot == PX4:
-        return Kind("PX4", flies, _PX4_MODES, streams=True, starts=False)
-    if beat.autopilot == ARDUPILOT:
-        modes = next((modes for types, modes in _ARDUPILOT_MODES if beat.type in types), None)
-        return Kind("ArduPilot", flies, modes, first_item=1, terrain=True)
-    return Kind("an autopilot without modes that are known here", flies, None)
+    modes = next((of for make, types, of in _MODES if make == beat.autopilot and beat.type in types), None)
+    return Kind(beat.autopilot, flies, modes)
 
 
 class Arming:

@@ -1,6 +1,8 @@
-"""The guidance of a vehicle along the swarm's routes, by missions or setpoints, with or without the wheel.
+"""The guidance of a vehicle along the swarm's routes, by missions or setpoints.
 
-A `Driver` is chosen once by `driver_of`. It takes the newest route and the vehicle's place, and returns messages.
+A guide is chosen once by `guide_of`. It takes the newest route and the vehicle's place, and returns messages.
+Without a way that leads somewhere the vehicle holds, as far as that is ours: by setpoints it gets one where it is, or
+none any more. A mission is driven to its end, unless its mode becomes hold.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
-from launch_scripts.gateways.mavlink.arming import Arming, Kind
+from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, Kind
 from swarm.client import Frame
 from swarm.client.frame import Point
 from swarm.client.route import along, between
@@ -59,16 +61,8 @@ class Wishes:
     lost_s: float = 5.0
 
 
-@dataclass(frozen=True)
-class Way:
-    """A route of the swarm.
-
-    points_m  (x_m, y_m) in the terrain's frame, in driving order; empty: it leads nowhere
-    status    the planner's word, such as "ok" or "unreachable"
-    """
-
-    points_m: tuple[Point, ...]
-    status: str
+Way = tuple[Point, ...]
+"""A route of the swarm: (x_m, y_m) in the terrain's frame, in driving order; empty: it leads nowhere."""
 
 
 def flies(kind: Kind, altitude_m: float | None) -> bool:
@@ -76,92 +70,43 @@ def flies(kind: Kind, altitude_m: float | None) -> bool:
     return altitude_m is not None if kind.flies is None else kind.flies
 
 
-def driver_of(kind: Kind, frame: Frame, wishes: Wishes) -> Driver | str:
-    """Returns what drives a kind of vehicle as it is wished, or why it cannot be driven: a sentence."""
+def guide_of(kind: Kind, frame: Frame, wishes: Wishes) -> Missions | Setpoints | str:
+    """Returns what guides a kind of vehicle as it is wished, or why it cannot be driven: a sentence."""
     height_m = wishes.altitude_m if flies(kind, wishes.altitude_m) else None
     if flies(kind, wishes.altitude_m):
         if height_m is None:
             return "it flies, and nobody says how high: give --altitude M, as the swarm tells no heights"
-        if wishes.above == "terrain" and not kind.terrain:
+        if wishes.above == "terrain" and kind.make != ARDUPILOT:
             return f"{kind.name} takes no heights above terrain: give --above home"
-    guided = wishes.drive == "guided"
-    if guided and (kind.modes is None or kind.modes.guided is None):
-        return f"{kind.name} has no guided mode here; give --drive mission"
-    arming = None
-    if wishes.arm:
-        mode = None if kind.modes is None else kind.modes.guided if guided else kind.modes.mission
-        # PX4 climbs to the height of its setpoints.
-        takeoff_m = height_m if guided and not kind.streams else None
-        arming = Arming(kind, mode, starts=kind.starts and not guided, takeoff_m=takeoff_m)
     above = codec.ABOVE_TERRAIN if height_m is not None and wishes.above == "terrain" else codec.ABOVE_HOME
-    return (Setpoints if guided else Missions)(kind, frame, above, height_m, arming)
+    if wishes.drive == "mission":
+        return Missions(kind, frame, above, height_m)
+    if kind.modes is None or kind.modes.guided is None:
+        return f"{kind.name} has no guided mode here; give --drive mission"
+    return Setpoints(kind, frame, above, height_m)
 
 
-class Driver:
-    """Drives one vehicle that is there. Without a way that leads somewhere the vehicle holds, as far as that is
-    ours: by setpoints it gets one where it is, or none any more; with the wheel its mode becomes hold. A mission
-    without the wheel is driven to its end.
+def arming_of(kind: Kind, wishes: Wishes) -> Arming | None:
+    """Returns what arms a vehicle that can be driven as it is wished; None if that is somebody else's."""
+    if not wishes.arm:
+        return None
+    guided = wishes.drive == "guided"
+    mode = None if kind.modes is None else kind.modes.guided if guided else kind.modes.mission
+    # PX4 starts its missions by their mode, and climbs to the height of its setpoints.
+    takes_off = guided and not kind.streams and flies(kind, wishes.altitude_m)
+    takeoff_m = wishes.altitude_m if takes_off else None
+    return Arming(kind, mode, starts=kind.make != PX4 and not guided, takeoff_m=takeoff_m)
+
+
+class Guide:
+    """What missions and setpoints have in common.
 
     above     of MAVLink: the frame of `height_m`
     height_m  None: the vehicle stays on its ground
-    arming    None: arming and modes are somebody else's
     """
 
-    def __init__(self, kind: Kind, frame: Frame, above: int, height_m: float | None, arming: Arming | None) -> None:
+    def __init__(self, kind: Kind, frame: Frame, above: int, height_m: float | None) -> None:
         self._kind, self._frame, self._above, self._height_m = kind, frame, above, height_m
-        self._arming = arming
-        self._gave_up = False
-        """It was told that the wheel commands nothing any more."""
-
-    def hear(self, message: codec.Incoming) -> list[str]:
-        """Takes in an answer of the vehicle. Returns sentences about it."""
-        return self._arming.hear(message) if self._arming and isinstance(message, codec.CommandAnswered) else []
-
-    def forget(self) -> None:
-        """The link is lost: nobody knows what the vehicle has."""
-        raise NotImplementedError
-
-    def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
-        """Returns what is to be said now so that the vehicle follows a way, with sentences for people."""
-        raise NotImplementedError
-
-    def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
-        """Returns what is to be said now as there is no way any more."""
-        raise NotImplementedError
-
-    def ready(self, now_ns: int) -> bool:
-        """Whether the vehicle may be brought into the mode in which it drives for us."""
-        raise NotImplementedError
-
-    def tick(
-        self, way: Way | None, beat: codec.Beat, position: codec.Position, place: Point, now_ns: int
-    ) -> list[codec.Outgoing | str]:
-        """Returns what is to be said now, with sentences for people.
-
-        way    the newest; None: the swarm is not heard, or there was none yet
-        place  of the position, in the terrain's frame
-        """
-        if way is None or not way.points_m:
-            said = self.hold(beat, position, now_ns)
-        else:
-            said = list(self.lead(way, position, place, now_ns))
-            if self._arming is not None and self.ready(now_ns):
-                command = self._arming.drive(beat, position.height_m, now_ns)
-                said += [] if command is None else [command]
-        if self._arming is not None and self._arming.why and not self._gave_up:
-            self._gave_up = True
-            said.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
-        return said
-
-    def hold(
-        self, beat: codec.Beat, position: codec.Position, now_ns: int, *, last: bool = False
-    ) -> list[codec.Outgoing | str]:
-        """Returns what is to be said now so that it stays where it is, as far as that is ours.
-
-        last  nothing is said after it
-        """
-        command = self._arming.hold(beat, now_ns, last=last) if self._arming is not None else None
-        return [*self.stay(position, now_ns), *([] if command is None else [command])]
 
 
 # --- missions -----------------------------------------------------------------------------------------------------
@@ -215,12 +160,13 @@ class Upload:
         return self._said
 
 
-class Missions(Driver):
-    """Uploads the rest of a way as a mission, one at a time, whenever that is not what the vehicle has already."""
+class Missions(Guide):
+    """Uploads the rest of a way as a mission, one at a time, whenever the way has changed."""
 
-    _upload: Upload | None = None
-    _seen: Way | None = None
-    """The way that was uploaded, or whose end it is."""
+    upload: Upload | None = None
+    """The mission on its way to the vehicle."""
+    _seen: Way = ()
+    """The way that was uploaded."""
     _sent: Sequence[Point] = ()
     """Points of the newest upload."""
     _cut = False
@@ -229,47 +175,43 @@ class Missions(Driver):
     """The vehicle has a mission that leads along a way."""
     _due_ns = 0
 
-    def hear(self, message: codec.Incoming) -> list[str]:
-        if self._upload is not None:
-            self._upload.hear(message)
-        return super().hear(message)
-
     def forget(self) -> None:
-        self._upload, self._seen, self._accepted = None, None, False
+        """The link is lost: nobody knows what the vehicle has."""
+        self.upload, self._seen, self._accepted = None, (), False
 
     def ready(self, now_ns: int) -> bool:
+        """Whether the vehicle may be brought into the mode in which it drives for us."""
         return self._accepted
 
     def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
-        under_way = self._upload is not None
+        """Returns what is to be said now as there is no way any more."""
+        under_way = self.upload is not None
         self.forget()
         return [codec.MissionCancelled()] if under_way else []
 
     def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
-        if self._upload is None and now_ns >= self._due_ns and self._is_news(way, place):
-            left = rest(way.points_m, place, self._frame.grid.resolution_m)
-            known = self._seen is not way and self._accepted and not self._cut and is_end_of(left, self._sent)
-            self._seen = way
-            if not known:
-                self._sent, self._cut = left[:MOST_POINTS], len(left) > MOST_POINTS
-                self._due_ns = now_ns + _NEXT_NS
-                self._upload = Upload(self._items(position))
-        upload = self._upload
+        """Returns what is to be said now so that the vehicle follows a way, with sentences for people."""
+        if self.upload is None and now_ns >= self._due_ns and self._is_news(way, place):
+            left = rest(way, place, self._frame.grid.resolution_m)
+            self._seen, self._sent, self._cut = way, left[:MOST_POINTS], len(left) > MOST_POINTS
+            self._due_ns = now_ns + _NEXT_NS
+            self.upload = Upload(self._items(position))
+        upload = self.upload
         if upload is None:
             return []
         said = upload.tick(now_ns)
         if not upload.accepted and not upload.why:
             return [] if said is None else [said]
-        self._upload = None
+        self.upload = None
         if upload.accepted:
             self._accepted = True
             return [codec.MissionCurrent(self._kind.first_item)]
-        self._seen = None
+        self._seen = ()
         self._due_ns = now_ns + _AFTER_FAILURE_NS
         return [f"a mission of {len(upload.items)} items has failed: the vehicle {upload.why}"]
 
     def _is_news(self, way: Way, place: Point) -> bool:
-        if way is not self._seen:
+        if way != self._seen:
             return True
         return self._cut and math.dist(place, self._sent[-1]) < math.dist(place, self._sent[0])
 
@@ -291,7 +233,7 @@ class Missions(Driver):
 # --- setpoints ----------------------------------------------------------------------------------------------------
 
 
-class Setpoints(Driver):
+class Setpoints(Guide):
     """Puts a setpoint at the next turn of the way, streamed where the autopilot wants a stream. Without a way the
     stream ends (PX4 leaves offboard by its own fail-safe), or the vehicle gets a setpoint where it is."""
 
@@ -304,6 +246,7 @@ class Setpoints(Driver):
     """(latitude, longitude)"""
 
     def forget(self) -> None:
+        """As of missions, as the others are."""
         self._goal, self._began_ns, self._holds_left = None, None, 0
 
     def ready(self, now_ns: int) -> bool:
@@ -312,7 +255,7 @@ class Setpoints(Driver):
 
     def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
         near_m = self._frame.grid.resolution_m / 2
-        left = rest(way.points_m, place, near_m)
+        left = rest(way, place, near_m)
         # The first lies half a cell ahead on the line; the vehicle drives straight to the turn behind it.
         goal = next((point for point in left[1:] if math.dist(point, place) > near_m), left[-1])
         if goal == self._goal and now_ns < self._due_ns:
@@ -358,14 +301,6 @@ def rest(points: Sequence[Point], place: Point, lead_m: float) -> list[Point]:
     if at + 2 == len(points) and share == 1.0:
         return [points[-1]]
     return turns([between(points[at], points[at + 1], share), *points[at + 1 :]])
-
-
-def is_end_of(points: Sequence[Point], whole: Sequence[Point]) -> bool:
-    """Whether points, but for the first, are the end of others: who drives those drives these."""
-    behind = points[1:] or points
-    return len(behind) <= len(whole) and all(
-        math.dist(a, b) < 0.01 for a, b in zip(reversed(behind), reversed(whole), strict=False)
-    )
 
 
 def _straight(a: Point, b: Point, c: Point) -> bool:

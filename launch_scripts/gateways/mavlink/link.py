@@ -13,7 +13,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from swarm.errors import BusError, ConfigError
 
@@ -53,27 +53,18 @@ def read_address(text: str) -> Address:
     raise ConfigError(f"LINK: found {text[:80]!r}, expected {_EXAMPLES}")
 
 
-class Link(Protocol):
-    """A way to a vehicle. Nothing raises once it is open: a link that is down brings nothing, and comes back."""
-
-    whole: bool
-    """Each piece that it brings holds whole messages."""
-
-    def read(self, within_s: float) -> bytes | None:
-        """Returns what has come, after waiting for it for so long; None if nothing has."""
-
-    def answer_last(self) -> None:
-        """What was read last is the vehicle's: what is written goes where it came from."""
-
-    def write(self, data: bytes) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def open_link(address: Address) -> Link:
-    """Raises ConfigError or BusError."""
+def open_link(address: Address) -> UdpLink | StreamLink:
+    """Raises ConfigError or BusError. Once it is open nothing raises: a link that is down brings nothing, and comes
+    back."""
     if address.kind == "serial":
-        link = StreamLink(_serial_opener(address), lambda port: port.read(port.in_waiting or 1), _write)
+        import serial
+
+        port: Any = serial.Serial
+        link = StreamLink(
+            lambda: port(address.name, address.number, timeout=0.02, write_timeout=0.05),
+            lambda port: port.read(port.in_waiting or 1),
+            lambda port, data: port.write(data),
+        )
         try:
             link.open()
         except (OSError, ValueError) as error:
@@ -93,6 +84,7 @@ class UdpLink:
     """Listens at an address and answers the vehicle, or speaks to an address and listens for its answers."""
 
     whole = True
+    """Each piece that it brings holds whole messages."""
 
     def __init__(self, address: Address, family: int, peer: Any) -> None:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -107,6 +99,7 @@ class UdpLink:
                 raise BusError(f"cannot listen at {address}: {error.strerror or error}") from error
 
     def read(self, within_s: float) -> bytes | None:
+        """Returns what has come, after waiting for it for so long; None if nothing has."""
         if select.select([self._socket], [], [], within_s)[0]:
             with contextlib.suppress(OSError):  # nobody was there for what we have sent
                 data, self._last = self._socket.recvfrom(_MOST_BYTES)
@@ -114,6 +107,7 @@ class UdpLink:
         return None
 
     def answer_last(self) -> None:
+        """What was read last is the vehicle's: what is written goes where it came from."""
         self._peer = self._last
 
     def write(self, data: bytes) -> None:
@@ -136,7 +130,7 @@ class StreamLink:
     whole = False
 
     def __init__(
-        self, made: Callable[[], Any], take: Callable[[Any], bytes], give: Callable[[Any, bytes], None]
+        self, made: Callable[[], Any], take: Callable[[Any], bytes], give: Callable[[Any, bytes], object]
     ) -> None:
         self._made, self._take, self._give = made, take, give
         self._stream: Any = None
@@ -176,19 +170,6 @@ class StreamLink:
             with contextlib.suppress(OSError):
                 self._stream.close()
         self._stream = None
-
-
-def _serial_opener(address: Address) -> Callable[[], Any]:
-    try:
-        import serial
-    except ModuleNotFoundError as error:
-        raise ConfigError("a serial link needs pyserial: pip install 'terrain-swarm[mavlink]'") from error
-    port: Any = serial.Serial
-    return lambda: port(address.name, address.number, timeout=0.02, write_timeout=0.05)
-
-
-def _write(port: Any, data: bytes) -> None:
-    port.write(data)
 
 
 def _connected(family: int, peer: Any) -> socket.socket:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Follow, Report, Tell, Unfollow, Withdraw
-from launch_scripts.gateways.mavlink.guidance import Way, Wishes
-from launch_scripts.gateways.mavlink.link import Address, Link, open_link
+from launch_scripts.gateways.mavlink.guidance import Wishes
+from launch_scripts.gateways.mavlink.link import Address, StreamLink, UdpLink, open_link
 from launch_scripts.gateways.mavlink.mavlink_codec import Wire, pymavlink
 from launch_scripts.stop_requests import stop_requests
 from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
@@ -91,7 +91,7 @@ class Shell:
     def __init__(
         self,
         swarm: Swarm,
-        link: Link,
+        link: UdpLink | StreamLink,
         wire: Wire,
         body: Body,
         wishes: Wishes,
@@ -121,7 +121,8 @@ class Shell:
         else:
             time.sleep(_TURN_S / 4)
         self._adapter.hear_swarm(self._swarm.connected)
-        self._hear_routes()
+        if self._routes is not None and (newest := self._routes.newest) is not None:
+            self._adapter.hear_way(newest.points_m if newest.ok or newest.searching else ())
         failure: SwarmError | None = None
         for action in self._adapter.tick(self._now_ns()):
             try:
@@ -138,14 +139,6 @@ class Shell:
             for action in last:
                 self._perform(action)
             time.sleep(_TURN_S)
-
-    def _hear_routes(self) -> None:
-        newest = None
-        while self._routes is not None and (route := self._routes.next(0.0)) is not None:
-            newest = route
-        if newest is not None:
-            leads = newest.ok or newest.searching
-            self._adapter.hear_way(Way(newest.points_m if leads else (), newest.status))
 
     def _perform(self, action: Action) -> None:
         match action:

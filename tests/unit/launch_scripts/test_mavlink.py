@@ -26,7 +26,7 @@ from support.mavlink_world import (
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Follow, Report, Unfollow, Withdraw
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Upload, Way, Wishes, is_end_of, rest, turns
+from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Upload, Way, Wishes, rest, turns
 
 MISSION, GUIDED = Wishes("t0"), Wishes("t0", "guided")
 OFFBOARD, AUTO_MISSION, AUTO_HOLD = 6 << 16, 4 << 16 | 4 << 24, 4 << 16 | 3 << 24
@@ -136,7 +136,7 @@ def test_outside_the_terrain_it_is_nowhere_for_the_swarm() -> None:
     world.hear(codec.Position(0.5, 0.5, 0.0, 0.0, None))
     said = world.run(0.2)
     assert [type(each) for each in said if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Withdraw]
-    assert "the vehicle is outside the terrain" in world.told()
+    assert "it is outside the terrain: the vehicle is left to its own fail-safe" in world.told()
 
 
 def test_another_kind_under_the_same_number_is_not_heard() -> None:
@@ -209,12 +209,8 @@ def test_what_cannot_be_driven_is_said_and_only_reported(wishes: Wishes, vehicle
     assert not of(world, Follow)
 
 
-def test_the_rest_of_the_same_route_is_no_new_mission_and_another_one_is() -> None:
+def test_another_route_is_a_new_mission_from_where_the_vehicle_is() -> None:
     world = driving(MISSION)
-    world.vehicle.cell = START + 3
-    world.adapter.hear_way(Way(WITH_A_TURN.points_m[3:], "ok"))
-    world.run(8.0)
-    assert len(world.vehicle.missions) == 1
     world.vehicle.cell = GRID.cell(23, 39)
     world.run(8.0)
     assert len(world.vehicle.missions) == 1, "near its end it has all that there is"
@@ -226,7 +222,7 @@ def test_the_rest_of_the_same_route_is_no_new_mission_and_another_one_is() -> No
 
 def test_a_long_route_is_uploaded_in_parts() -> None:
     corners = tuple(GRID.centre_m(GRID.cell(20 + number % 2, number)) for number in range(80))
-    world = driving(MISSION, Autopilot(cell=GRID.cell(20, 0)), Way(corners, "ok"), seconds=12.0)
+    world = driving(MISSION, Autopilot(cell=GRID.cell(20, 0)), corners, seconds=12.0)
     assert [len(mission) for mission in world.vehicle.missions] == [MOST_POINTS + 1]
     world.vehicle.cell = GRID.cell(20, 50)
     world.run(12.0)
@@ -451,7 +447,6 @@ def test_the_rest_is_the_end_of_the_line(line: list[tuple[int, int]], at: tuple[
     points = [(float(x), float(y)) for x, y in line]
     left = rest(points, (float(at[0]), float(at[1])), lead_m)
     assert left[-1] == points[-1]
-    assert is_end_of(left, left)
     for point in left:
         assert min(off(point, a, b) for a, b in zip(points, points[1:] or points, strict=False)) < 1e-6
 

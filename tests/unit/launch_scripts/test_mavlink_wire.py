@@ -18,7 +18,7 @@ from support.effort import few
 from support.mavlink_sender import NOW_S, Sender, beat, common, position
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
-from launch_scripts.gateways.mavlink.link import Link, StreamLink, open_link, read_address
+from launch_scripts.gateways.mavlink.link import StreamLink, UdpLink, open_link, read_address
 from launch_scripts.gateways.mavlink.service import read_key
 from swarm.errors import BusError, ConfigError
 
@@ -226,7 +226,7 @@ def test_what_is_no_address_is_one_sentence(text: str) -> None:
 
 
 @contextlib.contextmanager
-def opened(text: str) -> Iterator[Link]:
+def opened(text: str) -> Iterator[UdpLink | StreamLink]:
     link = open_link(read_address(text))
     try:
         yield link
@@ -234,7 +234,7 @@ def opened(text: str) -> Iterator[Link]:
         link.close()
 
 
-def within(link: Link, turns: int = 100) -> bytes:
+def within(link: UdpLink | StreamLink, turns: int = 100) -> bytes:
     """What it brings first."""
     for _ in range(turns):
         if data := link.read(0.05):
