@@ -2,7 +2,7 @@
 
 A guide is chosen once by `guide_of`. It takes the newest route and the vehicle's place, and returns messages.
 Without a way that leads somewhere the vehicle holds, as far as that is ours: by setpoints it gets one where it is, or
-none any more. A mission is driven to its end, unless its mode becomes hold.
+none any more. A mission is driven to its end, unless the vehicle's mode becomes hold.
 """
 
 from __future__ import annotations

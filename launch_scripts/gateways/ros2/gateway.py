@@ -303,7 +303,7 @@ class Gateway:
         for name, each in self._vehicles.items():
             if each.route_is_new:
                 each.route_is_new = False
-                yield name, ros_messages.packed_path(self._messages.map, now.stamp_ns, each.route)
+                yield name, self._messages.path(now.stamp_ns, each.route)
 
     def _tell_fixes(self, now: _Now) -> _Told:
         for name, each in self._vehicles.items():

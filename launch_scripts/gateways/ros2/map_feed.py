@@ -141,11 +141,9 @@ def find_terrain(digest: str, folder: Path | None, runs: Path) -> Terrain | None
         if terrain.digest != digest:
             raise TerrainError(f"{folder} holds terrain {terrain.digest}, and the run has {digest}")
         return terrain
-    try:
-        metas = [each for each in runs.glob(f"*/{_META}") if not each.parent.is_symlink()]
-        metas.sort(key=lambda each: each.stat().st_mtime_ns, reverse=True)
-    except OSError:
-        return None
+    metas: list[Path] = []
+    with suppress(OSError):
+        metas = sorted(runs.glob(f"*/{_META}"), key=lambda each: each.stat().st_mtime_ns, reverse=True)
     for meta in metas[:_NEWEST]:
         with suppress(SwarmError):  # another run's damage is no business of ours
             known = read_meta(meta, "")

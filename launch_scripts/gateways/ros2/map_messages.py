@@ -71,8 +71,6 @@ def occupancy_grid(messages: RosMessages, stamp_ns: int, occupancy: Occupancy, s
     """
     grid = messages.map.grid
     rows, cols = occupancy.shape
-    if (rows, cols) != (-(-grid.rows // side), -(-grid.cols // side)):
-        raise ValueError(f"{rows} x {cols} blocks of {side} cells are not those of {grid.rows} x {grid.cols} cells")
     west_m, south_m = messages.map.origin_m
     beyond_m = (rows * side - grid.rows) * grid.resolution_m
     info = {
@@ -89,8 +87,6 @@ def occupancy_update(messages: RosMessages, stamp_ns: int, occupancy: Occupancy,
 
     occupancy  int8 (rows, cols) of the window, row 0 in the north
     """
-    if occupancy.shape != (window.row1 - window.row0, window.col1 - window.col0):
-        raise ValueError(f"{occupancy.shape} cells do not fill {window}")
     theirs = flipped(window, messages.map.grid.rows)
     return messages.types.make(
         "map_msgs/msg/OccupancyGridUpdate", header=messages.header(stamp_ns), x=theirs.col0, y=theirs.row0,

@@ -53,14 +53,12 @@ class Qos(Enum):
 class NodeName:
     """A node of a Zenoh session. ROS distinguishes nodes of one session by number; ours has one.
 
-    zid        of the session, 32 hexadecimal digits
-    namespace  "/" or "/robots"
+    zid  of the session, 32 hexadecimal digits
     """
 
     domain: int
     zid: str
     name: str
-    namespace: str = "/"
 
     @property
     def token(self) -> str:
@@ -68,8 +66,9 @@ class NodeName:
 
     @property
     def tail(self) -> str:
-        """Enclave, namespace and name: no enclave, as nothing here speaks ROS's own security."""
-        return f"%/{mangled(self.namespace)}/{self.name}"
+        """Enclave, namespace and name. There is no enclave, as nothing here speaks ROS's own security. Peers may
+        have a namespace, which is left unread."""
+        return f"%/%/{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +169,7 @@ def read_token(key: str) -> Endpoint | None:
         domain, number, kind = int(parts[1]), int(parts[4]), Kind(parts[5])
     except ValueError as error:
         raise ProtocolError(f"token {key[:200]!r}: {error}") from error
-    node = NodeName(domain, parts[2], parts[8], parts[7].replace("%", "/"))
+    node = NodeName(domain, parts[2], parts[8])
     topic, type_name = parts[9].replace("%", "/"), type_name_of(parts[10])
     return Endpoint(node, number, kind, topic, type_name, parts[11], parts[12])
 

@@ -14,7 +14,6 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from launch_scripts.gateways.ros2.rmw import NO_HASH
 from swarm.errors import ProtocolError
@@ -23,6 +22,8 @@ LARGEST_MESSAGE_BYTES = 1 << 24
 """What a peer sends is not even looked at beyond it. A grid of 4096 x 4096 cells has as many."""
 _DTYPES = {"byte": "uint8", "char": "uint8", "string": "object"}
 REQUEST, RESPONSE, _EVENT = "_Request", "_Response", "_Event"
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+_GID: Any = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
 
 
 class Distribution(StrEnum):
@@ -63,13 +64,15 @@ class RosTypes:
         self.distribution = distribution
         rolling = distribution is Distribution.ROLLING
         self._store = get_typestore(Stores.LATEST if rolling else Stores[f"ROS2_{distribution.upper()}"])
-        _hash_char_as_uint8(self._store)
         for name, text in _ADDED.items():
             if name not in self._store.fielddefs:
                 package, _, base = name.split("/")
                 as_message = f"{package}/msg/{base}"  # what rosbags makes of every name
                 self._store.register({name: get_types_from_msg(text, as_message)[as_message]})
-        if "service_msgs/msg/ServiceEventInfo" in self._store.fielddefs:  # but in Humble, which hashes nothing
+        if _EVENT_INFO in self._store.fielddefs:  # but in Humble, which hashes nothing
+            constants, fields = self._store.fielddefs[_EVENT_INFO]
+            told = [(field, _GID if field == "client_gid" else kind) for field, kind in fields]
+            self._store.fielddefs[_EVENT_INFO] = (constants, told)
             for name in _ADDED:
                 if name.endswith(RESPONSE):
                     self._link_service(name.removesuffix(RESPONSE))
@@ -80,8 +83,11 @@ class RosTypes:
         def at_most_one(part: str) -> Any:
             return Nodetype.SEQUENCE, ((Nodetype.NAME, name + part), 1)
 
-        info = (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")
-        event = [("info", info), ("request", at_most_one(REQUEST)), ("response", at_most_one(RESPONSE))]
+        event = [
+            ("info", (Nodetype.NAME, _EVENT_INFO)),
+            ("request", at_most_one(REQUEST)),
+            ("response", at_most_one(RESPONSE)),
+        ]
         self._store.register({name + _EVENT: ([], event)})
         parts = (("request_message", REQUEST), ("response_message", RESPONSE), ("event_message", _EVENT))
         self._store.register({name: ([], [(field, (Nodetype.NAME, name + part)) for field, part in parts])})
@@ -145,16 +151,3 @@ class RosTypes:
 def types_of(distribution: Distribution) -> RosTypes:
     """The types of a distribution, loaded once: it takes a sixth of a second."""
     return RosTypes(distribution)
-
-
-def _hash_char_as_uint8(store: Typestore) -> None:
-    def repaired(field: Any) -> Any:
-        node, (inner, bound) = field[0], field[1] if isinstance(field[1], tuple) else (field[1], 0)
-        if node is Nodetype.BASE and inner == "char":
-            return node, ("uint8", bound)
-        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            return node, (repaired(inner), bound)
-        return field
-
-    for name, (constants, fields) in list(store.fielddefs.items()):
-        store.fielddefs[name] = (constants, [(field, repaired(kind)) for field, kind in fields])

@@ -113,12 +113,6 @@ def test_a_vehicle_that_is_back_is_where_it_says_and_not_where_the_one_before_wa
     assert [each for each in world.run(0.5) if isinstance(each, Follow)] == [Follow("t0")]
 
 
-def test_one_that_flies_is_withdrawn_when_its_link_is_lost() -> None:
-    world = driving(Wishes("t0", altitude_m=30.0), Autopilot(type=COPTER))
-    world.speaks = False
-    assert Withdraw() in world.run(8.0)
-
-
 def test_without_positions_the_vehicle_is_as_lost_as_without_heartbeats() -> None:
     world = driving(MISSION)
     world.speaks = False
@@ -164,6 +158,8 @@ def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
 def test_a_mission_has_the_turns_of_the_route_and_home_before_them_for_ardupilot() -> None:
     world = driving(MISSION)
     (mission,) = world.vehicle.missions
+    (of_px4,) = driving(MISSION, Autopilot(PX4)).vehicle.missions
+    assert places(of_px4) == places(mission)[1:], "PX4 has no home in its missions"
     assert [item.command for item in mission] == [codec.NAV_WAYPOINT] * 4
     assert places(mission) == [START, START + 1, GRID.cell(40, 39), GRID.cell(21, 39)]
     assert [item.current for item in mission] == [False, True, False, False]
@@ -171,13 +167,6 @@ def test_a_mission_has_the_turns_of_the_route_and_home_before_them_for_ardupilot
     assert of(world, codec.MissionCurrent) == [codec.MissionCurrent(1)]
     assert world.vehicle.mode == MANUAL
     assert not world.vehicle.armed
-
-
-def test_px4_has_no_home_in_its_missions() -> None:
-    world = driving(MISSION, Autopilot(PX4))
-    (mission,) = world.vehicle.missions
-    assert places(mission) == [START + 1, GRID.cell(40, 39), GRID.cell(21, 39)]
-    assert of(world, codec.MissionCurrent) == [codec.MissionCurrent(0)]
 
 
 def test_what_flies_takes_off_first_and_stays_at_the_end() -> None:
@@ -247,14 +236,6 @@ def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_anew() -> None:
     vehicle.answers = True
     world.run(8.0)
     assert len(vehicle.missions) == 1
-
-
-def test_a_newer_route_waits_until_the_mission_in_flight_has_ended() -> None:
-    world = driving(MISSION, Autopilot(answers=False), seconds=0.1)
-    for number in range(7):
-        world.adapter.hear_way([TO_THE_EAST, WITH_A_TURN][number % 2])
-        world.run(1.0)
-    assert {each.items for each in of(world, codec.MissionCount)} == {4}  # type: ignore[attr-defined]
 
 
 def test_a_refused_mission_says_the_result() -> None:
@@ -418,12 +399,6 @@ def test_a_copter_in_guided_takes_off_once() -> None:
     assert {each.height_m for each in of(world, codec.Setpoint)} == {30.0}  # type: ignore[attr-defined]
 
 
-def test_the_last_words_stop_what_is_driven() -> None:
-    world = driving(Wishes("t0", arm=True), Autopilot(PX4), seconds=10.0)
-    last = world.adapter.stop(world.now_ns)
-    assert any(isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE for each in last)
-
-
 # --- waypoints ---------------------------------------------------------------------------------------------------
 
 cells = st.integers(0, GRID.cells - 1)
@@ -456,10 +431,3 @@ def off(point: tuple[float, float], a: tuple[float, float], b: tuple[float, floa
     along = 0.0 if not long else sum((p - q) * (r - q) for p, q, r in zip(point, a, b, strict=True)) / long**2
     share = min(1.0, max(0.0, along))
     return math.dist(point, [q + share * (r - q) for q, r in zip(a, b, strict=True)])
-
-
-def test_asked_before_anything_was_offered_nothing_is_said() -> None:
-    world = World(MISSION)
-    world.hear(codec.ItemAsked(0))
-    world.run(1.0)
-    assert not of(world, codec.MissionItem)

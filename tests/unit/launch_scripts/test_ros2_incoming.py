@@ -37,7 +37,7 @@ from launch_scripts.gateways.ros2.incoming.readings import (
     robot_place,
 )
 from launch_scripts.gateways.ros2.incoming.work_queue import Input, WorkQueue
-from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, packed_path, quaternion_of
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError, SwarmError
@@ -367,6 +367,7 @@ def test_a_robot_is_found_by_its_topic(topic: str, robot: str | None) -> None:
 
 def test_a_response_of_getplan_has_the_bytes_of_its_path() -> None:
     points = [GRID.centre_m(cell) for cell in (3, 4, 21, 22)]
-    plan = path(RosMessages(TYPES, MAP), 7, points)
+    messages = RosMessages(TYPES, MAP)
+    plan = path(messages, 7, points)
     response = TYPES.make("nav_msgs/srv/GetPlan_Response", plan=plan)
-    assert TYPES.pack(response, "nav_msgs/srv/GetPlan_Response") == packed_path(MAP, 7, points)
+    assert TYPES.pack(response, "nav_msgs/srv/GetPlan_Response") == messages.path(7, points)

@@ -188,13 +188,6 @@ def test_occupancy_is_what_is_lost_of_the_best_speed(pace: np.ndarray[Any, Any],
     assert (np.diff(occupancy[finite][order].astype(int)) >= 0).all()
 
 
-def test_occupancy_is_refused_for_another_grid() -> None:
-    with pytest.raises(ValueError, match="not those of 4 x 6 cells"):
-        map_messages.occupancy_grid(maker(), STAMP_NS, np.zeros((6, 4), np.int8))
-    with pytest.raises(ValueError, match="do not fill"):
-        map_messages.occupancy_update(maker(), STAMP_NS, np.zeros((1, 1), np.int8), Window(0, 0, 1, 2))
-
-
 # --- markers ------------------------------------------------------------------------------------------------------
 
 LINE_M = np.array([[500_000.0, 5_200_000.0], [500_025.0, 5_199_975.0]])

@@ -15,7 +15,7 @@ from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
 from launch_scripts.gateways.ros2.incoming.readings import FrameReader, Place, Track
 from launch_scripts.gateways.ros2.incoming.work_queue import Input
 from launch_scripts.gateways.ros2.rmw import Qos
-from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages, packed_path
+from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher
 from launch_scripts.gateways.ros2.topic_table import POSE_TYPES, ROBOT
 from swarm.client import BusError, ConfigError, Route, Stream, Swarm, SwarmError, Vehicle
@@ -238,7 +238,7 @@ def path_of(messages: RosMessages, stamp_ns: int, route: Route | str) -> bytes:
     """CDR of a nav_msgs/Path of a route; without poses where there is none, or a reason why. A response of GetPlan,
     which is nothing but a path, has the same bytes."""
     points = () if isinstance(route, str) or not (route.ok or route.searching) else route.points_m
-    return packed_path(messages.map, stamp_ns, points)
+    return messages.path(stamp_ns, points)
 
 
 def certificate_of(messages: RosMessages, stamp_ns: int, robot: str, route: Route | str) -> Any:
