@@ -222,7 +222,8 @@ def test_whoever_takes_the_wheel_from_us_keeps_it(
         drives = armed and (mode is None or at == mode)
         drove = drove or drives
         foreign = drove and not drives and not (armed and held and at == hold)
-        command = wheel.drive(beat, height_m, now_ns) if wish == "drive" else wheel.hold(beat, now_ns)
+        said = wheel.drive(beat, height_m, now_ns) if wish == "drive" else wheel.hold(beat, now_ns)
+        command = said[0] if said else None
         held = held or (command is not None and wish == "hold")
         assert not (foreign and command is not None), "somebody else has set this mode"
         taken_away = taken_away or (foreign and bool(wheel.why))

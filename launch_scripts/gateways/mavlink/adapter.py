@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from msgspec import Struct
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.arming import Arming, Kind, kind_of
-from launch_scripts.gateways.mavlink.guidance import Missions, Setpoints, Way, Wishes, arming_of, flies, guide_of
+from launch_scripts.gateways.mavlink.guidance import (
+    Guide,
+    Missions,
+    Way,
+    Wishes,
+    arming_of,
+    flies,
+    guide_of,
+)
 from swarm.client import ConfigError, Frame
 from swarm.client.frame import Point
 from swarm.clock import NS_PER_S
@@ -70,25 +80,24 @@ class Adapter:
         self._frame = frame
         self._wishes = wishes
         self._beat: codec.Beat | None = None
-        self._position: codec.Position | None = None
-        self._place: Point | None = None
-        """Of the newest position, in the terrain's frame; None outside of it."""
-        self._beat_ns = self._position_ns = 0
-        """When they were heard."""
+        self._at: tuple[codec.Position, Point] | None = None
+        """The newest position, and its place in the terrain's frame; None outside of it."""
+        self._beat_ns = 0
+        self._position_ns: int | None = None
+        """When a position was heard; None before, and again once the vehicle is gone."""
         self._there = False
         self._reported: codec.Position | None = None
         """The newest that was told to the swarm; None while the vehicle is nowhere for it."""
         self._way: Way = ()
         self._swarm_up = True
-        self._guide: Missions | Setpoints | None = None
+        self._guide: Guide | None = None
         """None: the vehicle is not driven."""
         self._arming: Arming | None = None
         """None: arming and modes are somebody else's."""
         self._tells: list[str] = []
         self._told: set[str] = set()
         """Sentences of this minute."""
-        self._minute_ends_ns = 0
-        self._beat_due_ns = self._report_due_ns = self._ask_due_ns = self._warn_due_ns = 0
+        self._beat_due_ns = self._report_due_ns = self._ask_due_ns = self._warn_due_ns = self._minute_ends_ns = 0
 
     # --- what comes -----------------------------------------------------------------------------------------------
 
@@ -99,15 +108,13 @@ class Adapter:
                 self._hear_beat(message, now_ns)
             case codec.Position():
                 self._hear_position(message, now_ns)
-            case codec.Warned(text=text):
-                if now_ns >= self._warn_due_ns:
-                    self._warn_due_ns = now_ns + _WARN_NS
-                    self._tells.append(f"the vehicle says: {text}")
+            case codec.Warned(text=text) if now_ns >= self._warn_due_ns:
+                self._warn_due_ns = now_ns + _WARN_NS
+                self._tells.append(f"the vehicle says: {text}")
             case codec.CommandAnswered() if self._arming is not None:
                 self._tells += self._arming.hear(message)
             case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, Missions):
-                if self._guide.upload is not None:
-                    self._guide.upload.hear(message)
+                self._guide.hear(message)
 
     def hear_way(self, way: Way) -> None:
         """Takes in a route to the target that is followed."""
@@ -116,9 +123,8 @@ class Adapter:
     def hear_swarm(self, up: bool) -> None:
         """Takes in whether the swarm can be heard."""
         if up != self._swarm_up:
-            self._tells.append(
-                "the swarm is back" if up else "the swarm is not heard: its routes are followed no more"
-            )
+            lost = "the swarm is not heard: its routes are followed no more"
+            self._tells.append("the swarm is back" if up else lost)
         self._swarm_up = up
 
     def _hear_beat(self, beat: codec.Beat, now_ns: int) -> None:
@@ -138,14 +144,11 @@ class Adapter:
         self._beat, self._beat_ns = beat, now_ns
 
     def _hear_position(self, position: codec.Position, now_ns: int) -> None:
-        try:
+        self._at, self._position_ns = None, now_ns
+        with suppress(ConfigError):  # it is outside the terrain
             place = self._frame.from_wgs84(position.lat_deg, position.lon_deg)
             self._frame.cell(*place)
-        except ConfigError:
-            self._place = None
-        else:
-            self._place = place
-        self._position, self._position_ns = position, now_ns
+            self._at = position, place
 
     # --- what is due ----------------------------------------------------------------------------------------------
 
@@ -155,62 +158,47 @@ class Adapter:
         if now_ns >= self._beat_due_ns:
             self._beat_due_ns = now_ns + BEAT_NS
             actions.append(codec.Heartbeat())
-        silent = self._position is None or now_ns - self._position_ns > NS_PER_S
+        silent = self._position_ns is None or now_ns - self._position_ns > NS_PER_S
         if self._beat is not None and silent and now_ns >= self._ask_due_ns:
             self._ask_due_ns = now_ns + _ASK_NS
             actions.append(codec.Command(codec.SET_MESSAGE_INTERVAL, (codec.GLOBAL_POSITION_INT, _POSITIONS_US)))
         actions += self._come_or_go(now_ns)
-        beat, position, place = self._beat, self._position, self._place
-        if self._there and beat is not None and position is not None and place is not None:
-            actions += self._report(position, place, now_ns)
-            if self._guide is not None:
-                actions += self._drive(self._guide, beat, position, place, now_ns)
+        if self._there:
+            actions += self._report(now_ns)
+            actions += self._drive(now_ns)
         return actions + self._news(now_ns)
 
     def stop(self, now_ns: int) -> list[Action]:
         """Returns the last words to the vehicle: it is to stop, as nobody avoids it any more."""
         self._swarm_up = False
-        if not self._there or self._guide is None or self._beat is None or self._position is None:
-            return []
-        return self._hold(self._guide, self._beat, self._position, now_ns, last=True)
+        return self._hold(now_ns, last=True) if self._there else []
 
-    def _drive(
-        self, guide: Missions | Setpoints, beat: codec.Beat, position: codec.Position, place: Point, now_ns: int
-    ) -> list[Action]:
+    def _drive(self, now_ns: int) -> list[Action]:
         """Returns what lets the vehicle follow the way, or hold where there is none."""
-        said: list[Action] = []
-        if self._way and self._swarm_up:
-            for each in guide.lead(self._way, position, place, now_ns):
-                if isinstance(each, str):
-                    self._tells.append(each)
-                else:
-                    said.append(each)
-            if self._arming is not None and guide.ready(now_ns):
-                command = self._arming.drive(beat, position.height_m, now_ns)
-                said += [] if command is None else [command]
+        if self._guide is None or self._beat is None or self._at is None:
+            return []
+        if not self._way or not self._swarm_up:
+            said = self._hold(now_ns)
         else:
-            said = self._hold(guide, beat, position, now_ns)
+            led = self._guide.lead(self._way, *self._at, now_ns)
+            self._tells += [each for each in led if isinstance(each, str)]
+            said = [each for each in led if not isinstance(each, str)]
+            if self._arming is not None and self._guide.ready(now_ns):
+                said += self._arming.drive(self._beat, self._at[0].height_m, now_ns)
         if self._arming is not None and self._arming.why:
-            why = self._arming.why
+            self._tells.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
             self._arming = None
-            self._tells.append(f"the vehicle's mode and motors are left alone from now on: {why}")
         return said
 
-    def _hold(
-        self,
-        guide: Missions | Setpoints,
-        beat: codec.Beat,
-        position: codec.Position,
-        now_ns: int,
-        *,
-        last: bool = False,
-    ) -> list[Action]:
+    def _hold(self, now_ns: int, *, last: bool = False) -> list[Action]:
         """Returns what lets the vehicle stay where it is, as far as that is ours.
 
         last  nothing is said after it
         """
-        command = self._arming.hold(beat, now_ns, last=last) if self._arming is not None else None
-        return [*guide.stay(position, now_ns), *([] if command is None else [command])]
+        if self._guide is None or self._beat is None or self._at is None:
+            return []
+        said: list[Action] = list(self._guide.stay(self._at[0], now_ns))
+        return said if self._arming is None else [*said, *self._arming.hold(self._beat, now_ns, last=last)]
 
     def _come_or_go(self, now_ns: int) -> list[Action]:
         why = self._why_gone(now_ns)
@@ -226,13 +214,13 @@ class Adapter:
             self._guide.forget()
             self._way = ()
             actions.append(Unfollow())
-        if self._place is None or (self.kind is not None and flies(self.kind, self._wishes.altitude_m)):
+        if self._at is None or (self.kind is not None and flies(self.kind, self._wishes.altitude_m)):
             actions.append(Withdraw())
-        elif self._position is not None:
+        else:
             # Where to it may have gone nobody knows.
-            actions.append(Report(*self._place, None, _speed(self._position)))
+            actions.append(Report(*self._at[1], None, _speed(self._at[0])))
         # It is back with a place of its own: another vehicle may be the next to speak, and be somewhere else.
-        self._position = self._reported = None
+        self._at = self._position_ns = self._reported = None
         return actions
 
     def _why_gone(self, now_ns: int) -> str:
@@ -240,13 +228,14 @@ class Adapter:
         lost_ns = int(self._wishes.lost_s * NS_PER_S)
         if self._beat is None or now_ns - self._beat_ns > lost_ns:
             return f"no heartbeat for {self._wishes.lost_s:g} s"
-        if self._position is None or now_ns - self._position_ns > lost_ns:
+        if self._position_ns is None or now_ns - self._position_ns > lost_ns:
             return f"no position for {self._wishes.lost_s:g} s"
-        return "" if self._place is not None else "it is outside the terrain"
+        return "" if self._at is not None else "it is outside the terrain"
 
-    def _report(self, position: codec.Position, place: Point, now_ns: int) -> list[Action]:
-        if position is self._reported or now_ns < self._report_due_ns:
+    def _report(self, now_ns: int) -> list[Action]:
+        if self._at is None or self._at[0] is self._reported or now_ns < self._report_due_ns:
             return []
+        position, place = self._at
         self._report_due_ns = now_ns + REPORT_NS
         first, self._reported = self._reported is None, position
         actions: list[Action] = [Report(*place, position.heading_rad, _speed(position))]
@@ -259,13 +248,11 @@ class Adapter:
         if now_ns >= self._minute_ends_ns:
             self._minute_ends_ns = now_ns + _SAY_AGAIN_NS
             self._told.clear()
-        sentences, self._tells = self._tells, []
-        told: list[Action] = []
-        for sentence in sentences:
-            if sentence not in self._told and len(self._told) < _MOST_SAID:
-                self._told.add(sentence)
-                told.append(Tell(sentence))
-        return told
+        new = [each for each in dict.fromkeys(self._tells) if each not in self._told]
+        told = new[: _MOST_SAID - len(self._told)]
+        self._told.update(told)
+        self._tells.clear()
+        return [Tell(each) for each in told]
 
 
 def _speed(position: codec.Position) -> float:

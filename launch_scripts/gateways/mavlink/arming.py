@@ -123,15 +123,15 @@ class Arming:
         """Sent since one had an effect."""
         self._due_ns = 0
 
-    def drive(self, beat: codec.Beat, height_m: float, now_ns: int) -> codec.Command | None:
-        """Returns the next command that brings it to driving; None if it drives, or none is due."""
+    def drive(self, beat: codec.Beat, height_m: float, now_ns: int) -> list[codec.Command]:
+        """Returns the next command that brings it to driving; none if it drives, or none is due."""
         self._check_taken(beat, now_ns)
         if self.why or now_ns < self._due_ns:
-            return None
+            return []
         self._holding = False
         return self._send(self._wanted(beat, height_m), now_ns)
 
-    def hold(self, beat: codec.Beat, now_ns: int, *, last: bool = False) -> codec.Command | None:
+    def hold(self, beat: codec.Beat, now_ns: int, *, last: bool = False) -> list[codec.Command]:
         """Returns the command that lets it stand, where it drives for us.
 
         last  it is said now, if it was said before or not
@@ -139,9 +139,9 @@ class Arming:
         self._check_taken(beat, now_ns)
         modes = self._kind.modes
         if self.why or not self._taken or modes is None or beat.mode != self.mode or self.mode == modes.hold:
-            return None
+            return []
         if self._holding and now_ns < self._due_ns and not last:
-            return None
+            return []
         self._holding = self._held = True
         return self._send(self._kind.set_mode(modes.hold), now_ns)
 
@@ -190,13 +190,13 @@ class Arming:
             return codec.Command(codec.MISSION_START)
         return None
 
-    def _send(self, command: codec.Command | None, now_ns: int) -> codec.Command | None:
+    def _send(self, command: codec.Command | None, now_ns: int) -> list[codec.Command]:
         if command is None:
             self._commands = 0
-            return None
+            return []
         if self._commands == MOST_COMMANDS:
             self.why = f"it has not obeyed {MOST_COMMANDS} commands"
-            return None
+            return []
         self._commands += 1
         self._due_ns = now_ns + AGAIN_NS
-        return command
+        return [command]

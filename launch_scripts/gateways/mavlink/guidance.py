@@ -1,8 +1,8 @@
 """The guidance of a vehicle along the swarm's routes, by missions or setpoints.
 
 A guide is chosen once by `guide_of`. It takes the newest route and the vehicle's place, and returns messages.
-Without a way that leads somewhere the vehicle holds, as far as that is ours: by setpoints it gets one where it is, or
-none any more. A mission is driven to its end, unless the vehicle's mode becomes hold.
+Without a way that leads somewhere the vehicle holds, as far as that is ours: by setpoints it gets one where it is,
+or none any more. A mission is driven to its end, unless the vehicle's mode becomes hold.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def flies(kind: Kind, altitude_m: float | None) -> bool:
     return altitude_m is not None if kind.flies is None else kind.flies
 
 
-def guide_of(kind: Kind, frame: Frame, wishes: Wishes) -> Missions | Setpoints | str:
+def guide_of(kind: Kind, frame: Frame, wishes: Wishes) -> Guide | str:
     """Returns what guides a kind of vehicle as it is wished, or why it cannot be driven: a sentence."""
     height_m = wishes.altitude_m if flies(kind, wishes.altitude_m) else None
     if flies(kind, wishes.altitude_m):
@@ -98,7 +98,7 @@ def arming_of(kind: Kind, wishes: Wishes) -> Arming | None:
     return Arming(kind, mode, starts=kind.make != PX4 and not guided, takeoff_m=takeoff_m)
 
 
-class Guide:
+class _Guide:
     """What missions and setpoints have in common.
 
     above     of MAVLink: the frame of `height_m`
@@ -130,7 +130,7 @@ class Upload:
         """When it is said (again); None: at once."""
         self._tries = self._asked = 0
 
-    def hear(self, message: codec.Incoming) -> None:
+    def hear(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
         """Takes in that the vehicle asks for an item, or answers to all."""
         if self.accepted or self.why:
             return
@@ -160,10 +160,10 @@ class Upload:
         return self._said
 
 
-class Missions(Guide):
+class Missions(_Guide):
     """Uploads the rest of a way as a mission, one at a time, whenever the way has changed."""
 
-    upload: Upload | None = None
+    _upload: Upload | None = None
     """The mission on its way to the vehicle."""
     _seen: Way = ()
     """The way that was uploaded."""
@@ -177,7 +177,12 @@ class Missions(Guide):
 
     def forget(self) -> None:
         """The link is lost: nobody knows what the vehicle has."""
-        self.upload, self._seen, self._accepted = None, (), False
+        self._upload, self._seen, self._accepted = None, (), False
+
+    def hear(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
+        """Takes in that the vehicle asks for an item, or answers."""
+        if self._upload is not None:
+            self._upload.hear(message)
 
     def ready(self, now_ns: int) -> bool:
         """Whether the vehicle may be brought into the mode in which it drives for us."""
@@ -185,24 +190,24 @@ class Missions(Guide):
 
     def stay(self, position: codec.Position, now_ns: int) -> Sequence[codec.Outgoing]:
         """Returns what is to be said now as there is no way any more."""
-        under_way = self.upload is not None
+        under_way = self._upload is not None
         self.forget()
         return [codec.MissionCancelled()] if under_way else []
 
     def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
         """Returns what is to be said now so that the vehicle follows a way, with sentences for people."""
-        if self.upload is None and now_ns >= self._due_ns and self._is_news(way, place):
+        if self._upload is None and now_ns >= self._due_ns and self._is_news(way, place):
             left = rest(way, place, self._frame.grid.resolution_m)
             self._seen, self._sent, self._cut = way, left[:MOST_POINTS], len(left) > MOST_POINTS
             self._due_ns = now_ns + _NEXT_NS
-            self.upload = Upload(self._items(position))
-        upload = self.upload
+            self._upload = Upload(self._items(position))
+        upload = self._upload
         if upload is None:
             return []
         said = upload.tick(now_ns)
         if not upload.accepted and not upload.why:
             return [] if said is None else [said]
-        self.upload = None
+        self._upload = None
         if upload.accepted:
             self._accepted = True
             return [codec.MissionCurrent(self._kind.first_item)]
@@ -233,7 +238,7 @@ class Missions(Guide):
 # --- setpoints ----------------------------------------------------------------------------------------------------
 
 
-class Setpoints(Guide):
+class Setpoints(_Guide):
     """Puts a setpoint at the next turn of the way, streamed where the autopilot wants a stream. Without a way the
     stream ends (PX4 leaves offboard by its own fail-safe), or the vehicle gets a setpoint where it is."""
 
@@ -275,6 +280,9 @@ class Setpoints(Guide):
         self._holds_left -= 1
         self._due_ns = now_ns + _REPEAT_NS
         return [codec.Setpoint(self._above, *self._hold_at, self._height_m)]
+
+
+Guide = Missions | Setpoints
 
 
 # --- the few points of a route that an autopilot gets -------------------------------------------------------------

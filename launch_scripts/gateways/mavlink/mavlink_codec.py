@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 from msgspec import Struct
@@ -169,14 +167,11 @@ class Wire:
     sysid   of the vehicle; None: the first autopilot that is heard
     key     32 bytes: what is said is signed, and what is not signed by it is not heard; None: no signatures
     now_s   Unix time, from which signatures count up
-
-    counts  of messages refused: unreadable, of_others, senseless
     """
 
     def __init__(self, sysid: int | None, key: bytes | None, now_s: float) -> None:
         self.vehicle = sysid
         """The system number of the vehicle, once it is known."""
-        self.counts: Counter[str] = Counter()
         self._common = pymavlink()
         self._sent = io.BytesIO()
         self._mav = _parser(self._common)(self._sent, srcSystem=SYSID, srcComponent=COMPID)
@@ -194,32 +189,19 @@ class Wire:
         try:
             found = self._mav.parse_buffer(data) or []
         except Exception:  # of a parser that meets any bytes
-            self.counts["unreadable"] += 1
             found, whole = [], True
         # pymavlink forgets what it has read only where a message ends with the bytes that came.
         left = self._mav.buf[self._mav.buf_index :]
         self._mav.buf = bytearray() if whole or len(left) > _LONGEST_REST else left
         self._mav.buf_index = 0
-        return [heard for each in found if (heard := self._checked(each)) is not None]
+        return [heard for each in found if self._is_vehicles(each) and (heard := _read(each)) is not None]
 
-    def _checked(self, message: Any) -> Incoming | None:
-        kind = message.get_type()
-        if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
-            self.counts["unreadable"] += 1
-        elif not self._is_vehicles(message, kind):
-            self.counts["of_others"] += 1
-        elif kind in _READ:
-            try:
-                return _READ[kind](message)
-            except ValueError:
-                self.counts["senseless"] += 1
-        return None
-
-    def _is_vehicles(self, message: Any, kind: str) -> bool:
+    def _is_vehicles(self, message: Any) -> bool:
         sysid = message.get_srcSystem()
         if message.get_srcComponent() != AUTOPILOT or sysid in (0, SYSID):
             return False
-        if self.vehicle is None and kind == "HEARTBEAT" and message.autopilot != _INVALID_AUTOPILOT:
+        beats = message.get_type() == "HEARTBEAT"
+        if self.vehicle is None and beats and message.autopilot != _INVALID_AUTOPILOT:
             self.vehicle = sysid
         return bool(sysid == self.vehicle)
 
@@ -277,61 +259,36 @@ def _degrees7(place: MissionItem | Setpoint) -> tuple[int, int]:
     return round(place.lat_deg * 1e7), round(place.lon_deg * 1e7)
 
 
-# --- what each message must be, or ValueError ---------------------------------------------------------------------
+def _read(message: Any) -> Incoming | None:
+    """Returns a message as the core has it; None of what makes no sense, is not to us, or is not heard."""
+    match message.get_type():
+        case "HEARTBEAT" if message.autopilot != _INVALID_AUTOPILOT:
+            return Beat(message.autopilot, message.type, bool(message.base_mode & _ARMED), message.custom_mode)
+        case "GLOBAL_POSITION_INT":
+            return _position(message)
+        case "MISSION_REQUEST_INT" | "MISSION_REQUEST" if _is_of_our_mission(message):
+            return ItemAsked(message.seq)
+        case "MISSION_ACK" if _is_of_our_mission(message):
+            return MissionAnswered(message.type)
+        case "COMMAND_ACK" if message.target_system in (0, SYSID):
+            return CommandAnswered(message.command, message.result)
+        case "STATUSTEXT" if message.severity <= _WARNING:
+            text = message.text if isinstance(message.text, str) else message.text.decode("ascii", "replace")
+            shown = "".join(letter for letter in text if " " <= letter <= "~").strip()
+            return Warned(shown) if shown else None
+    return None
 
 
-def _beat(message: Any) -> Beat:
-    _check(message.autopilot != _INVALID_AUTOPILOT)
-    return Beat(message.autopilot, message.type, bool(message.base_mode & _ARMED), message.custom_mode)
-
-
-def _position(message: Any) -> Position:
+def _position(message: Any) -> Position | None:
     lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
     # Without a fix autopilots say 0, 0.
-    _check(abs(lat_deg) <= 90 and abs(lon_deg) <= 180 and (message.lat, message.lon) != (0, 0))
+    if abs(lat_deg) > 90 or abs(lon_deg) > 180 or (message.lat, message.lon) == (0, 0):
+        return None
     heading_rad = None if message.hdg == _NOT_KNOWN else math.radians(message.hdg / 100 % 360)
     speed_m_per_s = math.hypot(message.vx, message.vy) / 100
     return Position(lat_deg, lon_deg, message.relative_alt / 1e3, speed_m_per_s, heading_rad)
 
 
-def _item_asked(message: Any) -> ItemAsked:
-    _check_mission(message)
-    return ItemAsked(message.seq)
-
-
-def _mission_answered(message: Any) -> MissionAnswered:
-    _check_mission(message)
-    return MissionAnswered(message.type)
-
-
-def _check_mission(message: Any) -> None:
+def _is_of_our_mission(message: Any) -> bool:
     """Another station may upload a mission on the same link, and fences and rally points are none of ours."""
-    _check((message.target_system, message.target_component, message.mission_type) == (SYSID, COMPID, 0))
-
-
-def _command_answered(message: Any) -> CommandAnswered:
-    _check(message.target_system in (0, SYSID))
-    return CommandAnswered(message.command, message.result)
-
-
-def _warned(message: Any) -> Warned:
-    text = message.text if isinstance(message.text, str) else message.text.decode("ascii", "replace")
-    shown = "".join(letter for letter in text if " " <= letter <= "~").strip()
-    _check(message.severity <= _WARNING and bool(shown))
-    return Warned(shown)
-
-
-def _check(good: bool) -> None:
-    if not good:
-        raise ValueError("makes no sense, or is not to us")
-
-
-_READ: dict[str, Callable[[Any], Incoming]] = {
-    "HEARTBEAT": _beat,
-    "GLOBAL_POSITION_INT": _position,
-    "MISSION_REQUEST_INT": _item_asked,
-    "MISSION_REQUEST": _item_asked,
-    "MISSION_ACK": _mission_answered,
-    "COMMAND_ACK": _command_answered,
-    "STATUSTEXT": _warned,
-}
+    return (message.target_system, message.target_component, message.mission_type) == (SYSID, COMPID, 0)

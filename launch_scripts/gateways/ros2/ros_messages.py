@@ -276,8 +276,8 @@ _MARKS = _STAMP.pack(*divmod(_MARK_NS, NS_PER_S)), struct.pack("<3d", *_MARK_M, 
 class PackedPlaces:
     """CDR of a message of which only stamps and places change, written into bytes made before.
 
-    It is for what is put at every tick for every vehicle, and for routes: for 100 vehicles this takes a tenth of
-    the time that objects take. rosbags packs the first message, with a mark in the place of each stamp and each pose;
+    It is for what is put at every tick for every vehicle, and for routes: for 100 vehicles this takes a tenth
+    of the time that objects take. rosbags packs the first message, with a mark in the place of each stamp and each pose;
     names and lengths stay, and so all stays where it was. Any thread may call `at`.
     """
 
