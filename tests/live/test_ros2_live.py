@@ -21,7 +21,7 @@ from support.ros_node import PeerNode
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
 from launch_scripts.gateways.ros2.rmw import Attachment, Qos
-from launch_scripts.gateways.ros2.ros_node import close_ros, open_ros
+from launch_scripts.gateways.ros2.ros_node import open_ros
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS, TABLE, Direction
 from launch_scripts.ports import free_ports
@@ -85,11 +85,8 @@ def running(gateway: Gateway) -> Iterator[Gateway]:
 @pytest.fixture
 def session(gateway: Gateway) -> Iterator[zenoh.Session]:
     """Of a node of ours at the ROS side's router."""
-    session = open_ros(gateway.endpoint)
-    try:
+    with open_ros(gateway.endpoint) as session:
         yield session
-    finally:
-        close_ros(session)
 
 
 @pytest.fixture(scope="module")
@@ -198,13 +195,10 @@ def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> 
 
 def poses_heard(port: int, within_s: float) -> None:
     """Waits until a node at this router hears where vehicles are."""
-    session = open_ros(f"tcp/127.0.0.1:{port}")
-    try:
+    with open_ros(f"tcp/127.0.0.1:{port}") as session:
         heard: list[object] = []
         PeerNode(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, heard.append)
         eventually(lambda: heard, within_s, "poses of vehicles")
-    finally:
-        close_ros(session)
 
 
 @contextmanager

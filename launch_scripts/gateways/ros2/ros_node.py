@@ -24,7 +24,6 @@ from swarm.errors import BusError, ProtocolError
 
 log = logging.getLogger(__name__)
 
-RosSession = zenoh.Session
 _HEARTBEAT_S = 0.5
 
 
@@ -243,9 +242,3 @@ def open_ros(endpoint: str, timeout_s: float = 10.0) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise BusError(f"no router of the ROS side answers at {endpoint}: {error}") from error
-
-
-def close_ros(session: RosSession) -> None:
-    """Close what `open_ros` has opened."""
-    close: Callable[[], object] = session.close
-    close()

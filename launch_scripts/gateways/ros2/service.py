@@ -18,7 +18,7 @@ from launch_scripts.gateways.ros2.incoming.incoming import Incoming
 from launch_scripts.gateways.ros2.map_feed import MapFeed, find_terrain
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap
-from launch_scripts.gateways.ros2.ros_node import Node, Publisher, RosSession, close_ros, open_ros
+from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client import Frame, Observer, Swarm, SwarmError
@@ -44,12 +44,14 @@ def serve(
     runs     folder of the runs of this machine, where the terrain may be
     say      is told what people should know, a sentence each
     """
-    ros = open_ros(settings.ros.endpoint)
-    try:
+    with open_ros(settings.ros.endpoint) as ros:
         swarm: Swarm | None = connect()
         while swarm is not None:
             with swarm, swarm.observer(every_s=_POSITIONS_S) as observer:
-                run = _Run(settings, ros, swarm, observer, runs, say)
+                node = Node(
+                    ros, settings.ros.node, types_of(Distribution(settings.ros.distribution)), settings.ros.domain
+                )
+                run = _Run(settings, node, swarm, observer, runs, say)
                 try:
                     while not stopping() and swarm.ended is None:
                         run.turn()
@@ -60,8 +62,6 @@ def serve(
             if ended is not None:
                 say(f"{ended}")
             swarm = _connect_again(connect, stopping)
-    finally:
-        close_ros(ros)
 
 
 def _connect_again(connect: Callable[[], Swarm], stopping: Callable[[], bool]) -> Swarm | None:
@@ -78,10 +78,9 @@ class _Run:
     """The gateway of one run. All is done on one thread."""
 
     def __init__(
-        self, settings: Settings, ros: RosSession, swarm: Swarm, observer: Observer, runs: Path, say: Say
+        self, settings: Settings, node: Node, swarm: Swarm, observer: Observer, runs: Path, say: Say
     ) -> None:
         side, grid = settings.ros, swarm.frame.grid
-        types = types_of(Distribution(side.distribution))
         map = RosMap(grid, settings.frames.map)
         forwards = {row.name for row in settings.rows()}
         folder = Path(settings.swarm.terrain) if settings.swarm.terrain else None
@@ -93,8 +92,8 @@ class _Run:
             )
         to_wgs84 = _to_wgs84(swarm.frame, say) if "fix" in forwards else None
         self._swarm, self._observer, self._say = swarm, observer, say
-        self._gateway = Gateway(settings, types, map, MapFeed(grid, terrain), to_wgs84)
-        self._node = Node(ros, side.node, types, side.domain)
+        self._gateway = Gateway(settings, node.types, map, MapFeed(grid, terrain), to_wgs84)
+        self._node = node
         self._incoming: Incoming | None = None
         self._publishers: dict[Channel, Publisher] = {}
         self._counts: Counter[str] = Counter()

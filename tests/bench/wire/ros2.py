@@ -57,15 +57,14 @@ def ros2(
 
     As a share of one core, and what a hearer of all topics gets meanwhile.
     """
-    from launch_scripts.gateways.ros2.ros_node import close_ros, open_ros
+    from launch_scripts.gateways.ros2.ros_node import open_ros
 
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     ros_side = NetworkConfig(namespace="ros", listen=(endpoint,), connect=(endpoint,))
     heard: Counter[str] = Counter()
     with Far() as far, open_bus(ros_side, mode="router"), tempfile.TemporaryDirectory() as folder:
         far.start(swarm_peer, vehicles, 2 * _START_S + seconds)
-        hearer = open_ros(endpoint)
-        try:
+        with open_ros(endpoint) as hearer:
             subscriber = hearer.declare_subscriber("0/**", lambda sample: heard.update([str(sample.key_expr)]))
             with _gateway(far.network.connect[0], endpoint, Path(folder)) as process:
                 time.sleep(_WARM_S)
@@ -77,8 +76,6 @@ def ros2(
                 spent_s = now.user + now.system - used.user - used.system
                 heard.subtract(before)
             del subscriber
-        finally:
-            close_ros(hearer)
     rows = Counter[str]()
     for key, times in heard.items():
         rows[key.split("/")[-3]] += times

@@ -17,7 +17,7 @@ from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_n
 from launch_scripts.gateways.ros2.ros_node import Node
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
 from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, ZONE
-from swarm.client import Swarm, Target, Vehicle
+from swarm.client import Swarm
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 
@@ -65,8 +65,6 @@ class Incoming:
         self._news: deque[tuple[Endpoint, bool]] = deque(maxlen=_MOST_NEWS)
         self._said: set[str] = set()
         """Robots that were said not to be taken in."""
-        self._guests: list[Vehicle | Target] = []
-        """Targets that ROS moves, and authors of its marks."""
         self._map_now, self._vehicles = map_now, vehicles
         self._taken: frozenset[str] = frozenset()
         """Names in ROS of vehicles that agents of the swarm have. What another gateway tells of one looks like a
@@ -79,9 +77,8 @@ class Incoming:
             *(self._zone_input(each) for each in settings.zones),
             *(self._grid_input(each) for each in settings.grids),
         ]
-        self._services: list[Endpoint] = []
         if map_now is not None:
-            self._serve(MAP_SERVER.topic, MAP_SERVER.type_name, lambda _, reply: self._asked.append(reply))
+            node.serve(MAP_SERVER.topic, MAP_SERVER.type_name, lambda _, reply: self._asked.append(reply))
         if settings.orders:
             for name in ("pause", "hold", "resume"):
                 self._serve_order(f"/swarm/{name}", resumes=name == "resume")
@@ -102,10 +99,6 @@ class Incoming:
         robots = self._robots.values()
         return {"robots": sum(each.present for each in robots), "refused": sum(each.refused for each in robots)}
 
-    @property
-    def _parts(self) -> list[Robot | Input]:
-        return [*self._robots.values(), *self._inputs]
-
     def tick(self, now_ns: int) -> None:
         """Takes in what has come.
 
@@ -116,8 +109,10 @@ class Incoming:
             self._taken = frozenset(ros_name(id) for id in self._vehicles() if agent_of(id) != id)
         for _ in range(len(self._news)):
             self._hear(*self._news.popleft())
-        for part in self._parts:
-            part.tick(now_ns)
+        for robot in self._robots.values():
+            robot.tick(now_ns)
+        for each in self._inputs:
+            each.tick(now_ns)
         if self._asked and self._map_now is not None:
             # All who ask get one map. Of more than _MOST_ASKED the oldest get none: their question ends so.
             response = self._node.types.make(f"{MAP_SERVER.type_name}_Response", map=self._map_now())
@@ -125,16 +120,9 @@ class Incoming:
                 self._asked.popleft()(response)
 
     def close(self) -> None:
-        """Takes away all that was declared. The connection and the node stay open."""
-        for service in self._services:
-            self._node.remove(service)
-        for part in self._parts:
-            part.close()
-        self._robots.clear()
+        """Answers what waits. All that was declared or told ends with the node and the connection."""
         self._routes.close()
         self._orders.close()
-        for guest in self._guests:
-            guest.leave()
 
     # --- robots ---------------------------------------------------------------------------------------------------
 
@@ -179,14 +167,10 @@ class Incoming:
 
     def _target_input(self, id: str) -> Input:
         """A person who clicks once in RViz puts a target somewhere: it stays there while the gateway lives."""
-        target: Target | None = None
+        target = self._swarm.target(id, tracker=TRACKER)
 
         def take(message: Any, _: int) -> None:
-            nonlocal target
             place = self._reader.pose(message.header, message.pose)
-            if target is None:
-                target = self._swarm.target(id, tracker=TRACKER)
-                self._guests.append(target)
             target.at(place.x_m, place.y_m)
 
         return Input(self._node, self._settings.set_pose_of(id), SET_POSE.type_name, 10.0, take)
@@ -211,15 +195,12 @@ class Incoming:
 
     def _grid_input(self, grid: GridSettings) -> Input:
         """Cells which the next grid does not close are again as the map had them."""
-        author: Vehicle | None = None
+        author = self._swarm.vehicle(grid.name)  # it has no place: it only marks
         closed: set[int] = set()
 
         def take(message: Any, _: int) -> None:
-            nonlocal author, closed
+            nonlocal closed
             cells = set(closed_cells(self._map, message, grid.occupied))
-            if author is None:  # it has no place: it only marks
-                author = self._swarm.vehicle(grid.name)
-                self._guests.append(author)
             if opened := closed - cells:
                 author.mark(sorted(opened), clear=True)
             if new := cells if grid.for_s is not None else cells - closed:
@@ -232,9 +213,6 @@ class Incoming:
         )  # fmt: skip
 
     # --- services -------------------------------------------------------------------------------------------------
-
-    def _serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> None:
-        self._services.append(self._node.serve(name, type_name, answer))
 
     def _serve_order(self, name: str, *, resumes: bool) -> None:
         """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""
@@ -252,4 +230,4 @@ class Incoming:
             if not self._orders.give(name, give, lambda why: respond(False, why)):
                 respond(False, "too many orders wait already")
 
-        self._serve(name, _TRIGGER, answer)
+        self._node.serve(name, _TRIGGER, answer)

@@ -93,12 +93,8 @@ class PlaceRoutes:
         self.to_target(lent, start, vehicle_class, give_back, self._swarm.frame.cell(goal.x_m, goal.y_m))
 
     def close(self) -> None:
-        """Answers what waits, and lets all targets go."""
+        """Answers what waits."""
         self._queue.close()
-        with self._lock:
-            targets, self._targets = list(self._targets.values()), {}
-        for target in targets:
-            target.leave()
 
     def _find(self, target: str, cell: int | None, start: Place, vehicle_class: str) -> Route | str:
         """Waits for its planner. Raises SwarmError."""
