@@ -276,9 +276,9 @@ _MARKS = _STAMP.pack(*divmod(_MARK_NS, NS_PER_S)), struct.pack("<3d", *_MARK_M, 
 class PackedPlaces:
     """CDR of a message of which only stamps and places change, written into bytes made before.
 
-    It is for what is put at every tick for every vehicle, and for routes. For 100 vehicles this takes a tenth of
-    the time that objects take. rosbags packs the first message, with a mark in the place of each stamp and each pose.
-    Names and lengths stay, and so all stays where it was. Any thread may call `at`.
+    It is for what is put at every tick for every vehicle, and for routes: objects take ten times as long for 100
+    vehicles. rosbags packs the first message, with a mark in the place of each stamp and each pose. Names and
+    lengths stay, and so all stays where it was. Any thread may call `at`.
     """
 
     def __init__(self, messages: RosMessages, message: Any, type_name: str) -> None:

@@ -299,16 +299,6 @@ def test_tcp_connects_again_when_its_peer_has_gone_and_is_back() -> None:
     link.write(b"closed")
 
 
-@pytest.mark.network
-def test_tcp_to_nobody_waits_and_says_nothing() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    with opened(f"tcp:127.0.0.1:{port}") as link:
-        for _ in range(5):
-            link.write(b"anybody?")
-            assert link.read(0.01) is None
-
-
 def test_a_serial_port_is_read_and_written() -> None:
     pytest.importorskip("serial", reason="pyserial is not installed")
     ours, theirs = os.openpty()

@@ -274,16 +274,6 @@ def test_targets_that_nobody_tracks_are_not_told() -> None:
     assert "nobody tracks t1" in [each.message for each in diagnostics.status]
 
 
-def test_of_two_targets_whose_names_become_one_the_first_is_told_and_the_other_said_once() -> None:
-    core = gateway()
-    seen = {id: SeenTarget(id, 300_010.0, 5_199_610.0, 0, None, False) for id in ("t-1", "t_1")}
-    for step in range(4):
-        vehicles = {} if step == 2 else {"a": vehicle("a")}
-        actions = told(core, World(vehicles, seen), step)
-        assert len(puts(actions, "target_pose")) == 1
-    assert core.take_problems() == ["target t_1 is not told to ROS: t-1 is called t_1, too"]
-
-
 def test_what_is_not_listed_is_not_forwarded() -> None:
     core = gateway('forward = ["poses"]\n[topics.poses]\ntopic = "/fleet"\nhz = 1')
     actions = told(core, World({"a": vehicle("a")}), 0.0)

@@ -353,10 +353,6 @@ def test_settings_that_contradict_themselves_get_a_sentence(settings: IncomingSe
     assert says in str(error.value)
 
 
-def test_good_settings_pass() -> None:
-    check_incoming(IncomingSettings(robots=(Robots(), Robots(id="spot", topic="/odometry", plan="/plan"))))
-
-
 @pytest.mark.parametrize(
     ("topic", "robot"),
     [("/uav1/odom", "uav1"), ("/a/b/odom", None), ("//odom", None), ("/1a/odom", None), ("/uav1/odom/x", None)],

@@ -258,20 +258,9 @@ def every_message(messages: RosMessages) -> list[Any]:
 def test_every_message_is_read_as_it_was_made(distribution: Distribution) -> None:
     messages = maker(distribution=distribution)
     for made in every_message(messages):
-        assert plain(as_sent(messages, made)) == plain(made)
+        name = str(made.__msgtype__)
+        assert messages.types.pack(as_sent(messages, made), name) == messages.types.pack(made, name)
         assert messages.types.definition_of(made.__msgtype__)
-
-
-def plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, list):
-        return [plain(each) for each in value]
-    if getattr(value, "__msgtype__", "") == "std_msgs/msg/ColorRGBA":
-        return [float(np.float32(getattr(value, name))) for name in "rgba"]  # its fields have 32 bits
-    if hasattr(value, "__msgtype__"):
-        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__ if name != "__msgtype__"}
-    return "NaN" if isinstance(value, float) and math.isnan(value) else value
 
 
 def test_frames_twists_and_places_are_those_of_rep_103_and_105() -> None:
@@ -291,9 +280,6 @@ def test_frames_twists_and_places_are_those_of_rep_103_and_105() -> None:
     assert (base.header.frame_id, base.child_frame_id) == FRAMES
     assert (base.transform.translation.x, base.transform.translation.y) == (10, 20)
     assert base.transform.rotation.z == pytest.approx(math.sqrt(0.5))
-    way = path(messages, STAMP_NS, [(x_m, y_m), (x_m, y_m + 5), (x_m + 5, y_m + 5)])
-    yaws = [2 * math.atan2(each.pose.orientation.z, each.pose.orientation.w) for each in way.poses]
-    assert yaws == pytest.approx([math.pi / 2, 0, 0], abs=1e-12)
 
 
 def test_what_a_message_is_not_given_is_nothing_and_a_field_that_it_has_not_is_refused() -> None:
