@@ -179,8 +179,6 @@ class Gateway:
         """Windows that have changed since markers were put last."""
         self._changed: list[Window] = []
         """Windows that have changed since the map or its updates were put last."""
-        self._whole = False
-        """The whole map is to be put."""
         self._due_ns = dict.fromkeys(self._rows, 0)
         """When each row is told again, by the clock that never leaps."""
         always = tuple(self._channel(row.name) for row in self._rows.values() if row.per is None)
@@ -229,7 +227,9 @@ class Gateway:
                 moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
         if due & {"map", "map_updates", "markers"}:
             self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
-            self._take_changes(now_ns, whole="map" in due)
+            self._fresh += (changed := self._feed.take_changes())
+            if "map_updates" in self._rows:
+                self._changed = merged(changed, self._changed)
         for name, tell in self._tellers.items():
             if name in due:
                 self._due_ns[name] = _next_ns(self._rows[name], now_ns)
@@ -356,15 +356,9 @@ class Gateway:
 
     # --- the map --------------------------------------------------------------------------------------------------
 
-    def _take_changes(self, now_ns: int, *, whole: bool) -> None:
-        changed = self._feed.change(now_ns, whole=whole)
-        self._whole = changed is None
-        self._fresh += changed or []
-        if "map_updates" in self._rows:
-            self._changed = [] if changed is None else merged(changed, self._changed)
-
     def _tell_map(self, now: _Now) -> _Told:
-        if self._whole:
+        if self._feed.whole_is_due(now.now_ns):
+            self._changed = []
             yield None, self.whole_map(now.stamp_ns)
 
     def _tell_updates(self, now: _Now) -> _Told:

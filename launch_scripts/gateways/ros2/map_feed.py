@@ -56,7 +56,7 @@ class MapFeed:
         passable = self._map.pace_s_per_m[np.isfinite(self._map.pace_s_per_m)]
         self._best_s_per_m = float(passable.min()) if len(passable) else QUICK_S_PER_M
         self._told_ns: int | None = None
-        self._changed_cells = 0
+        self._changed = False
         """Since the whole map was told last, at `_told_ns`."""
         self._marked: dict[int, tuple[_Cells, _Cells, _Cells]] = {}
         """Tile -> cells of it that are marked as lethal, and with a pace, and those of zones."""
@@ -91,20 +91,21 @@ class MapFeed:
                     grid_cells(self.grid, corner, drawn),
                 )
 
-    def change(self, now_ns: int, *, whole: bool) -> list[Window] | None:
-        """Returns the windows that have changed since the last call, or None if the whole map is to be told: at
-        first, and when that is due.
+    def take_changes(self) -> list[Window]:
+        """Returns the windows that have changed since the last call."""
+        windows = self._map.take_dirty()
+        self._changed |= bool(windows)
+        return windows
+
+    def whole_is_due(self, now_ns: int) -> bool:
+        """Whether the whole map is to be told now; then it is told.
 
         now_ns  by a clock that never leaps
-        whole   the whole map may be told now
         """
-        windows = self._map.take_dirty()
-        self._changed_cells += sum(each.cells for each in windows)
-        due = self._told_ns is None or (self._changed_cells and now_ns - self._told_ns >= self._whole_ns)
-        if not (whole and due):
-            return windows
-        self._told_ns, self._changed_cells = now_ns, 0
-        return None
+        due = self._told_ns is None or (self._changed and now_ns - self._told_ns >= self._whole_ns)
+        if due:
+            self._told_ns, self._changed = now_ns, False
+        return due
 
     def occupancy(self, window: Window) -> Occupancy:
         """int8 (rows, cols) of a window, row 0 in the north, as `occupancy_of` has it."""

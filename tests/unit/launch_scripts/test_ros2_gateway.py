@@ -350,7 +350,7 @@ def test_zones_and_marks_are_drawn_until_they_are_gone() -> None:
     closed = zone.state([0, 1, 70], MarkKind.LETHAL, 0.0, BEGAN_NS, BEGAN_NS + 2 * NS_PER_S)
     (array,) = puts(told(core, World(sets=closed), 0.0), "markers")
     drawn = {each.ns: each for each in array.markers if each.action == 0}
-    assert set(drawn) == {"zones"}
+    assert set(drawn) == {"zones", "windows"}
     assert len(drawn["zones"].points) == 3
     left = [puts(told(core, World(), at_s), "markers")[0].markers for at_s in range(1, 14)]
     assert [each.ns for each in left[0] if each.action == 0] == ["zones"]

@@ -193,9 +193,9 @@ class Robot:
             self._put(self._goal_out, pose)
 
     def _put_plan(self, found: Route | str) -> None:
-        stamp_ns = time.time_ns()
-        self._put(self._plan, path_of(self._messages, stamp_ns, found))
-        self._put(self._certificate, certificate_of(self._messages, stamp_ns, self.id, found))
+        path, certificate = plan_of(self._messages, self.id, found)
+        self._put(self._plan, path)
+        self._put(self._certificate, certificate)
 
     def _put(self, publisher: Publisher, message: Any) -> None:
         """What a lost link does not take is lost."""
@@ -208,9 +208,8 @@ class Robot:
         """On a thread of ROS: never waits, always replies."""
 
         def answer(found: Route | str) -> None:
-            stamp_ns = time.time_ns()
-            reply(path_of(self._messages, stamp_ns, found))
-            certificate = certificate_of(self._messages, stamp_ns, self.id, found)
+            path, certificate = plan_of(self._messages, self.id, found)
+            reply(path)
             self._posted.append(lambda: self._put(self._certificate, certificate))
 
         what = "start"
@@ -234,18 +233,18 @@ class Robot:
         return place
 
 
-def path_of(messages: RosMessages, stamp_ns: int, route: Route | str) -> bytes:
-    """CDR of a nav_msgs/Path of a route; without poses where there is none, or a reason why. A response of GetPlan,
-    which is nothing but a path, has the same bytes."""
+def plan_of(messages: RosMessages, robot: str, route: Route | str) -> tuple[bytes, Any]:
+    """A route, or a reason why there is none, as two messages of one stamp.
+
+    Returns CDR of a nav_msgs/Path, without poses where there is no route; a response of GetPlan, which is nothing
+    but a path, has the same bytes. And a diagnostic_msgs/DiagnosticStatus: what it takes, and what no route is below.
+    """
+    stamp_ns = time.time_ns()
     points = () if isinstance(route, str) or not (route.ok or route.searching) else route.points_m
-    return messages.path(stamp_ns, points)
-
-
-def certificate_of(messages: RosMessages, stamp_ns: int, robot: str, route: Route | str) -> Any:
-    """diagnostic_msgs/DiagnosticStatus of the path with this stamp: what it takes, and what no route is below."""
+    path = messages.path(stamp_ns, points)
     name, stamp = f"plan of {robot}", f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d}"
     if isinstance(route, str):
-        return messages.diagnostic(name, Level.ERROR, route, {"plan_stamp_s": stamp})
+        return path, messages.diagnostic(name, Level.ERROR, route, {"plan_stamp_s": stamp})
     gap = route.cost_s / route.lower_bound_s if 0 < route.lower_bound_s < math.inf else 1.0
     values = {
         "plan_stamp_s": stamp,
@@ -255,7 +254,7 @@ def certificate_of(messages: RosMessages, stamp_ns: int, robot: str, route: Rout
         "cost_over_lower_bound": f"{gap:.6g}" if route.ok else "",
         "remaining_s": f"{route.remaining_s:.6g}",
     }
-    return messages.diagnostic(name, Level.OK if route.ok else Level.WARN, route.status, values)
+    return path, messages.diagnostic(name, Level.OK if route.ok else Level.WARN, route.status, values)
 
 
 def _target_frame(message: Any) -> str | None:
