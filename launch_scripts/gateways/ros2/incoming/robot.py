@@ -236,8 +236,9 @@ class Robot:
 def plan_of(messages: RosMessages, robot: str, route: Route | str) -> tuple[bytes, Any]:
     """A route, or a reason why there is none, as two messages of one stamp.
 
-    Returns CDR of a nav_msgs/Path, without poses where there is no route; a response of GetPlan, which is nothing
-    but a path, has the same bytes. And a diagnostic_msgs/DiagnosticStatus: what it takes, and what no route is below.
+    Returns CDR of a nav_msgs/Path, without poses where there is no route. A response of GetPlan, which is nothing
+    but a path, has the same bytes. The other is a diagnostic_msgs/DiagnosticStatus: what the route takes, and what
+    no route is below.
     """
     stamp_ns = time.time_ns()
     points = () if isinstance(route, str) or not (route.ok or route.searching) else route.points_m
