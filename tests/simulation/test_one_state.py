@@ -182,11 +182,11 @@ class Watched:
 
     def draw_all(self, now_ns: int) -> None:
         """One frame in which nothing waits for the next, the figures first."""
-        self.monitor._figures_due_ns = 0
+        self.monitor._limit.all_due()
         self.monitor.tick(now_ns)
         movers = self.monitor._movers
         for limit in (movers._vehicles._limit, movers._limit):
-            limit._next_ns = dict.fromkeys(limit._next_ns, 0)
+            limit.all_due()
         movers._fleets_new = True
         self.monitor.tick(now_ns)
 
