@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import time
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,7 +21,7 @@ from launch_scripts.commands.shared_options import (
     TargetId,
     VehicleClass,
 )
-from swarm.errors import BusError, ConfigError
+from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
     from launch_scripts.commands.status_view import Status
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from swarm.config.scenario import NetworkConfig
 
 app = typer.Typer()
-_STATUS_LISTEN_S, _STATUS_MOST_S = 1.5, 4.0
-"""`swarm status` listens for so long; longer while a process that has answered has not said how it is."""
 _TURN_S = 0.1
 
 
@@ -115,34 +113,13 @@ def status(where: Where, as_json: AsJson = False) -> None:
     """
     from rich.console import Console
 
-    from launch_scripts.commands.status_view import print_status, status_fields
+    from launch_scripts.commands.status_view import ask_status, print_status, status_fields
 
-    told = _ask_status(where)
+    told = ask_status(where)
     if as_json:
         typer.echo(json.dumps(status_fields(told), indent=2))
     else:
         print_status(told, Console(markup=False))
-
-
-def _ask_status(where: Where) -> Status:
-    """A running swarm as it is now. Raises BusError if nobody answers."""
-    from launch_scripts.commands.status_view import status_of
-    from launch_scripts.observe.run_observer import OutsideObserver
-    from swarm.clock import MonotonicClock
-
-    clock = MonotonicClock()
-    with where.bus() as bus:
-        observer = OutsideObserver(bus)
-        began_s = time.monotonic()
-        while (spent_s := time.monotonic() - began_s) < _STATUS_MOST_S:
-            if spent_s >= _STATUS_LISTEN_S and observer.whole:
-                break
-            observer.listen(clock, 0.1)
-        told = status_of(observer, clock.now_ns())
-    if told is None:
-        admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
-        raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
-    return told
 
 
 @command(app, ASK)
@@ -167,7 +144,7 @@ def top(
     """
     from launch_scripts.commands.status_view import show_top
 
-    show_top(where.network(), where, each=each, once=once, as_json=as_json)
+    show_top(where, each=each, once=once, as_json=as_json)
 
 
 @command(app, ASK)
@@ -186,17 +163,16 @@ def health(where: Where, url: str | None = None, live: bool = False, as_json: As
     url   Ask the machine whose figures or health are served there, such as http://127.0.0.1:9464.
     live  With --url: whether its processes live, not whether they are ready.
     """
+    from launch_scripts.commands.status_view import ask_status
     from launch_scripts.web.health_probe import ask
 
     if url is None and live:
         raise ConfigError("--live goes with --url: of a whole swarm it is asked whether it is ready")
-    if url is not None and (
-        where.connect or where.run or where.namespace or where.tls_ca or where.tls_cert or where.tls_key
-    ):
+    if url is not None and replace(where, runs=Where.runs) != Where():
         raise ConfigError(
             "--url asks one machine without TLS; what says how a whole swarm is reached goes without it"
         )
-    answer = swarm_answer(_ask_status(where)) if url is None else ask(url, live=live)
+    answer = swarm_answer(ask_status(where)) if url is None else ask(url, live=live)
     return answer.show(as_json=as_json)
 
 

@@ -122,26 +122,15 @@ def _asked(path: Path, choices: Choices, ask: Callable[..., Any] = typer.prompt)
     for name, (_, question) in _ASKED.items():
         default = getattr(_DEFAULTS, name)
         while getattr(choices, name) is None and not (name == "photo" and choices.terrain in BUILT_IN_TERRAINS):
-            answer = ask(question, default=str(default), err=True, show_default=default != "")
+            answer = ask(question, default=default, type=type(default), err=True, show_default=default != "")
+            answered = replace(choices, **{name: answer})
             try:
-                answered = replace(choices, **{name: _read(answer, type(default))})
                 _check_choices(path, answered)
             except ConfigError as error:
                 typer.echo(f"  {error}", err=True)
                 continue
             choices = answered
     return choices
-
-
-def _read(answer: object, kind: type[Any]) -> Any:
-    """What somebody typed, as text or number. Raises ConfigError."""
-    from swarm.config.explain import expected
-    from swarm.config.input_files import quoted
-
-    try:
-        return kind(answer)
-    except ValueError as error:
-        raise ConfigError(f"found {quoted(answer)}, expected {expected(kind)}") from error
 
 
 def _check_choices(path: Path, choices: Choices) -> None:
@@ -237,10 +226,10 @@ def check(
         ]
     found.sort(key=lambda finding: finding.level != "failure")  # failures stand before warnings
     if as_json:
-        typer.echo(json.dumps({"scenario": str(path), **as_fields(found), **facts}, indent=2))
-    else:
-        _print(str(path), found, facts)
-    return int(any(finding.level == "failure" for finding in found))
+        told = {"scenario": str(path), **as_fields(found), **facts}
+        typer.echo(json.dumps(told, indent=2))
+        return int(not told["ok"])
+    return _print(found, _summary(path, found, facts) if facts else "")
 
 
 def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -301,27 +290,36 @@ def _facts(scenario: Scenario, terrain: Terrain, wanted: Needs, here: Machine) -
     }
 
 
-def _print(path: str, found: list[Finding], facts: dict[str, Any]) -> None:
+def _print(found: list[Finding], summary: str = "") -> int:
+    """Prints a line for each finding, and a last one: how many are wrong, or `summary` where none is a failure.
+    Returns the exit code."""
     from rich.console import Console
     from rich.text import Text
 
     from launch_scripts.check.findings import STYLES, counted
-    from swarm.config.input_files import size
 
-    console = Console(soft_wrap=True)
+    console = Console(soft_wrap=True, highlight=False)
     for finding in found:
         console.print(Text.assemble((f"{finding.level}: ", STYLES[finding.level]), finding.sentence))
-    if any(finding.level == "failure" for finding in found):
-        if len(found) > 1:
-            console.print(f"{counted(found, 'failure')}, {counted(found, 'warning')}", highlight=False)
-        return
-    console.print(
+    failed = any(finding.level == "failure" for finding in found)
+    if summary and not failed:
+        console.print(summary)
+    elif len(found) > 1:
+        console.print(f"{counted(found, 'failure')}, {counted(found, 'warning')}")
+    return int(failed)
+
+
+def _summary(path: Path, found: list[Finding], facts: dict[str, Any]) -> str:
+    """What is told of a scenario that can run."""
+    from launch_scripts.check.findings import counted
+    from swarm.config.input_files import size
+
+    return (
         f"{path} can run, {counted(found, 'warning')}: vehicles {facts['vehicles']:,},"
         f" targets {facts['targets']:,}, processes {facts['processes']}, {facts['seconds']:g} s;"
         f" {facts['rows']} x {facts['cols']} cells of {facts['resolution_m']:g} m,"
         f" {facts['passable_share']:.0%} passable; about {facts['estimated_cores']:.1f} of {facts['cores']} cores"
-        f" and {size(facts['estimated_memory_bytes'])}",
-        highlight=False,
+        f" and {size(facts['estimated_memory_bytes'])}"
     )
 
 
@@ -336,21 +334,12 @@ def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
 
     swarm doctor --json | jq .findings
     """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from launch_scripts.check.findings import STYLES, as_fields, counted
+    from launch_scripts.check.findings import as_fields
     from launch_scripts.check.machine import examine
 
     found = list(examine(runs))
     if as_json:
-        typer.echo(json.dumps(as_fields(found), indent=2))
-    else:
-        table = Table.grid(padding=(0, 2))
-        for finding in found:
-            table.add_row(Text(finding.level, STYLES[finding.level]), finding.about, Text(finding.text))
-        console = Console(highlight=False)
-        console.print(table)
-        console.print(f"{counted(found, 'failure')}, {counted(found, 'warning')}")
-    return int(any(finding.level == "failure" for finding in found))
+        told = as_fields(found)
+        typer.echo(json.dumps(told, indent=2))
+        return int(not told["ok"])
+    return _print(found)

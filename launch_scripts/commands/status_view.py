@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import select
-import signal
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -29,23 +28,24 @@ from launch_scripts.observe.run_observer import OutsideObserver, frame_of_member
 from launch_scripts.observe.state import RunState, state_of
 from launch_scripts.plain_text import plain
 from launch_scripts.process_table import ROLES
+from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
-from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import NS_PER_S, Clock, MonotonicClock
+from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError
 from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo
 
 if TYPE_CHECKING:
-    from swarm.config.scenario import NetworkConfig
+    from launch_scripts.commands.running_swarm import Where
+    from swarm.bus.bus import Bus
 
 _SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
 """Alarms of `status` and of `top`, whose table has to fit a terminal."""
+_LISTEN_S, _TOP_LISTEN_S, _MOST_S = 1.5, 2.2, 4.0
+"""A picture is drawn after so long, and that of `top`, whose rates need two of the figures that each process tells
+once a second; later while a process that has answered has not said how it is."""
 _EVERY_S = 1.0
-_FIRST_S = 2.2
-"""Until the first table: each process tells its figures once a second, and rates need two of them."""
-_ANSWER_WITHIN_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,28 @@ class Status:
         return state_of(self.latest, self.now_ns)
 
 
-def status_of(observer: OutsideObserver, now_ns: int) -> Status | None:
-    """What was heard so far; None if nobody has answered."""
+def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S) -> OutsideObserver:
+    """A swarm of which whoever has answered has said how it is, if it does so in time. Raises BusError if nobody
+    answers."""
+    clock, observer = MonotonicClock(), OutsideObserver(bus)
+    began_s = time.monotonic()
+    while (spent_s := time.monotonic() - began_s) < _MOST_S and not (spent_s >= least_s and observer.whole):
+        observer.listen(clock, 0.1)
     if observer.latest is None:
-        return None
+        admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
+        raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
+    return observer
+
+
+def ask_status(where: Where) -> Status:
+    """A running swarm as it is now. Raises BusError if nobody answers."""
+    with where.bus() as bus:
+        return status_of(observed(bus, where), MonotonicClock().now_ns())
+
+
+def status_of(observer: OutsideObserver, now_ns: int) -> Status:
+    """What was heard so far. Somebody has answered."""
+    assert observer.latest is not None
     members, strangers = observer.members()
     return Status(members, strangers, observer.latest, frame_of_members(members), now_ns)
 
@@ -186,35 +204,32 @@ def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
 # --- drawn each second --------------------------------------------------------------------------------------------
 
 
-def show_top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_json: bool) -> None:
+def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
     """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if nobody answers at the beginning."""
     make_output_outlive_readers()
     console = Console(highlight=False)
     moving = console.is_terminal and not as_json and not once
-    with open_bus(network) as bus, _quietly(), _keys() if moving else contextlib.nullcontext():
-        clock, observer = MonotonicClock(), OutsideObserver(bus)
-        run, latest = _run_of(observer, clock, where)
-        due_s = time.monotonic() + _FIRST_S
-        with Live(console=console, auto_refresh=False) if moving else contextlib.nullcontext() as live:
+    keys = _keys() if moving else nullcontext()
+    with suppress(KeyboardInterrupt), stop_requests(), where.bus() as bus, keys:
+        observer, clock = observed(bus, where, _TOP_LISTEN_S), MonotonicClock()
+        run, latest = observer.run, observer.latest
+        if run is None or latest is None:
+            raise BusError(f"only routers answer {where}: is the swarm running?")
+        with Live(console=console, auto_refresh=False) if moving else nullcontext() as live:
             while True:
-                observer.listen(clock, due_s - time.monotonic())
-                due_s = max(due_s + _EVERY_S, time.monotonic())
                 state, processes = state_of(latest, clock.now_ns()), latest.loads.lines(latest.up())
                 if as_json:
                     print(json.dumps(top_fields(run, state, processes)), flush=True)
+                elif live is None:
+                    console.print(table_of(run, state, processes, console, each=each))
                 else:
-                    shown = table_of(run, state, processes, console, each=each)
-                    if live is None:
-                        console.print(shown)
-                    else:
-                        live.update(shown, refresh=True)
-                if once:
+                    live.update(table_of(run, state, processes, console, each=each), refresh=True)
+                if once or (moving and _asked_to_end()):
                     return
                 if observer.over or all(role == "router" for role, _ in latest.up()):
                     break
-                if moving and _asked_to_end():
-                    return
-    Console(stderr=as_json, highlight=False).print(f"run {run.run_id} is over, or cannot be reached")
+                observer.listen(clock, _EVERY_S)
+        Console(stderr=as_json, highlight=False).print(f"run {run.run_id} is over, or cannot be reached")
 
 
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
@@ -238,30 +253,7 @@ def _rounded(value: Any) -> Any:
     return int(value) if value.is_integer() else round(value, 2)
 
 
-def _run_of(observer: OutsideObserver, clock: Clock, where: object) -> tuple[RunInfo, LatestState]:
-    """The run that is observed, and what is heard of it. Waits for one that is just starting."""
-    until_s = time.monotonic() + _ANSWER_WITHIN_S
-    while observer.run is None or observer.latest is None:
-        if observer.answered and (observer.latest is None or time.monotonic() > until_s):
-            who = "nobody answers" if observer.latest is None else "only routers answer"
-            raise BusError(f"{who} {where}: is the swarm running?")
-        observer.listen(clock, 0.1)
-    return observer.run, observer.latest
-
-
-@contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Ctrl-C and SIGTERM end it without a word."""
-
-    def leave(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, leave)
-    with contextlib.suppress(KeyboardInterrupt):
-        yield
-
-
-@contextlib.contextmanager
+@contextmanager
 def _keys() -> Iterator[None]:
     """Lets single keys be read, where there is a keyboard."""
     if not sys.stdin.isatty():

@@ -248,7 +248,6 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     watched.draw_all(now_ns)
     state = simulation.recorder.summary(now_ns)
     status = status_of(observer, now_ns)
-    assert status is not None
     console = Console(file=io.StringIO(), width=250)
     print_status(status, console)
     texts = {

@@ -171,7 +171,7 @@ def test_doctor_looks_at_everything_and_says_how_it_is(
     code, said = doctor(monkeypatch, capsys)
     assert code == 0
     for about in machine.CHECKS:
-        assert f" {about} " in said, said
+        assert f": {about}: " in said, said
     assert "two sessions met on 127.0.0.1" in " ".join(said.split())
     assert said.splitlines()[-1].startswith("no failures, ")
     assert not list(tmp_path.iterdir()), "it leaves nothing behind"

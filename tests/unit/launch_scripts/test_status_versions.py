@@ -25,9 +25,7 @@ def told_by(**wire_versions: int) -> Status:
         info = msgspec.structs.replace(INFO, role="agent", id=id, wire_version=wire)
         observer.take(Replied("observer-run", RUN, {}, info), 0)
     observer.take(AskEnded("observer-run", RUN, len(wire_versions), None), 0)
-    status = status_of(observer, 0)
-    assert status is not None
-    return status
+    return status_of(observer, 0)
 
 
 def printed(status: Status) -> str:
