@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.launcher.tables import columns
 from launch_scripts.observe.run_observer import frame_of_run
-from launch_scripts.report.exporter import FORMATS, Layer, write_layers, write_raster
+from launch_scripts.report.exporter import FORMATS, check_target, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.mark_store import KeeperStore
@@ -80,7 +80,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         "rows": grid.rows,
         "cols": grid.cols,
         "sets": len(sets),
-        "marks": sum(len(each.kinds) for each in sets),
+        "marks": sum(counts["marks"] for counts in authors.values()),
         "cells_with_marks": int((kind != stored_marks.NOTHING_SAID_BAND).sum()),
         "cells_lethal": int((kind == 1).sum()),
         "authors": authors,
@@ -89,10 +89,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
             each.target: {
                 "row_col": list(divmod(each.cell, grid.cols)),
                 "at": fields_of(frame, each.cell),
-                "uncertainty_m": each.uncertainty_m,
-                "author": each.author,
-                "stamp_ns": each.stamp_ns,
-                "until_ns": each.until_ns,
+                **{name: getattr(each, name) for name in ("uncertainty_m", "author", "stamp_ns", "until_ns")},
             }
             for each in seen
         },
@@ -103,11 +100,11 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
     print(f"{store}: terrain {terrain}, {grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m")
     if grid.crs != "local":
         print(f"it lies at {extent_of(frame, 'latlon')}")
-    print(f"{found['marks']} marks in {len(sets)} sets; {found['cells_with_marks']} cells marked, "
-          f"{found['cells_lethal']} of them lethal")  # fmt: skip
+    cells = f"{found['cells_with_marks']} cells marked, {found['cells_lethal']} of them lethal"
+    print(f"{found['marks']} marks in {len(sets)} sets; {cells}")
     for author, counts in authors.items():
         print(f"  {author:40} {counts['marks']:7} marks in {counts['sets']:5} tiles")
-    if any(each.kinds for each in words):
+    if found["authors_that_learned"]:
         print(f"  what was learned of kinds of ground, by {len(words)} authors: swarm map learned {store}")
     for sighted in seen:
         where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
@@ -126,36 +123,31 @@ def export(store: Store, out: Path) -> None:
     out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
     """
     terrain, grid, sets = _read(store)
-    kind_of_file = out.suffix.lower()
+    check_target(out, "OUT", *_TEXT, *_PIXELS, *FORMATS)
+    ending, shown = out.suffix.lower(), sets
+    left_out = ""
+    if ending not in _TEXT:
+        # Pixels and polygons show the winners among the marks for all vehicles.
+        shown = [each for each in sets if each.tile < grid.tiles]
+        own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
+        left_out = f"; {own} marks for one class alone are left out, .json has them" if own else ""
     with writing(out):
-        if kind_of_file in _TEXT:
+        if ending in _TEXT:
             with KeeperStore(store, read_only=True) as kept:
                 classes = kept.classes
             out.write_text(stored_marks.to_json(terrain, grid, sets, classes), encoding="utf-8")
-        elif kind_of_file in _PIXELS:
+        elif ending in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
-        elif kind_of_file in FORMATS:
-            write_layers(out, [_layer(grid, sets)], MapFrame(grid))
         else:
-            raise StoreError(f"{out}: the name must end in {', '.join((*_TEXT, *_PIXELS, *FORMATS))}")
-    if kind_of_file in _TEXT:
-        print(f"{out}: {_counted(grid, sets)}")
-        return
-    # Pixels and polygons show the winners among the marks for all vehicles.
-    own = sum(len(each.kinds) for each in sets if each.tile > grid.tiles)
-    left_out = f"; {own} marks for one class alone are left out, .json has them" if own else ""
-    print(f"{out}: {_counted(grid, [each for each in sets if each.tile < grid.tiles])}{left_out}")
+            pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
+            write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
+    print(f"{out}: {_counted(grid, shown)}{left_out}")
 
 
 def _counted(grid: GridSpec, sets: list[MarkSet]) -> str:
     marks, words = _parted(grid, sets)
     text = f"{sum(len(each.kinds) for each in marks)} marks in {len(marks)} sets"
     return f"{text}, and what {len(words)} authors have learned" if words else text
-
-
-def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
-    pace, kind, _ = stored_marks.to_cells(grid, sets, time.time_ns())
-    return mark_layer(grid, kind, pace)
 
 
 @command(app, name="import")
@@ -222,19 +214,16 @@ def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"kinds": [each._asdict() for each in kinds]}, indent=2))
         return
-    console = Console(highlight=False)
     if not kinds:
-        console.print("nothing was learned: map.learning is off, or no vehicle has driven yet")
+        print("nothing was learned: map.learning is off, or no vehicle has driven yet")
         return
-    table = Table("kind of ground, degrees", pad_edge=False)
-    for heading in ("cells driven", "authors", "driven / prior pace", "standard error", "factor applied"):
-        table.add_column(heading, justify="right")
+    figures = ("cells driven", "authors", "driven / prior pace", "standard error", "factor applied")
+    table = columns("kind of ground, degrees", *figures)
     for each in kinds:
-        factor = "-" if each.factor == 1 else f"{each.factor:.2f}"
-        error = f"{each.standard_error:.1%}"
+        factor, error = "-" if each.factor == 1 else f"{each.factor:.2f}", f"{each.standard_error:.1%}"
         table.add_row(each.kind, f"{each.cells:,}", f"{each.authors}", f"{each.measured:.2f}", error, factor)
-    console.print(table)
-    console.print("factor -: not yet 4.5 standard errors from 1, so the prior stands")
+    Console(highlight=False).print(table)
+    print("factor -: not yet 4.5 standard errors from 1, so the prior stands")
 
 
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:

@@ -214,10 +214,9 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     # The cell is known once the swarm has said where its terrain lies; all else is checked before it is asked.
     place = None if at is None else read_place(at, "--at")
     made = [checked(GiveOrder, fields if place is None else {**fields, "cell": 0}) for fields in orders]
-    silent = False
+    silent = 0
     printed: list[dict[str, Any]] = []
     with where.bus() as bus:
-        operator = Operator(bus)
         for order in made:
             said: dict[str, Any] = {}
             if place is not None:
@@ -225,18 +224,17 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
                 cell = cell_of(place, frame, "--at")
                 order = msgspec.structs.replace(order, cell=cell)
                 said = {"at": fields_of(frame, cell)}
-            given, acknowledged = operator.give(order)
-            silent = silent or bool(acknowledged.silent)
-            if as_json:
-                told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
-                printed.append({"given": msgspec.to_builtins(given), **told, **said})
-                continue
-            if place is not None:
-                typer.echo(f"{order.subject} {order.name} is put at {written(frame, cell)}")
-            print_obeyed(acknowledged)
+            given, acknowledged = Operator(bus).give(order)
+            told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+            printed.append({"given": msgspec.to_builtins(given), **told, **said})
+            silent |= bool(acknowledged.silent)
+            if not as_json:
+                if place is not None:
+                    typer.echo(f"{order.subject} {order.name} is put at {written(frame, cell)}")
+                print_obeyed(acknowledged)
     if as_json:
         typer.echo(json.dumps(printed[0] if len(printed) == 1 else printed, indent=2))
-    return int(silent)
+    return silent
 
 
 def checked(kind: type[M], fields: dict[str, Any]) -> M:
@@ -257,10 +255,11 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
         raise ConfigError(f"the order is not possible: {said}") from None
 
 
-def print_obeyed(acknowledged: Acknowledged) -> None:
-    """Prints who obeys an order, and who has not said so."""
+def print_obeyed(acknowledged: Acknowledged) -> int:
+    """Prints who obeys an order, and who has not said so. Returns the exit code."""
     took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
     typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
     if acknowledged.silent:
         names = ", ".join(acknowledged.silent)
         typer.echo(f"no answer yet from {names}: they obey as soon as they hear a keeper", err=True)
+    return int(bool(acknowledged.silent))

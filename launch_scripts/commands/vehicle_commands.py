@@ -91,13 +91,13 @@ def remove(
     with _open(network, found[0].run_id) as bus:
         # Who names the agent itself means all of its vehicles, which an empty list says.
         said = {agent: _remove(bus, agent, [] if agent in some else some) for agent, some in asked.items()}
-    if as_json:
-        typer.echo(json.dumps({agent: {"left": one.left, "held": one.held} for agent, one in said.items()}))
     for one in said.values():
         if one.unknown:
             raise ConfigError(f"agent {one.agent} hosts no {', '.join(one.unknown)}")
         if not as_json:
             typer.echo(f"{', '.join(one.left)}: left" + (f"; {one.held} still hold cells" if one.held else ""))
+    if as_json:
+        typer.echo(json.dumps({agent: {"left": one.left, "held": one.held} for agent, one in said.items()}))
     return int(any(one.held for one in said.values()))
 
 

@@ -81,13 +81,13 @@ def add(
         fields["polygon"] = [(0.0, 0.0) for _ in places]
         fields["polygon_m"] = [_corner(word) for word in _words("--polygon-m", polygon_m, " such as 40,200")]
         order = checked(ZoneOrder, fields)
-        return _give(
-            lambda frame: [
-                msgspec.structs.replace(order, polygon=corners_of(places, frame, "--polygon")) if places else order
-            ],
-            where,
-            as_json,
-        )
+
+        def of_places(frame: MapFrame) -> Iterable[ZoneOrder]:
+            if not places:
+                return [order]
+            return [msgspec.structs.replace(order, polygon=corners_of(places, frame, "--polygon"))]
+
+        return _give(of_places, where, as_json)
     if polygon is not None or polygon_m is not None:
         raise ConfigError("zone add: give either --file or a polygon")
     if not file.is_file():
@@ -140,21 +140,20 @@ def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as
 
     orders_on  makes the orders for the swarm's terrain; all are made before the first is given
     """
-    obeyed: dict[str, float] = {}
-    silent: set[str] = set()
     with where.bus() as bus:
         frame = frame_of_run(bus, where)
-        for order in list(orders_on(frame)):
-            zones, acknowledged = Operator(bus).zone(order)
-            obeyed, silent = obeyed | acknowledged.obeyed, silent | set(acknowledged.silent)
-            if not as_json:
-                stands = [zone for zone in zones.zones if zone.name == zones.changed]
-                typer.echo(_line(stands[0], frame) if stands else f"zone {zones.changed} is removed")
-                print_obeyed(Acknowledged(obeyed, sorted(silent)))
+        given = [Operator(bus).zone(order) for order in list(orders_on(frame))]
+    zones = given[-1][0]
+    obeyed = {process: took_s for _, each in given for process, took_s in each.obeyed.items()}
+    silent = sorted({process for _, each in given for process in each.silent})
     if as_json:
-        told = {"changed": zones.changed, "obeyed_s": obeyed, "silent": sorted(silent)}
+        told = {"changed": zones.changed, "obeyed_s": obeyed, "silent": silent}
         typer.echo(json.dumps({**_fields(zones, frame), **told}, indent=2))
-    return int(bool(silent))
+        return int(bool(silent))
+    for then, _ in given:
+        stands = [_line(zone, frame) for zone in then.zones if zone.name == then.changed]
+        typer.echo(stands[0] if stands else f"zone {then.changed} is removed")
+    return print_obeyed(Acknowledged(obeyed, silent))
 
 
 def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:

@@ -19,24 +19,6 @@ from swarm.config.scenario import Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
 
 
-def test_help_teaches_with_examples(swarm: Swarm) -> None:
-    code, out, _ = swarm("--help")
-    assert code == 0
-    assert "swarm route --target t3 --row 40 --col 200" in out
-    for command in ("demo", "up", "router", "keeper", "planner", "agent", "targets", "monitor", "route", "status"):
-        assert command in out
-
-
-@pytest.mark.parametrize(
-    "command",
-    ["demo", "up", "simulate", "route", "status", "router", "keeper", "planner", "agent", "targets", "monitor"],
-)
-def test_every_command_explains_itself(swarm: Swarm, command: str) -> None:
-    code, out, _ = swarm(command, "--help")
-    assert code == 0
-    assert f"Usage: swarm {command}" in out
-
-
 def test_the_version_is_the_packages(swarm: Swarm) -> None:
     assert swarm("--version") == (0, f"swarm {version('terrain-swarm')}\n", "")
 
@@ -69,32 +51,10 @@ def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(swarm: Swarm,
     assert err.count("\n") == 1
 
 
-def test_a_scenario_file_that_is_not_there(swarm: Swarm, tmp_path: Path) -> None:
-    code, _, err = swarm("up", str(tmp_path / "gone.toml"))
-    assert (code, err.count("\n")) == (2, 1)
-    assert "No such file" in err
-
-
 def test_an_unknown_role_is_refused(swarm: Swarm) -> None:
     code, _, err = swarm("up", "synthetic", "--only", "driver")
     roles = "'router', 'keeper', 'monitor', 'planner', 'targets', 'agent'"
     assert (code, err) == (2, f"swarm: --only: no role 'driver'; the roles are {roles}\n")
-
-
-def test_a_planner_for_a_target_that_the_scenario_does_not_have(swarm: Swarm) -> None:
-    code, _, err = swarm("planner", "--target", "t9", "synthetic")
-    assert (code, err) == (2, "swarm: scenario synthetic has no planner 't9'; it has t0, t1\n")
-
-
-def test_a_port_that_is_taken_is_named_with_the_way_out(swarm: Swarm, tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        code, _, err = swarm("up", "synthetic", "--port", str(port), "--runs", str(tmp_path / "runs"))
-    assert code == 4
-    assert f"port {port}, which the router needs, is taken; choose others with --port N" in err
-    assert not (tmp_path / "runs").exists()
 
 
 def test_runs_where_nobody_may_write(swarm: Swarm, tmp_path: Path) -> None:
@@ -103,13 +63,6 @@ def test_runs_where_nobody_may_write(swarm: Swarm, tmp_path: Path) -> None:
     assert code == 6
     assert err.startswith(f"swarm: cannot make a run folder in {tmp_path / 'runs'}")
     assert "Traceback" not in err
-
-
-def test_nobody_there_to_ask(swarm: Swarm) -> None:
-    (port,) = ports.free_ports(1)
-    code, _, err = swarm("status", "--connect", f"tcp/127.0.0.1:{port}")
-    assert code == 4
-    assert err.startswith(f"swarm: cannot reach a router at tcp/127.0.0.1:{port}")
 
 
 def test_an_endpoint_beyond_this_machine_needs_tls(swarm: Swarm) -> None:

@@ -99,16 +99,3 @@ def test_damaged_files_are_one_sentence(
     code, _, told = swarm("compare r1 r2 --runs", runs)
     assert (code > 0, told.count("\n")) == (True, 1)
     assert re.search(sentence, told), told
-
-
-def test_figures_that_are_none_of_ours_end_no_comparison(runs: Path, swarm: Swarm) -> None:
-    strange = {
-        "captures": {"a": [1]},
-        "certified_gap": {"mean": "[red]x", "max": True},
-        "by_group": {"g": 3, "h": {"distance_m": "x"}},
-        "by_target": {"t": 3},
-        "made": {"versions": [1]},
-    }
-    (runs / "r2" / "report.json").write_text(json.dumps(strange))
-    code, out, _ = swarm("compare r1 r2 --runs", runs)
-    assert (code, "[red]x" in out) == (0, True)

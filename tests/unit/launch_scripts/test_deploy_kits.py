@@ -11,7 +11,6 @@ import sys
 import tarfile
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from launch_scripts.deploy import certificates
@@ -136,22 +135,6 @@ def test_no_certificate_outlives_its_authority(tmp_path: Path, monkeypatch: pyte
         check_signed(tmp_path / "ca.pem", path, path.with_suffix(".key"))
 
 
-def test_a_second_plan_keeps_the_key_of_a_router_whose_address_is_written_at_length(tmp_path: Path) -> None:
-    plan, certs = planned(machines=hosts("fd00:0:0:0:0:0:0:1", "FD00::2")), tmp_path / "certs"
-    write_kits(plan, tmp_path, systemd_files, 7)
-    before = {path: path.read_bytes() for path in certs.iterdir()}
-    write_kits(plan, tmp_path, systemd_files, 7)
-    assert {path: path.read_bytes() for path in certs.iterdir()} == before
-
-
-def test_an_archive_is_for_its_owner_only_whatever_was_left(tmp_path: Path) -> None:
-    for left in (tmp_path / "m0.tar.gz.part", tmp_path / "m1.tar.gz"):
-        left.write_text("")
-        left.chmod(0o666)
-    unpacked(planned(), tmp_path)
-    assert not list(tmp_path.rglob("*.part"))
-
-
 def test_archives_of_machines_that_are_gone_are_removed_and_no_other_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,21 +157,6 @@ def test_no_archive_outside_of_the_folder_is_removed(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"plan\.json is no plan of `swarm deploy plan`"):
         keep_plan(planned(), out)
     assert (tmp_path / "mine.tar.gz").exists()
-
-
-def test_an_interrupted_plan_leaves_the_plan_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = planned()
-    keep_plan(plan, tmp_path)
-    before = (tmp_path / "plan.json").read_bytes()
-
-    def interrupted(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", interrupted)
-    with pytest.raises(StoreError, match=r"cannot write .*plan\.json: .*No space left on device"):
-        keep_plan(plan, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
-    assert (tmp_path / "plan.json").read_bytes() == before
 
 
 def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_its_own_processes(
@@ -298,30 +266,9 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
-def test_systemd_finds_a_fault_that_is_made(tmp_path: Path) -> None:
-    """So that the test above can fail."""
-    plan = planned()
-    text = systemd_files(plan, plan.hosts[0])[UNIT].replace("Restart=on-failure", "Restart=sometimes")
-    if shutil.which("systemd-analyze") is None:
-        pytest.skip("there is no systemd-analyze (package systemd)")
-    path = tmp_path / UNIT
-    path.write_text(text)
-    done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", str(path)], capture_output=True, text=True, check=False
-    )
-    assert "sometimes" in done.stderr
-
-
 def test_the_service_is_shut_off_from_the_rest_of_the_machine(tmp_path: Path) -> None:
     done = analyze(tmp_path, "security", "--offline=true", "--no-pager", f"--threshold={EXPOSURE}")
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-def test_a_plan_is_the_same_from_its_archive(tmp_path: Path) -> None:
-    plan = planned()
-    texts = {(folder / "plan.json").read_text() for folder in unpacked(plan, tmp_path)}
-    (text,) = texts
-    assert msgspec.json.decode(msgspec.json.encode(plan.hosts)) == msgspec.json.decode(text)["hosts"]
 
 
 def test_what_lies_in_the_folder_of_a_plan_before_is_read_as_one(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from shared_map.keeper.export import from_json, to_cells, to_json
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learning.measurements import Measurement
 from shared_map.replication.replica import MapReplica
-from swarm.errors import StoreError
+from swarm.errors import StoreError, SwarmError
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
@@ -120,14 +120,14 @@ SET = {"author": "a1.1", "group": "all", "tile": 0, "epoch": 1, "seq": 16}
 
 def complaint(arguments: list[str]) -> str:
     result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, StoreError), result.output
+    assert isinstance(result.exception, SwarmError), result.output
     return str(result.exception)
 
 
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
     assert "there is no store" in complaint(["inspect", str(tmp_path / "none")])
-    assert "must end in .json, .tif" in complaint(["export", str(store), str(tmp_path / "map.txt")])
+    assert "write .json or .tif" in complaint(["export", str(store), str(tmp_path / "map.txt")])
     assert "cannot write" in complaint(["export", str(store), str(tmp_path / "no" / "map.json")])
     junk = tmp_path / "junk"
     junk.write_text("no map")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tomllib
 import typing
 from pathlib import Path
 
@@ -98,19 +97,6 @@ def test_every_key_that_new_writes_stands_below_its_meaning(tmp_path: Path, swar
 def _sections() -> list[type[typing.Any]]:
     modules = [vars(sys.modules[each.__module__]) for each in (Scenario, TerrainConfig)]
     return [each for module in modules for each in module.values() if isinstance(each, type(Scenario))]
-
-
-def test_files_are_named_from_where_the_scenario_lies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
-) -> None:
-    monkeypatch.setattr(machine, "this_machine", lambda runs: ROOMY)
-    (tmp_path / "mine").mkdir()
-    np.savez(tmp_path / "hill.npz", elevation=np.ones((24, 24), np.float32), resolution_m=10.0)
-    assert swarm("new mine/a.toml --terrain hill.npz --vehicles 3")[0] == 0
-    assert tomllib.loads((tmp_path / "mine/a.toml").read_text())["terrain"]["source"] == "../hill.npz"
-    code, out, _ = swarm("check mine/a.toml --json")
-    assert code == 0
-    assert (json.loads(out)["rows"], json.loads(out)["resolution_m"]) == (24, 10.0)
 
 
 def test_nothing_is_written_over(tmp_path: Path, swarm: Swarm) -> None:

@@ -59,13 +59,6 @@ def test_of_a_scenario_what_steps_cost_or_cells(tmp_path: Path) -> None:
     assert curves[0]["by_slope_percent"]["-10"] == curves[0]["by_slope_percent"]["+10"]
 
 
-def test_a_scenario_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no scenario"):
-        runner.invoke(app, ["rules", "nowhere"], catch_exceptions=False)
-    with pytest.raises(ConfigError, match=r"write \.png"):
-        runner.invoke(app, ["rules", "--picture", str(tmp_path / "a.gif")], catch_exceptions=False)
-
-
 def test_a_terrain_file_is_told_its_vehicles_by_an_option_and_a_scenario_says_them_itself(tmp_path: Path) -> None:
     file = tmp_path / "hill.npz"
     row, col = np.mgrid[:20, :20]

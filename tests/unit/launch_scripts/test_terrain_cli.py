@@ -12,9 +12,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain_commands import app
 from launch_scripts.report import terrain_figure
-from shared_map.importers.sources import load_source
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
-from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario
 from swarm.errors import SwarmError
 
@@ -53,17 +51,6 @@ def test_info_tells_of_the_scenarios_own_landscape_what_it_costs_and_what_looks_
     assert 0 < facts["largest_part_share"] <= 1
     assert any("cost.max_slope_deg" in doubt for doubt in facts["doubts"])
     assert "! " in run("info", file)
-
-
-def test_a_terrain_file_stands_for_a_scenario_on_it(made: Path) -> None:
-    assert "300 x 280 cells of 30 m" in run("cost", made / "dem.tif")
-
-
-def test_synth_makes_the_same_again_from_a_seed(made: Path, tmp_path: Path) -> None:
-    run("synth", "--rows", 300, "--cols", 280, "--seed", 4, "--rivers", 0, "--out", tmp_path / "again.npz")
-    again = load_source(TerrainConfig(source=str(tmp_path / "again.npz")), 1)
-    first = load_source(TerrainConfig(source=str(made / "dem.tif")), 1)
-    np.testing.assert_array_equal(again.elevation_m, first.elevation_m)
 
 
 def test_cost_writes_a_geotiff_with_overviews_and_a_picture(made: Path, tmp_path: Path) -> None:
