@@ -37,10 +37,11 @@ from launch_scripts.deploy.size import (
     too_much,
 )
 from launch_scripts.launcher.options import common_run_id, find_scenario, own_certificate, with_network
+from launch_scripts.launcher.tables import columns
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from swarm.bus.access_control import ROUTER, bearer, common_name
 from swarm.config.input_files import quoted
-from swarm.config.load import check_endpoint
+from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario
 from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
 from swarm.errors import ConfigError, writing
@@ -207,8 +208,7 @@ def size(
 
 def _show_size(found: Needs) -> None:
     machines = f"{found.machines:,} machine{'s' * (found.machines > 1)}"
-    table = Table("", machines, title="What this swarm needs", title_justify="left")
-    table.columns[1].justify = "right"
+    table = columns("What this swarm needs", machines)
     for name, value in (
         ("cores, all machines", sum(found.cpu_cores.values())),
         *((f"  {role}", each) for role, each in found.cpu_cores.items()),
@@ -328,14 +328,10 @@ def zenohd(
         peers=tuple(peer or network.peers),
         tls=own_certificate(network.tls, "router.0"),
     )
-    network = revocations.with_revocations(network)
-    if network.tls is not None:  # zenohd may run elsewhere than here
-        files = (network.tls.ca, network.tls.certificate, network.tls.key)
-        ca, certificate, key = (str(Path(file).resolve()) for file in files)
-        absolute = msgspec.structs.replace(network.tls, ca=ca, certificate=certificate, key=key)
-        network = msgspec.structs.replace(network, tls=absolute)
+    # zenohd may run elsewhere than here.
+    network = anchored(msgspec.structs.replace(chosen, network=network), Path.cwd()).network
     config = zenohd_config(
-        network,
+        revocations.with_revocations(network),
         plugins=None if plugins is None else str(plugins.resolve()),
         volume=volume,
     )

@@ -6,7 +6,7 @@ import json
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
@@ -63,8 +63,10 @@ def ros2(
     topics    Print what is forwarded, and exit.
     as_json   With --list: as JSON.
     """
+    from launch_scripts.gateways.ros2.gateway_settings import load_settings
+
     told = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
-    chosen = settings_of(settings, {**told, "vehicles": vehicles})
+    chosen = load_settings(settings, {**told, "vehicles": vehicles})
     if topics:
         _list_topics(chosen, as_json=as_json)
         return
@@ -73,16 +75,6 @@ def ros2(
     if where.tls_ca is None:
         where = replace(where, tls_ca=ours.ca, tls_cert=ours.certificate, tls_key=ours.key)
     _serve_ros2(chosen, where.network(), where.runs)
-
-
-def settings_of(file: Path | None, changes: dict[str, Any]) -> Settings:
-    """The settings of a file, and what options say over them. Raises ConfigError.
-
-    changes  key -> value, such as {"ros.domain": 3}; None changes nothing
-    """
-    from launch_scripts.gateways.ros2.gateway_settings import load_settings
-
-    return load_settings(file, changes)
 
 
 def _list_topics(settings: Settings, *, as_json: bool) -> None:

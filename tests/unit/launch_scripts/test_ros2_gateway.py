@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from support.effort import few
 from support.ros_messages import path
 
-from launch_scripts.commands.gateway_commands import settings_of
 from launch_scripts.gateways.ros2.gateway import Channel, Declare, Gateway, Health, Put, Remove
 from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
 from launch_scripts.gateways.ros2.map_feed import MapFeed
@@ -499,7 +498,7 @@ def test_options_change_what_they_name_and_nothing_else(text: str, tmp_path: Pat
     said = {"ros.domain": 3, "vehicles": None, "ros.endpoint": None}
     before, after = parse_settings(text), load_settings(file, said)
     assert after == replace(before, ros=replace(before.ros, domain=3))
-    assert settings_of(file, dict.fromkeys(said)) == before
+    assert load_settings(file, dict.fromkeys(said)) == before
 
 
 def test_a_mistake_in_the_options_is_one_sentence_that_names_them() -> None:
