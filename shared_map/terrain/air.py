@@ -31,26 +31,6 @@ _ROOM = 1.02
 """How far beyond the grade of a surface the table of factors reaches: rounding makes steps a hair steeper."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Flight:
-    """How a class flies.
-
-    speed_mps         through the air, in level flight
-    clearance_m       least height over the highest ground of a cell and its eight neighbours
-    grade             steepest rise and fall of the surface, metres per metre
-    climb_s_per_m     time that a metre of climb takes in addition to the way
-    descent_s_per_m   the same of a metre of descent
-    wind              in which it flies
-    """
-
-    speed_mps: float
-    clearance_m: float = 60.0
-    grade: float = 0.15
-    climb_s_per_m: float = 1 / 3
-    descent_s_per_m: float = 0.02
-    wind: Wind = STILL
-
-
 @dataclass(frozen=True, eq=False)
 class AirGround:
     """What a tree of an air class is grown over.
@@ -68,7 +48,7 @@ class AirGround:
 
 
 def air_ground(
-    grid: GridSpec, elevation_m: Floats, flight: Flight, closed: NDArray[np.bool_] | None = None
+    grid: GridSpec, elevation_m: Floats, air: AirConfig, wind: Wind = STILL, closed: Bools | None = None
 ) -> AirGround:
     """The ground of an air class.
 
@@ -78,15 +58,16 @@ def air_ground(
         how high it is
     closed : (rows, cols) bool, no-fly zones; none if not given
     """
-    lifted = lifted_floor(clearance_floor(elevation_m, flight.clearance_m), flight.grade, grid.resolution_m)
+    grade = grade_of(elevation_m, grid.resolution_m) if air.grade is None else air.grade
+    lifted = lifted_floor(clearance_floor(elevation_m, air.clearance_m), grade, grid.resolution_m)
     unknown = np.isnan(lifted)
     lethal = unknown if closed is None else unknown | closed
-    pace = np.where(lethal, np.float32(np.inf), np.float32(1.0 / flight.speed_mps))
-    steepest = flight.grade * _ROOM
+    pace = np.where(lethal, np.float32(np.inf), np.float32(1.0 / air.speed_m_per_s))
+    steepest = grade * _ROOM
     rises = np.linspace(-steepest, steepest, 2 * ENTRIES + 1)
-    metres_s = np.where(rises > 0, rises * flight.climb_s_per_m, -rises * flight.descent_s_per_m)
-    factors = (1.0 + flight.speed_mps * metres_s).astype(np.float32)
-    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest, flight.wind), flight.grade)
+    metres_s = np.where(rises > 0, rises * (1 / air.climb_m_per_s), -rises * (1 / air.descent_m_per_s))
+    factors = (1.0 + air.speed_m_per_s * metres_s).astype(np.float32)
+    return AirGround(lifted, pace, Climb(grid, lifted, factors, steepest, wind), grade)
 
 
 def clearance_floor(elevation_m: Floats, clearance_m: float) -> NDArray[np.float64]:
@@ -157,7 +138,8 @@ def air_terrain(common: Terrain, air: AirConfig, wind: WindConfig, named: str) -
     """
     level = np.zeros((common.grid.rows, common.grid.cols), np.float32)
     paint_zones(level, air.no_fly, common.grid, CostConfig(), key=f"{named}: air.no_fly")
-    flown = flight_of(common, air, wind, np.isinf(level))
+    blown = wind_of(wind.speed_m_per_s, wind.from_deg, air.speed_m_per_s)
+    flown = air_ground(common.grid, common.elevation_m, air, blown, np.isinf(level))
     if np.isinf(flown.pace_s_per_m).all():
         raise TerrainError(f"{named}: it can fly nowhere: no cell is outside of its no-fly zones and of voids")
     digest = hashlib.blake2b(digest_size=8)
@@ -185,16 +167,3 @@ def _said_of(wind: WindConfig, air: AirConfig) -> tuple[str, ...]:
     low, high = air.speed_m_per_s - wind.speed_m_per_s, air.speed_m_per_s + wind.speed_m_per_s
     blows = f"in a wind of {wind.speed_m_per_s:g} m/s from {wind.from_deg:g} degrees"
     return (f"{blows}: {low:.3g} m/s over the ground against it, {high:.3g} m/s with it",)
-
-
-def flight_of(common: Terrain, air: AirConfig, wind: WindConfig, closed: Bools) -> AirGround:
-    """What trees of the class are grown over."""
-    flight = Flight(
-        speed_mps=air.speed_m_per_s,
-        clearance_m=air.clearance_m,
-        grade=grade_of(common.elevation_m, common.grid.resolution_m) if air.grade is None else air.grade,
-        climb_s_per_m=1 / air.climb_m_per_s,
-        descent_s_per_m=1 / air.descent_m_per_s,
-        wind=wind_of(wind.speed_m_per_s, wind.from_deg, air.speed_m_per_s),
-    )
-    return air_ground(common.grid, common.elevation_m, flight, closed)

@@ -22,8 +22,9 @@ from planner_service.route_finder import RouteFinder
 from planner_service.search.search_routes import Ways
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.air import AirGround, Flight, air_ground
+from shared_map.terrain.air import AirGround, air_ground
 from shared_map.terrain.step_climb import STILL, Wind, wind_of
+from swarm.config.classes import AirConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, walk
 from swarm.wire.routes import RouteStatus
@@ -99,8 +100,8 @@ def flown_over(ground: tuple[int, int, int, float], wind: Wind) -> AirGround:
     heights = rng.normal(500, relief_m, (rows, cols)).astype(np.float32)
     closed = rng.random((rows, cols)) < rng.choice([0.0, 0.15])
     closed[0, 0] = False
-    flight = Flight(speed_mps=SPEED_MPS, grade=0.2, climb_s_per_m=0.4, descent_s_per_m=0.05, wind=wind)
-    return air_ground(GridSpec(rows, cols, METRES), heights, flight, closed)
+    air = AirConfig(speed_m_per_s=SPEED_MPS, grade=0.2, climb_m_per_s=2.5, descent_m_per_s=20.0)
+    return air_ground(GridSpec(rows, cols, METRES), heights, air, wind, closed)
 
 
 def twin_edges(flown: AirGround, wind: Wind) -> csr_matrix:
@@ -204,8 +205,8 @@ def straight_s(wind: Wind, row: int, col: int) -> float:
 
 def test_over_a_plain_a_flight_in_any_wind_is_one_segment_and_takes_what_the_triangle_says() -> None:
     for wind in (STILL, Wind(0.3, 0.0), Wind(-0.2, 0.5)):
-        flight = Flight(speed_mps=SPEED_MPS, wind=wind)
-        flown = air_ground(GridSpec(80, 60, METRES), np.zeros((80, 60), np.float32), flight)
+        air, level = AirConfig(speed_m_per_s=SPEED_MPS), np.zeros((80, 60), np.float32)
+        flown = air_ground(GridSpec(80, 60, METRES), level, air, wind)
         finder = RouteFinder(flown.pace_s_per_m, (3, 3), resolution_m=METRES, climb=flown.climb)
         pulled = finder.pull(finder.route(70, 31))
         assert pulled.turns.tolist() == [[70, 31], [3, 3]]

@@ -265,13 +265,11 @@ def held_out(
     names, of_cell, cells = np.unique(
         groups[labels != TerrainClass.UNKNOWN], return_inverse=True, return_counts=True
     )
-    held = np.zeros(min(5, len(names)), np.int64)
-    part = np.zeros(len(names), np.intp)
-    for name in np.argsort(-cells, kind="stable").tolist():
-        part[name] = held.argmin()
-        held[part[name]] += cells[name]
+    parts = min(5, len(names))
+    part = np.empty(len(names), np.intp)
+    part[np.argsort(-cells, kind="stable")] = np.arange(len(names)) % parts
     predicted = np.empty_like(kinds)
-    for number in range(len(held)):
+    for number in range(parts):
         out = part[of_cell] == number
         predicted[out] = Learner(columns[~out], kinds[~out]).predict(columns[out])
     return kinds, predicted

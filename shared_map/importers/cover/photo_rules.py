@@ -228,48 +228,29 @@ def line_strength(rgb: Bytes) -> Bytes:
     grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
     smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * _FIXED).astype(np.int16)
     padded = np.pad(smooth, _MARGIN, mode="edge")
-    here = np.ascontiguousarray(_moved(padded, 2, 0, 0))
-    crests = {}
-    best = np.zeros(smooth.shape, np.int16)
-    crest = np.zeros(smooth.shape, np.bool_)
+    here = _moved(padded, 2, 0, 0)
+    best, crest = np.zeros(smooth.shape, np.int16), np.zeros(smooth.shape, np.bool_)
     for number in range(_DIRECTIONS):
         angle = math.pi * number / _DIRECTIONS
         down, right = math.sin(angle), math.cos(angle)
-        contrast = _contrast(padded, here, down, right)
+        ahead, behind, one, other = (
+            _moved(padded, 2, _SIDE * by_row, _SIDE * by_col)
+            for by_row, by_col in ((down, right), (-down, -right), (right, -down), (-right, down))
+        )
+        # Brighter than both sides, less a quarter of the bend along the line.
+        contrast = here - np.maximum(one, other) - np.abs(ahead + behind - 2 * here) // 4
+        np.clip(contrast, -_BRIGHTEST * _FIXED, _BRIGHTEST * _FIXED, out=contrast)
         first, second, *others = (_moved(contrast, 4, tap * down, tap * right) for tap in _TAPS)
-        total = first + second
-        for other in others:
-            total += other
+        total = sum(others, first + second)
+        sides = np.maximum(*(_moved(padded, _MARGIN, sign * right, -sign * down) for sign in (1, -1)))
         # Masks and maxima: NumPy's copy "where" costs as much as thirty of them.
         better = total > best
         np.maximum(best, total, out=best)
-        beside = round(right), round(-down)
-        if beside not in crests:
-            sides = np.maximum(*(_moved(padded, _MARGIN, sign * right, -sign * down) for sign in (1, -1)))
-            crests[beside] = smooth >= sides
         crest |= better
-        crest &= np.logical_not(better) | crests[beside]
+        crest &= ~better | (smooth >= sides)
     best *= crest
     best //= _FIXED * len(_TAPS) // 10
     return np.minimum(best, 255).astype(np.uint8)
-
-
-def _contrast(padded: Shorts, here: Shorts, down: float, right: float) -> Shorts:
-    """Brighter than both sides, less a quarter of the bend along the line; `_MARGIN` - 4 narrower on each side."""
-    ahead, behind, one, other = (
-        _moved(padded, 2, _SIDE * by_row, _SIDE * by_col)
-        for by_row, by_col in ((down, right), (-down, -right), (right, -down), (-right, down))
-    )
-    bend = ahead + behind
-    bend -= here
-    bend -= here
-    np.abs(bend, out=bend)
-    bend >>= 2
-    contrast = np.maximum(one, other)
-    np.subtract(here, contrast, out=contrast)
-    contrast -= bend
-    most = _BRIGHTEST * _FIXED
-    return np.clip(contrast, -most, most, out=contrast)
 
 
 def _moved(array: Shorts, trim: int, down: float, right: float) -> Shorts:

@@ -283,21 +283,10 @@ def _crossings(polygon: Any) -> float:
     import shapely
 
     points = shapely.get_coordinates(polygon)
-    start, stop = points[:-1], points[1:]
-    some = np.unique(np.linspace(0, len(start) - 1, 200).astype(np.intp))
-    crossed = 0
-    for n in some:
-        crossed += int((_sides(start[n], stop[n], start, stop) & _sides(start, stop, start[n], stop[n])).sum())
-    return crossed * len(start) / len(some) / 2
-
-
-def _sides(a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Whether c and d lie on different sides of the line through a and b."""
-
-    def side(p: Any) -> Any:
-        return (b[..., 0] - a[..., 0]) * (p[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (p[..., 0] - a[..., 0])
-
-    return side(c) * side(d) < 0
+    edges = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1))
+    some = edges[np.unique(np.linspace(0, len(edges) - 1, 200).astype(np.intp))]
+    crossed = shapely.STRtree(edges).query(some, predicate="crosses").shape[1]
+    return float(crossed * len(edges) / len(some) / 2)
 
 
 # --- for orders ---------------------------------------------------------------------------------------------

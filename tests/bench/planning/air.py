@@ -15,8 +15,9 @@ from bench.harness import Seed, benchmark, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.arrays import Floats
-from shared_map.terrain.air import AirGround, Flight, air_ground, clearance_floor, grade_of
+from shared_map.terrain.air import AirGround, air_ground, clearance_floor
 from shared_map.terrain.terrain import build_terrain
+from swarm.config.classes import AirConfig
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -57,8 +58,7 @@ def air(
     heights[np.isnan(heights)] = np.nanmax(heights)
     rows, cols = heights.shape
     grid = GridSpec(rows, cols, terrain.grid.resolution_m * _EVERY)
-    chosen = grade_of(heights, grid.resolution_m) if grade is None else grade
-    flight = Flight(speed_mps=15.0, grade=chosen)
+    flight = AirConfig(descent_m_per_s=50.0, grade=grade)
     flown = air_ground(grid, heights, flight)
     rng = np.random.default_rng(seed)
     ratios = np.concatenate(
@@ -75,7 +75,7 @@ def air(
         "resolution_m": grid.resolution_m,
         "relief_m": round(float(heights.max() - heights.min())),
         "levels": LEVELS,
-        "grade": flight.grade,
+        "grade": flown.grade,
         "routes": len(ratios),
         "over_stack_mean": round(float(ratios.mean()), 4),
         "over_stack_p95": round(float(np.quantile(ratios, 0.95)), 4),
@@ -96,12 +96,12 @@ def _neighbours(grid: GridSpec, south: int, east: int) -> tuple[NDArray[np.intp]
 
 
 def _over_stack(
-    grid: GridSpec, heights: Floats, flown: AirGround, flight: Flight, root: int, starts: NDArray[np.int64]
+    grid: GridSpec, heights: Floats, flown: AirGround, flight: AirConfig, root: int, starts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Both ways go from the floor to the floor: to climb to the surface or a level counts."""
     floor = clearance_floor(heights, flight.clearance_m).ravel()
     surface = flown.height_m.astype(np.float64).ravel()
-    up, down = flight.climb_s_per_m, flight.descent_s_per_m
+    up, down = 1 / flight.climb_m_per_s, 1 / flight.descent_m_per_s
     tree, costs = _grown(grid, flown, root)
     ours = tree.cost_at(costs.pad_all(starts))
     ours = ours + (surface - floor)[starts] * up + (surface - floor)[root] * down
@@ -115,18 +115,18 @@ def _over_stack(
 
 
 def _stack(
-    grid: GridSpec, levels: NDArray[np.float64], lowest: NDArray[np.intp], flight: Flight, root: int
+    grid: GridSpec, levels: NDArray[np.float64], lowest: NDArray[np.intp], flight: AirConfig, root: int
 ) -> NDArray[np.float64]:
     """Costs to the root from every cell of every level, by scipy: 26 neighbours."""
     apart_m = float(levels[1] - levels[0])
     tails, heads, seconds = [], [], []
     for south, east in [*_STEPS, (0, 0)]:
         below, ahead = _neighbours(grid, south, east)
-        level_s = grid.resolution_m * math.hypot(south, east) / flight.speed_mps
+        level_s = grid.resolution_m * math.hypot(south, east) / flight.speed_m_per_s
         for rise in (-1, 0, 1):
             if not (south or east or rise):
                 continue
-            cost_s = level_s + apart_m * (0.0, flight.climb_s_per_m, flight.descent_s_per_m)[rise]
+            cost_s = level_s + apart_m * (0.0, 1 / flight.climb_m_per_s, 1 / flight.descent_m_per_s)[rise]
             for level in range(max(-rise, 0), LEVELS - max(rise, 0)):
                 free = (lowest[below] <= level) & (lowest[ahead] <= level + rise)
                 tails.append((level * grid.cells + below[free]).astype(np.int32))

@@ -15,7 +15,8 @@ from support.effort import few
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.air import Flight, air_ground, clearance_floor, lifted_floor
+from shared_map.terrain.air import air_ground, clearance_floor, lifted_floor
+from swarm.config.classes import AirConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -79,7 +80,7 @@ def test_along_every_route_of_an_air_class_the_clearance_is_kept_between_centres
 ) -> None:
     grid = GridSpec(*heights.shape, 30.0)
     closed = np.random.default_rng(seed).random(heights.shape) < 0.1
-    flown = air_ground(grid, heights, Flight(speed_mps=15.0, clearance_m=clearance_m), closed)
+    flown = air_ground(grid, heights, AirConfig(clearance_m=clearance_m), closed=closed)
     free = np.flatnonzero(np.isfinite(flown.pace_s_per_m))
     assert not closed.reshape(-1)[free].any()
     assert not np.isnan(heights.reshape(-1)[free]).any()
@@ -114,15 +115,15 @@ def _way(costs: CostGrid, tree: CostToGoTree, cell: int) -> list[int]:
 
 
 def test_flat_ground_is_flown_over_at_the_clearance_and_level() -> None:
-    flown = air_ground(GridSpec(4, 5, 10.0), np.full((4, 5), 100, np.float32), Flight(speed_mps=20.0))
+    flown = air_ground(GridSpec(4, 5, 10.0), np.full((4, 5), 100, np.float32), AirConfig(speed_m_per_s=20.0))
     assert (flown.height_m == 160).all()
     assert (flown.pace_s_per_m == np.float32(0.05)).all()
     assert flown.climb.of_step(0, 1) == 1.0
 
 
-@pytest.mark.parametrize(("rise", "factor"), [(0.1, 1 + 15 * 0.1 / 3), (-0.1, 1 + 15 * 0.1 * 0.02)])
+@pytest.mark.parametrize(("rise", "factor"), [(0.1, 1 + 15 * 0.1 / 3), (-0.1, 1 + 15 * 0.1 / 10)])
 def test_a_climb_costs_what_the_class_says(rise: float, factor: float) -> None:
     grid = GridSpec(1, 40, 100.0)
     heights = (100 + 100 * rise * np.arange(40, dtype=np.float32))[None]
-    flown = air_ground(grid, heights, Flight(speed_mps=15.0, grade=0.2))
+    flown = air_ground(grid, heights, AirConfig(grade=0.2))
     assert flown.climb.of_step(20, 21) == pytest.approx(factor, rel=1e-3)

@@ -34,11 +34,6 @@ def test_other_planets_have_metres_of_their_own(tmp_path: Path, system: str, ste
     assert not np.isnan(source.elevation_m).any()
 
 
-def test_a_local_system_in_metres_is_as_good_as_any(tmp_path: Path) -> None:
-    source = load(written(tmp_path / "site.tif", hills(1, 50), crs='LOCAL_CS["site",UNIT["metre",1]]'))
-    assert (source.grid.crs, source.grid.resolution_m) == ("local", 20.0)
-
-
 def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> None:
     from rasterio.transform import from_origin
 

@@ -7,12 +7,8 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import ndimage
-from support.effort import few
 
-from shared_map.terrain import hidden
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.synthetic.noise import Noise, fractal_noise, mountain_noise
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
@@ -83,28 +79,6 @@ def test_a_hidden_zone_is_painted_on_the_truth_only(terrain: Terrain) -> None:
     truth = build_truth(scenario(HiddenConfig(zones=(square,))), terrain)
     assert np.isinf(truth[10:20, 10:20]).all()
     assert np.isfinite(terrain.pace_s_per_m[10:20, 10:20]).any()
-
-
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.35, 0.45, 0.6]), st.sampled_from([0.3, 0.7, 0.95]))
-@settings(max_examples=few(150), deadline=None)
-def test_closing_a_block_is_decided_as_if_all_parts_were_found_again(seed: int, walls: float, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    rows, cols = int(rng.integers(3, 50)), int(rng.integers(3, 50))
-    truth = np.where(rng.random((rows, cols)) < walls, np.inf, 1.0).astype(np.float32)
-    truth[rng.integers(rows)] = 1.0
-    slow = truth.copy()
-    parts, least = hidden._Parts(truth), share * largest(truth)
-    for _ in range(25):
-        row, col, half = int(rng.integers(rows)), int(rng.integers(cols)), int(rng.integers(1, 3))
-        block = (slice(max(row - half, 0), row + half + 1), slice(max(col - half, 0), col + half + 1))
-        kept = slow[block].copy()
-        slow[block] = np.inf
-        fits = largest(slow) >= least
-        if not fits:
-            slow[block] = kept
-        assert parts.close(block, least) == fits
-        np.testing.assert_array_equal(truth, slow)
-        assert parts.largest == largest(slow)
 
 
 @pytest.mark.parametrize("noise", [fractal_noise, mountain_noise])

@@ -74,10 +74,6 @@ def test_a_slope_too_gentle_to_see_between_two_cells_is_no_lake() -> None:
     assert np.count_nonzero(level_ground(slope).mask) == 1600
 
 
-def test_a_level_floor_without_a_shore_is_no_lake() -> None:
-    assert not level_ground(np.full((50, 50), 412, np.float32)).mask.any()
-
-
 @pytest.mark.parametrize("code", [np.inf, -np.inf, -3.4e38])
 def test_what_is_no_height_is_no_lake_and_no_warning(code: float) -> None:
     heights = HEIGHTS.copy()

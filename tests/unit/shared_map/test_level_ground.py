@@ -12,7 +12,6 @@ from scipy import ndimage
 from support.height_models import SIDE, hills, is_water, load, written
 from support.water_models import MODELS, UNKNOWABLE, counted
 
-from shared_map.importers import level_ground as module
 from shared_map.importers.level_ground import level_ground, undeclared_voids
 from shared_map.importers.plain_grids import read_npz
 from shared_map.importers.sources import _jacksboro_path
@@ -97,19 +96,6 @@ def test_water_of_every_kind_of_model_is_found_and_dry_ground_is_left(name: str)
     # What is missed where water is rough are ponds.
     rough = "laser" in name or "packed" in name or "filter" in name
     assert (shares["missed"] or 0) <= (0.1 if rough else 0.002)
-
-
-@pytest.mark.parametrize("band_rows", [8, 1000])
-@pytest.mark.parametrize("name", ["lakes, warped by a cubic filter", "coast, laser, +-0.1 m everywhere"])
-def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch, name: str, band_rows: int) -> None:
-    heights = MODELS[name]().heights_m
-    expected = level_ground(heights)
-    monkeypatch.setattr(
-        module, "bands", lambda rows, _=0: [(n, min(n + band_rows, rows)) for n in range(0, rows, band_rows)]
-    )
-    found = level_ground(heights)
-    np.testing.assert_array_equal(found.mask, expected.mask)
-    assert found.patches == expected.patches
 
 
 def test_the_arms_of_norris_lake_are_water() -> None:

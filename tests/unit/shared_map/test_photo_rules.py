@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy import ndimage
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.importers.cover import photo_rules
@@ -18,7 +15,6 @@ from shared_map.importers.cover.photo_rules import (
     EXPOSURES,
     Features,
     ground_readings,
-    line_strength,
 )
 from shared_map.importers.sources import Source, classified
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
@@ -82,37 +78,6 @@ def test_rules_in_place_say_what_rules_written_one_by_one_say() -> None:
                 other = as_read(f, *exposure)
                 expected |= np.choose(other, [BIT.get(kind, np.uint8(0)) for kind in TerrainClass]).astype(np.uint8)
             np.testing.assert_array_equal(ground_readings(f), expected)
-
-
-def strength_one_by_one(rgb: Bytes) -> Bytes:
-    """`line_strength` with a copy under a mask in place of maxima of masks."""
-    grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
-    smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * 8).astype(np.int16)
-    padded = np.pad(smooth, 6, mode="edge")
-
-    def moved(array: NDArray[np.int16], trim: int, down: float, right: float) -> NDArray[np.int16]:
-        dr, dc = round(down), round(right)
-        return array[trim + dr : array.shape[0] - trim + dr, trim + dc : array.shape[1] - trim + dc]
-
-    best, crest = np.zeros(grey.shape, np.int16), np.zeros(grey.shape, np.bool_)
-    for number in range(8):
-        down, right = math.sin(math.pi * number / 8), math.cos(math.pi * number / 8)
-        here = moved(padded, 2, 0, 0)
-        sides = np.maximum(moved(padded, 2, 2 * right, -2 * down), moved(padded, 2, -2 * right, 2 * down))
-        bend = moved(padded, 2, 2 * down, 2 * right) + moved(padded, 2, -2 * down, -2 * right) - 2 * here
-        contrast = np.clip(here - sides - np.abs(bend) // 4, -320, 320)
-        total = np.sum([moved(contrast, 4, tap * down, tap * right) for tap in (-4, -2, 0, 2, 4)], axis=0)
-        better = total > best
-        best[better] = total[better]
-        top = smooth >= np.maximum(moved(padded, 6, right, -down), moved(padded, 6, -right, down))
-        crest[better] = top[better]
-    return np.where(crest, np.clip(best // 4, 0, 255), 0).astype(np.uint8)
-
-
-def test_lines_are_as_strong_as_one_by_one() -> None:
-    for photo, _ in photos():
-        np.testing.assert_array_equal(line_strength(photo), strength_one_by_one(photo))
-        assert line_strength(photo[:3, :5]).shape == (3, 5)
 
 
 def test_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared_map.importers.plain_grids import read_pgm
 from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
 ASC = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\nNODATA_value -9999\n1 2 3\n4 -9999 6\n"
 MAP = "type octile\nheight 3\nwidth 4\nmap\n..@T\nGS.W\nO...\n"
 YAML = "image: m.pgm  # the picture\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n"
@@ -211,24 +208,3 @@ def test_resampling_a_map_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.pgm").write_bytes(b"P5 2 1 255\n\xff\xff")
     with pytest.raises(TerrainError, match="cannot be resampled without closing gaps"):
         load(tmp_path / "m.yaml", YAML, resolution_m=0.2)
-
-
-@needs_data
-@pytest.mark.parametrize("name", ["depot", "tb3_sandbox"])
-def test_real_ros_maps_have_free_and_lethal_ground(name: str) -> None:
-    source = load(DATA / "ros_maps" / f"{name}.yaml")
-    pixels, _ = read_pgm(DATA / "ros_maps" / f"{name}.pgm")
-    assert source.factor is not None
-    assert source.factor.shape == pixels.shape
-    assert (source.factor == 1).sum() == (pixels > 255 * 0.75).sum() or name != "depot"
-    assert np.isinf(source.factor).any()
-
-
-@needs_data
-@pytest.mark.parametrize(
-    "name", ["cities/Berlin_0_512", "mazes/maze512-32-0", "random/random512-10-0", "rooms/16room_000"]
-)
-def test_real_grid_maps_are_512_squared(name: str) -> None:
-    source = load(DATA / "movingai" / f"{name}.map")
-    assert source.elevation_m.shape == (512, 512)
-    assert 0.3 < np.isfinite(source.factor).mean() < 1

@@ -50,16 +50,6 @@ def test_a_terrain_is_made_once_and_is_the_same_ever_after(tmp_path: Path, built
     assert os.path.samefile(tmp_path / "one" / "pace.npy", tmp_path / "two" / "pace.npy")
 
 
-def test_the_terrain_that_comes_with_a_library_is_kept_until_that_is_another(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    key = store.kept_key(Scenario())
-    assert key is not None
-    version = store.version
-    monkeypatch.setattr(store, "version", lambda name: "0" if name == "matplotlib" else version(name))
-    assert store.kept_key(Scenario()) not in (key, None)
-
-
 OTHERS = {
     "seed": msgspec.structs.replace(SMALL, seed=4),
     "size": msgspec.structs.replace(SMALL, terrain=msgspec.structs.replace(SMALL.terrain, rows=41)),
