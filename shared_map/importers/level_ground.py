@@ -193,11 +193,10 @@ def looked_at(
     some_m = without(stored[::every, ::every], voids) * np.float32(scale) + np.float32(offset)
     found = level_ground(some_m)
     level = found.mask.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :cols]
-    return voids, level, [*notes_of_voids(unknown), *notes_of_level(found, config)]
+    return voids, level, [*_said_of_voids(unknown), *_said_of_level(found, config)]
 
 
-def notes_of_voids(voids: Sequence[float]) -> Iterator[str]:
-    """What people should know of undeclared voids."""
+def _said_of_voids(voids: Sequence[float]) -> Iterator[str]:
     for code in voids:
         yield (
             f"{code:g} is taken for no height: nothing else is near it, though the file does not declare it"
@@ -205,8 +204,7 @@ def notes_of_voids(voids: Sequence[float]) -> Iterator[str]:
         )
 
 
-def notes_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
-    """What people should know of level ground."""
+def _said_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
     if found.patches:
         (height_m, cells), many = found.patches[0], len(found.patches)
         taken = f"is taken for {config.level_is}, as terrain.level_is says"

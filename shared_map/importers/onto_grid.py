@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,68 +26,82 @@ def transform_of(grid: GridSpec, row0: int = 0) -> Any:
     return from_origin(grid.west_m, north, grid.resolution_m, grid.resolution_m)
 
 
-def grows(dataset: Any, transform: Any, crs: Any, grid: GridSpec, target: Any) -> bool:
-    """True if the grid is at least half as coarse again as the file: then its cells are averaged or counted."""
-    width, height = pixel_m(transform, dataset.height, dataset.width, crs, target)
-    return grid.resolution_m >= 1.5 * max(width, height)
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """How a raster comes onto the grid of a terrain.
 
-
-def warped(
-    source: Any, onto: NDArray[Any], grid: GridSpec, crs: Any, target: Any, how: str, row0: int = 0, **given: Any
-) -> NDArray[Any]:
-    """Brings a raster onto rows of a grid, in place.
-
-    Parameters
-    ----------
-    source : rasterio.Band or array (rows, cols)
-        An array needs its `src_transform`.
-    onto : array (rows, grid.cols)
-        Cells that the source does not reach become `dst_nodata`, or stay as they are.
-    crs, target : rasterio.CRS
-        Of the source and of the grid.
-    how : str
-        The name of one of rasterio's resamplings.
-    row0 : int
-        Row of the grid that is the first of `onto`.
-    **given
-        For `rasterio.warp.reproject`.
+    transform, crs  affine transform and coordinate system of the raster
+    target          the grid's system; None if the raster's pixels are the terrain's cells
+    share           of the terrain, within the raster's frame
     """
-    from rasterio.warp import Resampling, reproject
 
-    place = {"src_crs": crs, "dst_crs": target, "dst_transform": transform_of(grid, row0)}
-    reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=os.cpu_count() or 1)
-    return onto
+    dataset: Any
+    grid: GridSpec
+    transform: Any
+    crs: Any
+    target: Any
+    share: float = 1.0
+
+    @property
+    def grows(self) -> bool:
+        """True if the grid is at least half as coarse again: then its cells are averaged or counted."""
+        size = self.dataset.height, self.dataset.width
+        width, height = pixel_m(self.transform, *size, self.crs, self.target)
+        return self.grid.resolution_m >= 1.5 * max(width, height)
+
+    def warp(self, source: Any, onto: NDArray[Any], how: str, row0: int = 0, **given: Any) -> NDArray[Any]:
+        """Bring a band, or an array in its place, onto rows of the grid, in place.
+
+        Parameters
+        ----------
+        source : int or array (rows, cols)
+            Number of a band, or any number of cells over the same ground as the raster.
+        onto : array (rows, grid.cols)
+            Cells that the source does not reach become `dst_nodata`, or stay as they are.
+        how : str
+            The name of one of rasterio's resamplings.
+        row0 : int
+            Row of the grid that is the first of `onto`.
+        **given
+            For `rasterio.warp.reproject`.
+        """
+        import rasterio
+        from rasterio.transform import Affine
+        from rasterio.warp import Resampling, reproject
+
+        place = {"src_crs": self.crs, "dst_crs": self.target, "dst_transform": transform_of(self.grid, row0)}
+        if isinstance(source, int):
+            source = rasterio.band(self.dataset, source)
+        else:
+            rows, cols = source.shape
+            stretch = Affine.scale(self.dataset.width / cols, self.dataset.height / rows)
+            place["src_transform"] = self.transform @ stretch
+        threads = os.cpu_count() or 1
+        reproject(source, onto, **place, **given, resampling=Resampling[how], num_threads=threads)
+        return onto
 
 
-def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str) -> tuple[Any, Any, float]:
+def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str) -> Placed:
     """How a file comes onto the terrain's grid.
-
-    Returns
-    -------
-    crs, target : rasterio.CRS or None
-        Of the file and of the grid; None, None if its pixels are the terrain's cells.
-    share : float
-        Share of the terrain within the file's frame.
 
     Raises TerrainError if one of the two has no place on Earth and they differ in size, the file does not say in
     which system it is (nor does `given`), or does not overlap the terrain.
     """
     import rasterio
 
-    same_shape = (dataset.height, dataset.width) == (grid.rows, grid.cols)
+    same_shape = (dataset.height, dataset.width) == grid.shape
     if not (dataset.crs or not dataset.transform.is_identity) or grid.crs == "local":
         if not same_shape:
             raise TerrainError(
                 f"{what} has {dataset.height} x {dataset.width} pixels and no place in common with the terrain of"
                 f" {grid.rows} x {grid.cols} cells; georeference both, or make them the same size"
             )
-        return None, None, 1.0
+        return Placed(dataset, grid, dataset.transform, None, None)
     crs = crs_of(dataset.crs, given if not dataset.crs else None, what)
     target = rasterio.CRS.from_user_input(grid.crs)
     share = overlap(dataset, crs, target, grid, what)
-    if crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3):
-        return None, None, share
-    return crs, target, share
+    is_cells = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
+    return Placed(dataset, grid, dataset.transform, crs, None if is_cells else target, share)
 
 
 def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:

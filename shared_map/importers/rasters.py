@@ -22,13 +22,13 @@ from shared_map.importers.cover.land_cover import read_cover
 from shared_map.importers.encoded_heights import TITLES, Encoding, encodings_of, heights_decoded
 from shared_map.importers.georeference import crs_of, overruled, plan_grid
 from shared_map.importers.level_ground import MOST_SAMPLED, looked_at, without
-from shared_map.importers.onto_grid import grows, nearest, warped
+from shared_map.importers.onto_grid import Placed, nearest
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
 from shared_map.importers.sources import Source
 from shared_map.terrain.row_bands import Progress, bands
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
-from swarm.grid import MAX_CELLS, GridSpec
+from swarm.grid import MAX_CELLS
 
 _UNITS_M = {
     **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
@@ -222,8 +222,6 @@ def _heights(
 
     whole  all heights as they are stored, NaN where there is none; None: they are read from the first band
     """
-    import rasterio
-
     if whole is None and dataset.count >= 3:
         raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
     if np.dtype(dataset.dtypes[0]).kind not in "iuf":
@@ -234,21 +232,22 @@ def _heights(
     if dataset.count == 2:
         told.append("the file has two bands; heights are taken from the first")
     voids, found, looks = looked_at(_sampled(dataset) if whole is None else whole, config, factor, offset)
-    level = _level_on(dataset, found, place, grid, target)
+    placed = Placed(dataset, grid, place.transform, place.crs, target)
+    if target is None:
+        level: Bools = found[nearest(found, grid)]
+    else:
+        level = placed.warp(found.astype(np.uint8), np.zeros(grid.shape, np.uint8), "nearest") > 0
     if voids and target is not None:
         whole = without(_whole(dataset, voids, path) if whole is None else whole, voids)
-    given: dict[str, Any] = {"src_nodata": math.nan, "dst_nodata": math.nan}
-    if whole is not None:
-        given["src_transform"] = place.transform
-    elif dataset.nodata is not None or np.dtype(dataset.dtypes[0]).kind != "f":
-        given["src_nodata"] = dataset.nodata
-    how = "average" if grows(dataset, place.transform, place.crs, grid, target) else "bilinear"
+    void = math.nan
+    if whole is None and (dataset.nodata is not None or np.dtype(dataset.dtypes[0]).kind != "f"):
+        void = dataset.nodata
+    how = "average" if placed.grows else "bilinear"
     elevation_m = np.empty(grid.shape, np.float32)
     for row0, row1 in bands(grid.rows, READ_ROWS):
         band = elevation_m[row0:row1]
         if target is not None:
-            source = rasterio.band(dataset, 1) if whole is None else whole
-            warped(source, band, grid, place.crs, target, how, row0, **given)
+            placed.warp(1 if whole is None else whole, band, how, row0, src_nodata=void, dst_nodata=math.nan)
         else:
             band[:] = without(_rows_of(dataset, row0, row1) if whole is None else whole[row0:row1], voids)
         if (factor, offset) != (1.0, 0.0):
@@ -310,16 +309,3 @@ def _whole(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
             " large to mend here: gdal_calc or gdal_edit.py -a_nodata does it"
         )
     return _rows_of(dataset, 0, dataset.height)
-
-
-def _level_on(dataset: Any, mask: Bools, place: _Place, grid: GridSpec, target: Any) -> Bools:
-    """A mask of a dataset's ground, of any number of cells, on the terrain's grid: the nearest cell counts."""
-    from rasterio.transform import Affine
-
-    rows, cols = mask.shape
-    if target is None:
-        return np.asarray(mask[nearest(mask, grid)], np.bool_)
-    placed = np.zeros((grid.rows, grid.cols), np.uint8)
-    stretched = place.transform @ Affine.scale(dataset.width / cols, dataset.height / rows)
-    source = mask.astype(np.uint8)
-    return warped(source, placed, grid, place.crs, target, "nearest", src_transform=stretched) > 0

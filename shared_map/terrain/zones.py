@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, assert_never
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.importers.raster_files import mask_of
@@ -20,7 +21,7 @@ from swarm.places import corners_of, extent_of
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
-    from shared_map.importers.zones.zone_files import Burnt, FileFacts
+    from shared_map.importers.zones.zone_files import FileFacts
 
 PREFERRED_FACTOR = np.float32(0.5)
 ROUGH_FACTOR = np.float32(2.0)
@@ -31,7 +32,7 @@ _APPROACH_CELLS = 3
 has a width by its class, so that it may reach beyond the ends of the bridge."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class ZoneFacts:
     """What a zone did to the terrain, for people.
 
@@ -44,10 +45,10 @@ class ZoneFacts:
 
     name: str
     kind: str
-    cells: int
-    changed: int
-    lethal: int
-    opened: int
+    cells: int = 0
+    changed: int = 0
+    lethal: int = 0
+    opened: int = 0
     file: FileFacts | None = None
 
     def told(self, cells: int) -> str:
@@ -121,30 +122,28 @@ def paint_zones(
         painter.bridges(each)
     for each in painted:
         painter.forbidden(each)
-    return [each.facts() for each in painted]
+    return [each.facts for each in painted]
 
 
-_NOTHING = (Window(0, 0, 0, 0), np.zeros((0, 0), np.float32))
+Part = tuple[Window, NDArray[Any]]
+"""A window and an array of its cells."""
+_NOTHING: Part = (Window(0, 0, 0, 0), np.zeros((0, 0), np.float32))
 
 
 @dataclass(eq=False)
 class _Painted:
-    """A zone while it is painted. Parts are (window, array).
+    """A zone while it is painted.
 
-    values  factor or pace, NaN where there is none; kept after they are painted where a bridge needs them only
-    lethal  where it is lethal
+    values   factor or pace, NaN where there is none; kept after they are painted where a bridge needs them only
+    lethal   where it is lethal
+    bridges  where its road is a bridge
     """
 
     zone: ZoneConfig
-    values: tuple[Window, Floats] | None
-    lethal: tuple[Window, Bools] | None
-    burnt: Burnt | None = None
-    cells: int = 0
-    counts: dict[str, int] = field(default_factory=lambda: {"changed": 0, "lethal": 0, "opened": 0})
-
-    def facts(self) -> ZoneFacts:
-        file = None if self.burnt is None else self.burnt.facts
-        return ZoneFacts(self.zone.called, self.zone.kind, self.cells, **self.counts, file=file)
+    facts: ZoneFacts
+    values: Part = _NOTHING
+    lethal: Part = _NOTHING
+    bridges: Part = _NOTHING
 
 
 def _around(inside: Bools) -> Window:
@@ -168,30 +167,30 @@ class _Painter:
 
     def read(self, zone: ZoneConfig, where: str) -> _Painted:
         """What a zone covers."""
+        facts = ZoneFacts(zone.called, zone.kind)
         if zone.file is not None:
             from shared_map.importers.zones.zone_files import burn_zone
 
             burnt = burn_zone(zone, self._grid, f"{where} {zone.called!r}")
-            cells = int((~np.isnan(burnt.values[1])).sum()) + int(burnt.lethal[1].sum())
-            return _Painted(zone, burnt.values, burnt.lethal, replace(burnt, values=_NOTHING), cells)
+            facts.cells = int((~np.isnan(burnt.values[1])).sum()) + int(burnt.lethal[1].sum())
+            facts.file = burnt.facts
+            return _Painted(zone, facts, burnt.values, burnt.lethal, burnt.bridges)
         inside = zone_mask(zone, self._grid, where)
         window = _around(inside)
-        inside = inside[_part(window)]
-        found = _Painted(zone, None, None, cells=int(inside.sum()))
+        inside = inside[_part(window)].copy()
+        facts.cells = int(inside.sum())
         if zone.kind in ("forbidden", "water"):
-            found.lethal = (window, inside.copy())
-        else:
-            found.values = (window, np.where(inside, np.float32(zone.value or 1.0), np.float32(np.nan)))
-        return found
+            return _Painted(zone, facts, lethal=(window, inside))
+        values = np.where(inside, np.float32(zone.value or 1.0), np.float32(np.nan))
+        return _Painted(zone, facts, values=(window, values))
 
     def cost(self, painted: _Painted) -> None:
         """What is no more than costly."""
-        zone = painted.zone
-        if painted.values is not None and not painted.values[0].empty:
-            window, values = painted.values
-            self._set(painted, window, self._changed(zone, window, values, from_file=zone.file is not None))
-        if painted.burnt is None or painted.burnt.bridges[0].empty:
-            painted.values = None
+        zone, (window, values) = painted.zone, painted.values
+        if not window.empty:
+            self._set(painted.facts, window, self._changed(zone, window, values, from_file=zone.file is not None))
+        if painted.bridges[0].empty:
+            painted.values = _NOTHING
 
     def _changed(self, zone: ZoneConfig, window: Window, values: Floats, *, from_file: bool) -> Floats:
         """The pace of a window with a zone in it."""
@@ -232,10 +231,10 @@ class _Painter:
 
     def water(self, painted: _Painted) -> None:
         """Water closes what it covers, roads too; so does what paces and factors say to be lethal."""
-        if painted.zone.kind not in ("water", "pace", "factor") or painted.lethal is None:
-            return
         window, wet = painted.lethal
-        if painted.zone.kind == "water" and self._classes is not None and painted.burnt is not None:
+        if painted.zone.kind not in ("water", "pace", "factor") or window.empty:
+            return
+        if painted.zone.kind == "water" and self._classes is not None and painted.zone.file is not None:
             self._classes[_part(window)][wet] = TerrainClass.WATER
         self._close(painted)
         if self._water is None:
@@ -244,11 +243,8 @@ class _Painter:
 
     def bridges(self, painted: _Painted) -> None:
         """Bridges open the water beneath them, and the ends of their roads that lie in it."""
-        if painted.values is None or painted.burnt is None or self._water is None:
-            return
-        window, values = painted.values
-        over, deck = painted.burnt.bridges
-        if window.empty or over.empty:
+        (window, values), (over, deck) = painted.values, painted.bridges
+        if self._water is None or window.empty or over.empty:
             return
         from scipy import ndimage
 
@@ -260,7 +256,7 @@ class _Painter:
         )
         after = self._pace[_part(window)].copy()
         self._lay(window, after, values, open_, from_file=True)
-        painted.counts["opened"] += int((np.isinf(self._pace[_part(window)]) & np.isfinite(after)).sum())
+        painted.facts.opened += int((np.isinf(self._pace[_part(window)]) & np.isfinite(after)).sum())
         self._pace[_part(window)] = after
 
     def forbidden(self, painted: _Painted) -> None:
@@ -269,17 +265,16 @@ class _Painter:
             self._close(painted)
 
     def _close(self, painted: _Painted) -> None:
-        if painted.lethal is not None and not painted.lethal[0].empty:
-            window, closed = painted.lethal
-            self._set(painted, window, np.where(closed, LETHAL, self._pace[_part(window)]))
+        window, closed = painted.lethal
+        if not window.empty:
+            self._set(painted.facts, window, np.where(closed, LETHAL, self._pace[_part(window)]))
 
-    def _set(self, painted: _Painted, window: Window, after: Floats) -> None:
-        part = _part(window)
-        before, counts = self._pace[part], painted.counts
-        counts["changed"] += int((before != after).sum())
-        counts["lethal"] += int((np.isfinite(before) & np.isinf(after)).sum())
-        counts["opened"] += int((np.isinf(before) & np.isfinite(after)).sum())
-        self._pace[part] = after
+    def _set(self, facts: ZoneFacts, window: Window, after: Floats) -> None:
+        before = self._pace[_part(window)]
+        facts.changed += int((before != after).sum())
+        facts.lethal += int((np.isfinite(before) & np.isinf(after)).sum())
+        facts.opened += int((np.isinf(before) & np.isfinite(after)).sum())
+        self._pace[_part(window)] = after
 
 
 def files_of_zone(zone: ZoneConfig) -> list[Path]:

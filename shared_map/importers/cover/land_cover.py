@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.importers.cover.cover_codes import HIGHEST_CODE, NOTHING, CoverTable, joined, some
 from shared_map.importers.cover.cover_meaning import Meaning, meaning_of, why_unknown
-from shared_map.importers.onto_grid import grows, place_on, warped
+from shared_map.importers.onto_grid import place_on
 from shared_map.importers.raster_files import READ_ROWS, opened
 from shared_map.importers.sources import Source
 from shared_map.terrain.layers import TerrainClass
@@ -93,25 +93,26 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
         meaning = meaning_of(dataset, what, config)
         if meaning is None:
             raise TerrainError(why_unknown(dataset, what))
-        crs, target, share = place_on(dataset, grid, config.crs, what)
-        notes, how = [], ""
-        if target is not None:
-            counted = grows(dataset, dataset.transform, crs, grid, target)
-            how, taken = ("mode", "most frequent") if counted else ("nearest", "nearest")
-            size = f"{dataset.height} x {dataset.width} pixels"
+        placed = place_on(dataset, grid, config.crs, what)
+        notes, how = [], "mode" if placed.target is not None and placed.grows else "nearest"
+        if placed.target is not None:
+            taken, size = {"mode": "most frequent"}.get(how, how), f"{dataset.height} x {dataset.width} pixels"
             notes.append(f"land cover: {size}, each cell takes the {taken} code")
-        if share < 0.999:
-            notes.append(f"the land cover's frame covers {share:.1%} of the terrain")
+        if placed.share < 0.999:
+            notes.append(f"the land cover's frame covers {placed.share:.1%} of the terrain")
 
         def codes_of(row0: int, row1: int) -> NDArray[Any]:
-            if target is not None:
-                return _warped(dataset, stored, row0, row1, grid, crs, target, how)
-            return _codes(dataset, meaning, row0, row1) if stored is None else stored[row0:row1]
+            if placed.target is None:
+                return _codes(dataset, meaning, row0, row1) if stored is None else stored[row0:row1]
+            codes = np.full((row1 - row0, grid.cols), _NO_CODE, np.int32)
+            nodata = dataset.nodata if stored is None else NOTHING
+            source = 1 if stored is None else stored
+            return placed.warp(source, codes, how, row0, src_nodata=nodata, dst_nodata=_NO_CODE)
 
         stored = _codes_in_memory(dataset, meaning)
         kinds, factors, states = _look_up(meaning.table)
-        shape = (grid.rows, grid.cols)
-        classes, factor, known = np.empty(shape, np.uint8), np.empty(shape, np.float32), np.empty(shape, np.bool_)
+        classes, factor = np.empty(grid.shape, np.uint8), np.empty(grid.shape, np.float32)
+        known = np.empty(grid.shape, np.bool_)
         cells = np.zeros(HIGHEST_CODE + 3, np.int64)
         for row0, row1 in bands(grid.rows, READ_ROWS):
             at = _entries(codes_of(row0, row1))
@@ -180,19 +181,6 @@ def _codes(dataset: Any, meaning: Meaning, row0: int, row1: int) -> NDArray[Any]
         codes = meaning.codes[np.clip(codes, 0, len(meaning.codes) - 1).astype(np.intp)].astype(np.float64)
     codes[~shown] = NOTHING
     return codes
-
-
-def _warped(
-    dataset: Any, stored: NDArray[Any] | None, row0: int, row1: int, grid: GridSpec, crs: Any, target: Any, how: str
-) -> NDArray[Any]:
-    import rasterio
-
-    codes = np.full((row1 - row0, grid.cols), _NO_CODE, np.int32)
-    source = rasterio.band(dataset, 1) if stored is None else stored
-    nodata = dataset.nodata if stored is None else NOTHING
-    place = None if stored is None else dataset.transform
-    given = {"src_transform": place, "src_nodata": nodata, "dst_nodata": _NO_CODE}
-    return warped(source, codes, grid, crs, target, how, row0, **given)
 
 
 def _told(what: str, meaning: Meaning, cells: NDArray[np.int64], states: Bytes) -> Iterable[str]:

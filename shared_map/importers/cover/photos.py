@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
-from shared_map.importers.onto_grid import grows, place_on, warped
+from shared_map.importers.onto_grid import Placed, place_on
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
@@ -61,54 +61,42 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     """
     what = f"photo {path}"
     with opened(path, "photo") as dataset:
-        crs, target, share = place_on(dataset, grid, given_crs, what)
+        placed = place_on(dataset, grid, given_crs, what)
         notes = []
         if grid.crs != "local" and (dataset.crs or not dataset.transform.is_identity):
-            notes.append(f"photo: {dataset.height} x {dataset.width} pixels, covers {share:.1%} of the terrain")
-        return _read(dataset, _Onto(dataset, grid, crs, target), notes, progress)
+            notes.append(
+                f"photo: {dataset.height} x {dataset.width} pixels, covers {placed.share:.1%} of the terrain"
+            )
+        return _read(placed, notes, progress)
 
 
-@dataclass(frozen=True, eq=False)
-class _Onto:
-    """A photo's way onto rows of the terrain's grid; `target` is None where its pixels are the terrain's cells."""
-
-    dataset: Any
-    grid: GridSpec
-    crs: Any
-    target: Any
-
-    def band(self, index: int, row0: int, row1: int) -> NDArray[Any]:
-        """Rows of a band, 0 beyond the photo. Palettes and transparency are not interpolated."""
-        import rasterio
-        from rasterio.enums import ColorInterp
-        from rasterio.windows import Window
-
-        dataset, grid, target = self.dataset, self.grid, self.target
-        if target is None:
-            return np.asarray(dataset.read(index, window=Window(0, row0, dataset.width, row1 - row0)))
-        how = "average" if grows(dataset, dataset.transform, self.crs, grid, target) else "bilinear"
-        if dataset.colorinterp[index - 1] in (ColorInterp.palette, ColorInterp.alpha):
-            how = "nearest"
-        rows = np.zeros((row1 - row0, grid.cols), dataset.dtypes[index - 1])
-        return warped(rasterio.band(dataset, index), rows, grid, self.crs, target, how, row0)
-
-    def frame(self, row0: int, row1: int) -> Bools:
-        """Which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
-        from rasterio.transform import Affine
-
-        if self.target is None:
-            return np.ones((row1 - row0, self.grid.cols), np.bool_)
-        ones = np.ones((min(self.dataset.height, 64), min(self.dataset.width, 64)), np.uint8)
-        wide, high = self.dataset.width / ones.shape[1], self.dataset.height / ones.shape[0]
-        coarse = self.dataset.transform @ Affine.scale(wide, high)
-        inside = np.zeros((row1 - row0, self.grid.cols), np.uint8)
-        return warped(ones, inside, self.grid, self.crs, self.target, "nearest", row0, src_transform=coarse) > 0
-
-
-def _read(dataset: Any, onto: _Onto, notes: list[str], progress: Progress) -> Photo:
+def _band(placed: Placed, index: int, row0: int, row1: int) -> NDArray[Any]:
+    """Rows of a band on the grid, 0 beyond the photo. Palettes and transparency are not interpolated."""
     from rasterio.enums import ColorInterp
 
-    grid = onto.grid
+    dataset = placed.dataset
+    if placed.target is None:
+        return np.asarray(dataset.read(index, window=((row0, row1), (0, dataset.width))))
+    how = "average" if placed.grows else "bilinear"
+    if dataset.colorinterp[index - 1] in (ColorInterp.palette, ColorInterp.alpha):
+        how = "nearest"
+    return placed.warp(index, np.zeros((row1 - row0, placed.grid.cols), dataset.dtypes[index - 1]), how, row0)
+
+
+def _frame(placed: Placed, row0: int, row1: int) -> Bools:
+    """Which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
+    inside = np.zeros((row1 - row0, placed.grid.cols), np.uint8)
+    if placed.target is None:
+        return inside == 0
+    ones = np.ones((min(placed.dataset.height, 64), min(placed.dataset.width, 64)), np.uint8)
+    seen: Bools = placed.warp(ones, inside, "nearest", row0) > 0
+    return seen
+
+
+def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
+    from rasterio.enums import ColorInterp
+
+    dataset, grid = placed.dataset, placed.grid
     indexes, palette = _colour_bands(dataset)
     meanings = list(dataset.colorinterp)
     alpha = meanings.index(ColorInterp.alpha) + 1 if ColorInterp.alpha in meanings else None
@@ -118,14 +106,14 @@ def _read(dataset: Any, onto: _Onto, notes: list[str], progress: Progress) -> Ph
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
     for row0, row1 in bands(grid.rows, READ_ROWS):
-        raw = [onto.band(index, row0, row1) for index in indexes]
-        inside = onto.frame(row0, row1)
+        raw = [_band(placed, index, row0, row1) for index in indexes]
+        inside = _frame(placed, row0, row1)
         if raw[0].dtype.kind == "f":
             inside &= ~np.any([np.isnan(values) for values in raw], axis=0)
         if dataset.nodata is not None:
             inside &= ~np.all([values == dataset.nodata for values in raw], axis=0)
         if alpha is not None:
-            inside &= onto.band(alpha, row0, row1) > 0
+            inside &= _band(placed, alpha, row0, row1) > 0
         seen[row0:row1] = inside
         for channel in range(3):
             values = raw[channel % len(raw)]

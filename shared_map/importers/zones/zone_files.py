@@ -15,7 +15,7 @@ import numpy as np
 
 from shared_map.arrays import Bools, Floats
 from shared_map.importers.georeference import crs_name
-from shared_map.importers.onto_grid import grows, overlap, warped
+from shared_map.importers.onto_grid import Placed, overlap
 from shared_map.importers.raster_files import is_raster, opened
 from shared_map.importers.zones import way_classes
 from shared_map.importers.zones.burn import Drawn, burn
@@ -292,8 +292,7 @@ def _values_on(dataset: Any, grid: GridSpec, crs: str | None, what: str) -> tupl
     stored[dataset.read_masks(1) == 0] = np.nan
     stored *= np.float32(dataset.scales[0] or 1.0)
     stored += np.float32(dataset.offsets[0] or 0.0)
-    how = "average" if grows(dataset, dataset.transform, own, grid, target) else "nearest"
-    values = np.full(grid.shape, np.nan, np.float32)
-    place = {"src_transform": dataset.transform, "src_nodata": math.nan, "dst_nodata": math.nan}
-    warped(stored, values, grid, own, target, how, **place)
+    placed, values = Placed(dataset, grid, dataset.transform, own, target), np.full(grid.shape, np.nan, np.float32)
+    how = "average" if placed.grows else "nearest"
+    placed.warp(stored, values, how, src_nodata=math.nan, dst_nodata=math.nan)
     return values, "local" if crs == "local" else crs_name(own)

@@ -17,7 +17,6 @@ from shared_map.importers.cover.classify import Labels, class_readings, confusio
 from shared_map.importers.cover.photo_rules import box_sum
 from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
-from shared_map.terrain.row_bands import counted, looked_up
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from shared_map.terrain.synthetic.noise import fractal_noise
 from swarm.config.ground import TerrainConfig
@@ -255,12 +254,3 @@ def test_means_of_bytes_are_those_of_scipy(reach: int) -> None:
     found = box_sum(padded, reach) / side**2
     expected = ndimage.uniform_filter(photo.astype(np.float64), (side, side, 1))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-def test_labels_are_counted_and_looked_up_band_by_band() -> None:
-    rng = np.random.default_rng(2)
-    labels = rng.integers(0, 9, (300, 17)).astype(np.int32)
-    where, flags = rng.random((300, 17)) < 0.3, rng.random(9) < 0.5
-    np.testing.assert_array_equal(counted(labels, 9), np.bincount(labels.ravel(), minlength=9))
-    np.testing.assert_array_equal(counted(labels, 9, where), np.bincount(labels[where], minlength=9))
-    np.testing.assert_array_equal(looked_up(flags, labels), flags[labels])

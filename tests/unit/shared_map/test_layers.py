@@ -8,9 +8,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from support.effort import few
 
 from shared_map.importers.sources import load_source
 from shared_map.terrain.layers import (
@@ -22,7 +19,7 @@ from shared_map.terrain.layers import (
     slope_deg,
     terrain_pace,
 )
-from shared_map.terrain.slope_rules import SLOPE_RULES, directional_factor, slope_factor
+from shared_map.terrain.slope_rules import slope_factor
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
@@ -96,10 +93,6 @@ def test_roughness_is_what_stands_off_the_even_slope() -> None:
     assert pace[1][0, 0] == pytest.approx(3 * pace[0][0, 0])
 
 
-def test_every_slope_rule_of_the_scenario_has_a_row() -> None:
-    assert set(SLOPE_RULES) == set(RULES)
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_level_ground_costs_one_and_steeper_never_less(rule: str) -> None:
     cost = ruled(rule, max_slope_deg=35)
@@ -120,34 +113,6 @@ def test_linear_and_quadratic_reach_the_steep_factor_at_the_limit() -> None:
         cost = CostConfig(slope_rule=rule, max_slope_deg=30, steep_factor=5)
         assert slope_factor(limit, cost)[0] == pytest.approx(5, rel=1e-3)
         assert slope_factor(half, cost)[0] == pytest.approx(middle, rel=1e-4)
-
-
-def test_tobler_walks_fastest_slightly_downhill() -> None:
-    cost = CostConfig(slope_rule="tobler", max_slope_deg=60)
-    rises = np.linspace(-0.5, 0.5, 1001).astype(np.float32)
-    factor = directional_factor(rises, cost)
-    assert rises[np.argmin(factor)] == pytest.approx(-0.05, abs=0.002)
-    assert directional_factor(np.zeros(1, np.float32), cost)[0] == pytest.approx(1)
-    # 6 exp(-3.5 |0.2 + 0.05|) km/h against 6 exp(-3.5 * 0.05) on the level
-    assert directional_factor(np.array([0.2], np.float32), cost)[0] == pytest.approx(math.exp(3.5 * 0.2), rel=1e-5)
-
-
-@pytest.mark.parametrize("rule", [rule for rule, row in SLOPE_RULES.items() if row.is_directed])
-def test_uphill_is_not_downhill(rule: str) -> None:
-    cost = ruled(rule)
-    up, down = directional_factor(np.array([0.2, -0.2], np.float32), cost)
-    assert up > down * 1.3
-    both = slope_factor(np.array([0.2], np.float32), cost)[0]
-    assert both == pytest.approx((up + down) / 2, rel=1e-6)
-
-
-@given(grade=st.floats(0, 100, width=32), factor=st.floats(0.125, 1e6, width=32), rule=st.sampled_from(RULES))
-@settings(max_examples=few(200), deadline=None)
-def test_costly_is_not_lethal(grade: float, factor: float, rule: str) -> None:
-    cost = ruled(rule, max_slope_deg=90, class_factor={"rock": factor})
-    pace = terrain_pace(np.array([[grade]], np.float32), np.array([[TerrainClass.ROCK]], np.uint8), cost)
-    assert np.isfinite(pace).all()
-    assert (pace > 0).all()
 
 
 def test_the_merge_rule_cell_by_cell() -> None:
