@@ -67,8 +67,6 @@ _MAX_PIXELS = 16 * MAX_CELLS
 """Of formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
 """A block is what has to be unpacked at once."""
-_MOST_BLOCKS = 1 << 20
-"""Of a band of a sparse file."""
 _MAX_BANDS = 256
 
 

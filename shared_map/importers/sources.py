@@ -68,17 +68,8 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     ------
     TerrainError
         With one sentence: a file is missing, damaged, of an unknown kind or without heights, a key that it needs is
-        not set, photo and terrain do not overlap, or memory does not suffice.
+        not set, or photo and terrain do not overlap.
     """
-    try:
-        return _loaded(config, seed, progress)
-    except MemoryError as error:
-        raise TerrainError(
-            f"terrain {config.source} does not fit into memory; crop it or set a larger terrain.resolution_m"
-        ) from error
-
-
-def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
     if config.source == "synthetic":
         source = _synthetic(config, seed)
     elif config.source == "jacksboro":
@@ -86,8 +77,11 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
     else:
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
-    if config.photo is not None:
-        config = _photo_or_cover(config)
+    if config.photo is not None and config.cover is None and config.labels is None:
+        from shared_map.importers.cover.cover_meaning import is_drawn
+
+        if is_drawn(Path(config.photo), config):
+            config = msgspec.structs.replace(config, photo=None, cover=config.photo)
     if config.photo is not None:
         source = with_photo(source, Path(config.photo), config, progress)
     if source.photo is not None:
@@ -100,19 +94,6 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
 
         source = with_cover(source, config, progress)
     return source
-
-
-def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
-    """The settings with a photo that is a drawn map of land cover named as such."""
-    from shared_map.importers.cover.cover_meaning import is_drawn
-
-    if config.photo is None or config.cover is not None or config.labels is not None:
-        return config
-    return (
-        msgspec.structs.replace(config, photo=None, cover=config.photo)
-        if is_drawn(Path(config.photo), config)
-        else config
-    )
 
 
 # --- built in -----------------------------------------------------------------------------------------------

@@ -87,12 +87,13 @@ def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_
     """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence."""
     from shared_map.importers.sources import load_source
 
-    source = load_source(scenario.terrain, scenario.seed, progress)
     try:
+        source = load_source(scenario.terrain, scenario.seed, progress)
         return _built(of_class(scenario, vehicle_class), source, progress, scenario.cost)
     except MemoryError as error:
         raise TerrainError(
-            f"terrain {scenario.terrain.source} does not fit into memory; set a larger terrain.resolution_m"
+            f"terrain {scenario.terrain.source} does not fit into memory; crop it, or set a larger"
+            " terrain.resolution_m"
         ) from error
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
+from shared_map.importers.cover.cover_codes import joined
 from shared_map.importers.onto_grid import Placed, place_on
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned
 from shared_map.terrain.row_bands import Progress, bands, no_progress
@@ -87,7 +88,7 @@ def _frame(placed: Placed, row0: int, row1: int) -> Bools:
     """Which cells of some rows lie inside the photo's frame at all: a coarse frame of ones, warped."""
     inside = np.zeros((row1 - row0, placed.grid.cols), np.uint8)
     if placed.target is None:
-        return inside == 0
+        return np.ones(inside.shape, np.bool_)
     ones = np.ones((min(placed.dataset.height, 64), min(placed.dataset.width, 64)), np.uint8)
     seen: Bools = placed.warp(ones, inside, "nearest", row0) > 0
     return seen
@@ -194,10 +195,8 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
     drawn = why_drawn(rgb, seen)
     if drawn is not None:
         return drawn
-    stride = max(-(-max(seen.shape) // MOST_SIDE), 1)
-    some, shown = rgb[::stride, ::stride].astype(np.int32), seen[::stride, ::stride]
-    red, green, blue = some[..., 0], some[..., 1], some[..., 2]
-    lit = shown & (red + green + blue > _DARK)
+    red, green, blue = np.moveaxis(_middle(rgb).astype(np.int32), -1, 0)
+    lit = _middle(seen) & (red + green + blue > _DARK)
     false = (red > _RED_OVER_GREEN * green) & (np.abs(green - blue) < _LIKE_BLUE * red) & lit
     share = false.sum() / max(int(lit.sum()), 1)
     if share > _FALSE_SHARE:
@@ -210,13 +209,15 @@ def why_drawn(rgb: Bytes, seen: Bools) -> str | None:
 
     Pixels must be the file's own, or copies of them: between two colours of a legend an interpolation makes others.
     """
-    stride = max(-(-max(seen.shape) // MOST_SIDE), 1)
-    rows, cols = min(seen.shape[0], MOST_SIDE), min(seen.shape[1], MOST_SIDE)
-    middle = rgb[:rows, :cols] if stride == 1 else rgb[(len(rgb) - rows) // 2 :, (rgb.shape[1] - cols) // 2 :]
-    middle = middle[:rows, :cols]
-    same = (middle[1:, 1:] == middle[:-1, 1:]).all(axis=2) & (middle[1:, 1:] == middle[1:, :-1]).all(axis=2)
-    some, shown = rgb[::stride, ::stride].astype(np.int32), seen[::stride, ::stride]
-    colours = np.unique((some[..., 0] << 16 | some[..., 1] << 8 | some[..., 2])[shown]).size
+    some = _middle(rgb)
+    same = (some[1:, 1:] == some[:-1, 1:]).all(axis=2) & (some[1:, 1:] == some[1:, :-1]).all(axis=2)
+    colours = np.unique(joined(np.moveaxis(some, -1, 0))[_middle(seen)]).size
     if 1 < colours <= _LEGEND_COLOURS and same.mean() > _LEGEND_SAME:
         return f"a drawn map: it has {colours} colours, in areas"
     return None
+
+
+def _middle(array: NDArray[Any]) -> NDArray[Any]:
+    """At most `MOST_SIDE` rows and columns in the middle of an array."""
+    row0, col0 = (max(side - MOST_SIDE, 0) // 2 for side in array.shape[:2])
+    return array[row0 : row0 + MOST_SIDE, col0 : col0 + MOST_SIDE]

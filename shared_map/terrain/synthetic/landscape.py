@@ -9,7 +9,7 @@ import numpy as np
 
 from shared_map.arrays import Bytes, Floats
 from shared_map.terrain import layers
-from shared_map.terrain.layers import TerrainClass, grade_of_padded, gradient, gradient_of_padded
+from shared_map.terrain.layers import TerrainClass, grade_of_padded, gradient_of_padded
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.synthetic.noise import fractal_noise, mountain_noise
 from shared_map.terrain.synthetic.rivers import carve
@@ -170,11 +170,6 @@ def shade(east: Floats, north: Floats, exaggeration: float = 1.0) -> Floats:
     light = (east - north) * np.float32(0.5) + np.float32(LEVEL_LIGHT)
     light /= np.sqrt(east * east + north * north + np.float32(1))
     return np.clip(light, 0, 1, out=light)
-
-
-def hillshade(elevation_m: Floats, resolution_m: float, exaggeration: float = 1.0) -> Floats:
-    """`shade` of heights: float32 (rows, cols) in m, in which a void (NaN) is level, on cells of `resolution_m`."""
-    return shade(*gradient(elevation_m, resolution_m), exaggeration)
 
 
 def paint_photo(
