@@ -227,7 +227,9 @@ class Gateway:
                 moving.route, moving.route_is_new = np.array(list(points_m), np.float64).reshape(-1, 2), True
         if due & {"map", "map_updates", "markers"}:
             self._feed.merge(view.take_mark_sets(), now_ns, swarm_now_ns)
-            self._fresh += (changed := self._feed.take_changes())
+            changed = self._feed.take_changes()
+            if "markers" in self._rows:
+                self._fresh += changed
             if "map_updates" in self._rows:
                 self._changed = merged(changed, self._changed)
         for name, tell in self._tellers.items():

@@ -23,7 +23,6 @@ from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
 from swarm.clock import NS_PER_S
-from swarm.errors import ConfigError
 
 TYPES = types_of(Distribution.JAZZY)
 
@@ -121,18 +120,6 @@ def test_a_robot_at_its_goal_follows_its_target_again_and_its_goal_target_is_fre
     world.say("one", "goal_pose", 5, 5)
     world.say("one", "odom", 5, 5)
     assert world.follows("one") == "fox"
-    world.say("two", "goal_pose", 6, 6)
-    assert world.follows("two") == "goal0"
-
-
-def test_a_goal_that_cannot_be_followed_is_lent_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World()
-
-    def follow(target: str) -> None:
-        raise ConfigError("it is refused")
-
-    monkeypatch.setattr(world.robots["one"]._vehicle, "follow", follow)
-    world.say("one", "goal_pose", 5, 5)
     world.say("two", "goal_pose", 6, 6)
     assert world.follows("two") == "goal0"
 
