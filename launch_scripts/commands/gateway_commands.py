@@ -186,7 +186,7 @@ def mavlink(
     from launch_scripts.gateways.mavlink.guidance import Wishes
     from launch_scripts.gateways.mavlink.link import read_address
     from launch_scripts.gateways.mavlink.mavlink_codec import pymavlink
-    from launch_scripts.gateways.mavlink.service import Body, read_key, run
+    from launch_scripts.gateways.mavlink.service import read_key, run
     from swarm.config.agents import agent_of
 
     address = read_address(link)
@@ -206,6 +206,8 @@ def mavlink(
     pymavlink()
     network = where.network()
 
-    wishes = Wishes(target, drives.drive, drives.arm, altitude, drives.above, vehicle.lost_after)
-    body = Body(id, vehicle.group, vehicle.radius, drives.vehicle_class)
-    run(lambda: _join(network), address, body, wishes, sysid=vehicle.sysid, key=key, tell=typer.echo)
+    wishes = Wishes(
+        target, drives.drive, drives.arm, altitude, drives.above, vehicle.lost_after,
+        id, vehicle.group, vehicle.radius, drives.vehicle_class,
+    )  # fmt: skip
+    run(lambda: _join(network), address, wishes, sysid=vehicle.sysid, key=key, tell=typer.echo)

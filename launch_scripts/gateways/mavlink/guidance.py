@@ -51,6 +51,8 @@ class Wishes:
     altitude_m  of one that flies
     above       what the altitude is above
     lost_s      after so long without a heartbeat or a position the link counts as lost
+    id          who it is in the swarm; None: `mav` and its number on the link
+    group, radius_m, vehicle_class  as `Swarm.vehicle` has them
     """
 
     target: str | None = None
@@ -59,6 +61,10 @@ class Wishes:
     altitude_m: float | None = None
     above: Literal["home", "terrain"] = "home"
     lost_s: float = 5.0
+    id: str | None = None
+    group: str = "all"
+    radius_m: float = 1.0
+    vehicle_class: str = "ground"
 
 
 Way = tuple[Point, ...]

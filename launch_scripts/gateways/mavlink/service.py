@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Follow, Report, Tell, Unfollow, Withdraw
@@ -19,19 +18,6 @@ _MOST_READ = 200
 """Pieces read in one turn, so that a flood leaves time for what is due."""
 _LAST_WORDS = 3
 """Times that the last words are said: nobody answers them."""
-
-
-@dataclass(frozen=True)
-class Body:
-    """Who the vehicle is in the swarm, as `Swarm.vehicle` has it.
-
-    id  None: `mav` and its number on the link
-    """
-
-    id: str | None = None
-    group: str = "all"
-    radius_m: float = 1.0
-    vehicle_class: str = "ground"
 
 
 def read_key(path: Path) -> bytes:
@@ -58,7 +44,6 @@ def check_ground(frame: Frame) -> None:
 def run(
     connect: Callable[[], Swarm],
     address: Address,
-    body: Body,
     wishes: Wishes,
     *,
     sysid: int | None,
@@ -71,7 +56,7 @@ def run(
         check_ground(swarm.frame)
         link = open_link(address)
         try:
-            shell = Shell(swarm, link, Wire(sysid, key, time.time()), body, wishes, tell)
+            shell = Shell(swarm, link, Wire(sysid, key, time.time()), wishes, tell)
             tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
             with stop_requests() as stopping:  # so that the vehicle is told to stop
                 try:
@@ -93,12 +78,11 @@ class Shell:
         swarm: Swarm,
         link: UdpLink | StreamLink,
         wire: Wire,
-        body: Body,
         wishes: Wishes,
         tell: Callable[[str], None],
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._swarm, self._link, self._wire, self._body = swarm, link, wire, body
+        self._swarm, self._link, self._wire, self._wishes = swarm, link, wire, wishes
         self._tell, self._now_ns = tell, now_ns
         self._adapter = Adapter(swarm.frame, wishes)
         self._vehicle: Vehicle | None = None
@@ -146,10 +130,10 @@ class Shell:
                 self._tell(sentence)
             case Report(x_m=x_m, y_m=y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s):
                 if self._vehicle is None:
-                    body = self._body
+                    wishes = self._wishes
                     self._vehicle = self._swarm.vehicle(
-                        body.id or f"mav{self._wire.vehicle}",
-                        group=body.group, radius_m=body.radius_m, vehicle_class=body.vehicle_class,
+                        wishes.id or f"mav{self._wire.vehicle}",
+                        group=wishes.group, radius_m=wishes.radius_m, vehicle_class=wishes.vehicle_class,
                     )  # fmt: skip
                 self._vehicle.at(x_m, y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s)
             case Withdraw():

@@ -13,12 +13,12 @@ from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.mavlink.guidance import Wishes
 from launch_scripts.gateways.mavlink.mavlink_codec import Wire
-from launch_scripts.gateways.mavlink.service import Body, Shell, check_ground
+from launch_scripts.gateways.mavlink.service import Shell, check_ground
 from swarm.bus.bus import Heard
 from swarm.client import ConfigError, Frame, RunMismatchError, Swarm
 from swarm.client.session import Session
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Body as BodyMessage
+from swarm.wire.messages.vehicles import Body
 from swarm.wire.topics import BODY
 
 LAT_DEG, LON_DEG = FRAME.to_wgs84(*GRID.centre_m(START))
@@ -57,7 +57,7 @@ class PlayedLink:
 class Rig:
     def __init__(self, wishes: Wishes) -> None:
         self.world = SwarmModel()
-        self.bodies: list[BodyMessage] = []
+        self.bodies: list[Body] = []
         self.world.bus("ear").subscribe(BODY, self._hear)
         bus = self.world.bus("adapter")
         self.session = Session(bus, run_info(GRID), self.world.scheduler.clock)
@@ -68,7 +68,6 @@ class Rig:
             Swarm(self.session),
             self.link,
             Wire(None, None, time.time()),
-            Body(),
             wishes,
             self.told.append,
             lambda: self.now_ns,
@@ -77,7 +76,7 @@ class Rig:
 
     def _hear(self, event: Any) -> None:
         assert isinstance(event, Heard)
-        assert isinstance(event.message, BodyMessage)
+        assert isinstance(event.message, Body)
         self.bodies.append(event.message)
 
     def vehicle_says(self, autopilot: int, type: int, mode: int = 0, base: int = 1) -> None:
