@@ -51,12 +51,6 @@ def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(swarm: Swarm,
     assert err.count("\n") == 1
 
 
-def test_an_unknown_role_is_refused(swarm: Swarm) -> None:
-    code, _, err = swarm("up", "synthetic", "--only", "driver")
-    roles = "'router', 'keeper', 'monitor', 'planner', 'targets', 'agent'"
-    assert (code, err) == (2, f"swarm: --only: no role 'driver'; the roles are {roles}\n")
-
-
 def test_runs_where_nobody_may_write(swarm: Swarm, tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file in the way")
     code, _, err = swarm("up", "synthetic", "--port", "0", "--runs", str(tmp_path / "runs"))

@@ -61,15 +61,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def plan(folder: Path, *more: str) -> Result:
-    words = [
-        "plan",
-        str(folder / "small.toml"),
-        "--hosts",
-        str(folder / "hosts.toml"),
-        "--out",
-        str(folder / "kits"),
-    ]
-    return CliRunner().invoke(app, [*words, *more], catch_exceptions=True)
+    line = f"plan {folder}/small.toml --hosts {folder}/hosts.toml --out {folder}/kits"
+    return CliRunner().invoke(app, [*line.split(), *more], catch_exceptions=True)
 
 
 def test_the_command_line_takes_the_words_of_every_container() -> None:

@@ -60,17 +60,8 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
     assert route.at_m[-1] == pytest.approx(route.length_m, rel=1e-6)
     assert (np.diff(route.at_s) > 0).all()
     for ending in ("geojson", "gpkg", "gpx", "kml", "csv", "png"):
-        words = [
-            "--terrain",
-            hill,
-            "--from",
-            "cell:10,5",
-            "--to",
-            "cell:10,75",
-            "--out",
-            tmp_path / f"way.{ending}",
-        ]
-        result = CliRunner().invoke(app, ["route", *map(str, words), "--json"], catch_exceptions=False)
+        line = f"route --terrain {hill} --from cell:10,5 --to cell:10,75 --out {tmp_path}/way.{ending} --json"
+        result = CliRunner().invoke(app, line.split(), catch_exceptions=False)
         assert result.exit_code == 0, result.output
     many = len(route.at_m)
     (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
@@ -146,20 +137,8 @@ def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path:
     assert (truth[inside] <= best.cost_s * 1.1 + 1e-3).all()
     assert inside.reshape(-1)[best.cells].all()
     assert inside.sum() >= 0.95 * (truth <= best.cost_s * 1.1).sum() > 300
-    words = [
-        "reach",
-        str(hill),
-        "--from",
-        "cell:20,5",
-        "--to",
-        "cell:30,75",
-        "--slack",
-        "0.1",
-        "--every-s",
-        "5",
-        "--out",
-    ]
-    said = CliRunner().invoke(terrain_app, [*words, str(tmp_path / "c.geojson")], catch_exceptions=False).output
+    line = f"reach {hill} --from cell:20,5 --to cell:30,75 --slack 0.1 --every-s 5 --out {tmp_path}/c.geojson"
+    said = CliRunner().invoke(terrain_app, line.split(), catch_exceptions=False).output
     assert f"the best takes {best.cost_s:.0f} s" in said
     features = json.loads((tmp_path / "c.geojson").read_text())["features"]
     assert min(each["properties"]["from_s"] for each in features) == 0

@@ -43,10 +43,6 @@ def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version()
     }  # fmt: skip
 
 
-def test_where_all_speak_one_version_nothing_is_said_of_it() -> None:
-    assert "wire version" not in printed(told_by(a0=9, a1=9))
-
-
 def test_a_process_whose_version_is_no_neighbour_of_the_run_s_is_a_stranger() -> None:
     status = told_by(a0=10, a1=8, a2=8)
     assert [info.id for info in status.strangers] == ["a0"]
