@@ -95,9 +95,6 @@ class Followers:
     def __len__(self) -> int:
         return len(self._by_id)
 
-    def all(self) -> Iterable[Follower]:
-        return self._by_id.values()
-
     def ids(self) -> Iterable[str]:
         return self._by_id.keys()
 

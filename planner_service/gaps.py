@@ -111,7 +111,7 @@ class GapStatistics:
 
 
 def _some(followers: Followers) -> list[Follower]:
-    every = list(followers.all())
+    every = [follower for _, follower in followers.all_items()]
     return every[:: -(-len(every) // _MOST) or 1]
 
 

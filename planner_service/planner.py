@@ -203,7 +203,7 @@ class Planner:
             actions.extend(told)
             actions.extend(self._pushes(now_ns))
             if self.target_search is not None and self.vehicle_class == GROUND:
-                believed = self.target_search.told(self.target, self._incarnation, now_ns)
+                believed = self.target_search.belief_message(self.target, self._incarnation, now_ns)
                 actions.extend([] if believed is None else [believed])
         if self.leads and now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + STATUS_NS

@@ -22,7 +22,7 @@ from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import Assigner, Spread
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.driving.driven_vehicle import AskRoute, Follow, GivenRoute, Vehicle
+from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
@@ -273,9 +273,9 @@ class Agent:
     def decide(self, now_ns: int) -> list[AgentAction]:
         """Say what each vehicle needs next; returns the requests to planners."""
         actions: list[AgentAction] = []
-        asks: dict[tuple[str, bool], list[AskRoute]] = {}
+        asks: dict[tuple[str, bool], list[tuple[str, int, Reason]]] = {}
         self.blocked_ticks = 0
-        if self._empty.look(
+        if self._empty.find_gone(
             (each.target for each in self.vehicles.values() if each.target and each.in_reach), now_ns
         ):
             self.assignment.ask_soon(now_ns)
@@ -299,9 +299,10 @@ class Agent:
                 # What was granted late may be closed by now, and would be held for good.
                 self._driver.end_path(vehicle)
                 path = paths[vehicle.id]
-            ask = vehicle.route_request(now_ns, path[-1])
-            if ask is not None:
-                asks.setdefault((ask.target, ask.force), []).append(ask)
+            reason = vehicle.route_request(now_ns)
+            if reason is not None and vehicle.target is not None:
+                key = vehicle.target, reason is Reason.RAN_OUT
+                asks.setdefault(key, []).append((vehicle.id, path[-1], reason))
             if stopped:
                 self._wishes.stay(vehicle.id)
                 continue
@@ -313,8 +314,8 @@ class Agent:
         self._wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
-            ids, cells = tuple(ask.vehicle for ask in batch), tuple(ask.cell for ask in batch)
-            reroutes = sum(ask.reason.is_reroute for ask in batch)
+            ids, cells, reasons = zip(*batch, strict=True)
+            reroutes = sum(reason.is_reroute for reason in reasons)
             request = AskRoutes(self._requests, target_id, ids, cells, force, reroutes)
             self._route_requests[request.request] = request
             actions.append(request)

@@ -1,10 +1,9 @@
-"""Assembles the parts of an agent process: each is made once, here, of the scenario, the terrain and the file of
-promises. `AgentService` carries messages between them and the bus."""
+"""Assembles the parts of an agent process of the scenario, the terrain and the file of promises. `AgentService`
+carries messages between them and the bus."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +43,11 @@ _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least, so that they are there before a vehicle is."""
 
 
-class AgentParts(NamedTuple):
-    """What an agent process consists of.
+class AgentParts:
+    """What an agent process consists of; each part is made once, of what `setup` says of the agent that it names.
+
+    truth  float32 (rows, cols), s/m, the pace at which vehicles of "ground" really drive
+    warn   as of `RightOfWaySync`
 
     author     under which it writes marks and reports
     flies      True if its vehicles are in the air, where no bodies are
@@ -54,105 +56,80 @@ class AgentParts(NamedTuple):
     costs      what the group's agents tell each other; None if the assigner does not ask for it
     spawning   lets the vehicles of an added agent enter; None for an agent of the scenario
     faults     what plug-ins did wrong and nobody has been told yet
-    """
-
-    author: str
-    flies: bool
-    member: Member
-    maps: AgentMaps
-    replica: MapReplica
-    sync: MapSync
-    zones: ZonesAround
-    near_marks: Interest
-    right_of_way: RightOfWaySync
-    agent: Agent
-    costs: GroupCosts | None
-    detector: TargetDetector
-    untracked: UntrackedTargets
-    target_bodies: TargetBodies
-    spawning: Spawning | None
-    fleet: FleetReport
-    chasers: ChasersReport
-    faults: list[str]
-
-
-def assemble(
-    setup: RoleSetup,
-    terrain: Terrain,
-    truth: NDArray[np.float32],
-    bus: Bus,
-    post: Post,
-    store: PromiseStore,
-    warn: Callable[[str, str], None],
-) -> AgentParts:
-    """Makes all parts of the agent that `setup` names.
-
-    truth  float32 (rows, cols), s/m, the pace at which vehicles of "ground" really drive
-    warn   as of `RightOfWaySync`
 
     Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
     """
-    scenario, grid = setup.scenario, terrain.grid
-    plan = _plan_of(setup) if setup.added is None else setup.added.plan
-    group, class_name = plan.group.name, plan.group.vehicle_class
-    author, faults = author_of(group, setup.author), list[str]()
-    grounds = class_grounds(scenario, terrain, truth, load_homes(setup, terrain, truth))
-    own, as_class, in_air = grounds[class_name], of_class(scenario, class_name), flies(scenario, class_name)
-    range_m = as_class.vehicles.sense_range_m
 
-    number = class_numbers(scenario).get(class_name, 0)
-    maps = AgentMaps(grounds[GROUND], own, learning=scenario.map.learning, class_number=number)
-    reads = MarkFilter(grid, readable_groups(scenario, group))
-    replica = MapReplica(grid, maps.sink, author=author, group=group, filter=reads)
-    near = scenario.map.interest == "near"
-    lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
-    # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
-    reach_m = max(scenario.map.interest_m, 2 * range_m)
-    sync = MapSync(replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
+    def __init__(
+        self,
+        setup: RoleSetup,
+        terrain: Terrain,
+        truth: NDArray[np.float32],
+        bus: Bus,
+        post: Post,
+        store: PromiseStore,
+        warn: Callable[[str, str], None],
+    ) -> None:
+        scenario, grid = setup.scenario, terrain.grid
+        plan = _plan_of(setup) if setup.added is None else setup.added.plan
+        group, class_name = plan.group.name, plan.group.vehicle_class
+        self.author, self.faults = author_of(group, setup.author), list[str]()
+        grounds = class_grounds(scenario, terrain, truth, load_homes(setup, terrain, truth))
+        own, as_class = grounds[class_name], of_class(scenario, class_name)
+        self.flies = flies(scenario, class_name)
+        range_m = as_class.vehicles.sense_range_m
+        self.member = Member(setup.info(grid, terrain.digest), bus, post, setup.before)
 
-    spawns = spawn_cells(scenario, grid, grounds)
-    layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
-    beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is in_air}
-    side = scenario.map.plot_regions * REGION_CELLS
-    plots = Plots(grid, list(beside), side, layer=int(in_air), others=spawns.keys() - beside.keys())
-    core = RightOfWay(setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids)
+        # The map.
+        number = class_numbers(scenario).get(class_name, 0)
+        self.maps = AgentMaps(grounds[GROUND], own, learning=scenario.map.learning, class_number=number)
+        reads = MarkFilter(grid, readable_groups(scenario, group))
+        self.replica = MapReplica(grid, self.maps.sink, author=self.author, group=group, filter=reads)
+        near = scenario.map.interest == "near"
+        self.sync = MapSync(self.replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
+        self.zones = ZonesAround(self.replica, self.maps)
+        lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
+        # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
+        reach_m = max(scenario.map.interest_m, 2 * range_m)
+        self.near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
 
-    seen = SensorWorld(grid, truth, range_m, setup.id, scenario.seed)
-    sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), seen, faults.append)
-    targets = plan.group.targets or tuple(scenario.target_ids)
-    assigned = AssignmentWorld(setup.id, group, targets, scenario.seed, plan.group.pursuers)
-    assigner = assigner_of(named_plugin(scenario, assignment_key(scenario, group)), assigned, faults.append)
-    costs = GroupCosts(author, group, setup.id) if shares_costs(assigner) else None
-    driven = DynamicsWorld(setup.id, grid, scenario.seed)
-    dynamics = own_dynamics(class_named(scenario, class_name), driven) or dynamics_of(
-        named_plugin(scenario, "vehicles.dynamics"), driven, faults.append
-    )
-    bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
-    agent = Agent(plan, as_class, maps.local, sensor, core.holdings, bodies, assigner, dynamics, costs)
-    spawning = None
-    if setup.added is not None:
-        cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
-        spawning = Spawning(plan.vehicle_ids, cells, core.holdings, agent.is_open)
-    return AgentParts(
-        author=author,
-        flies=in_air,
-        member=Member(setup.info(grid, terrain.digest), bus, post, setup.before),
-        maps=maps,
-        replica=replica,
-        sync=sync,
-        zones=ZonesAround(replica, maps),
-        near_marks=Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m))),
-        right_of_way=RightOfWaySync(core, setup, store, bus, post, warn),
-        agent=agent,
-        costs=costs,
-        detector=TargetDetector(grid, author, group, range_m),
-        untracked=UntrackedTargets(scenario.untracked, reads),
-        target_bodies=TargetBodies(scenario, grid),
-        spawning=spawning,
-        fleet=FleetReport(author, group, class_name),
-        chasers=ChasersReport(author, class_name),
-        faults=faults,
-    )
+        # Right of way.
+        spawns = spawn_cells(scenario, grid, grounds)
+        layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
+        beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
+        side = scenario.map.plot_regions * REGION_CELLS
+        plots = Plots(grid, list(beside), side, layer=int(self.flies), others=spawns.keys() - beside.keys())
+        core = RightOfWay(setup.id, plots, beside, store.own, store.saved, vehicles=plan.vehicle_ids)
+        self.right_of_way = RightOfWaySync(core, setup, store, bus, post, warn)
+
+        # The vehicles.
+        seen = SensorWorld(grid, truth, range_m, setup.id, scenario.seed)
+        sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), seen, self.faults.append)
+        targets = plan.group.targets or tuple(scenario.target_ids)
+        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed, plan.group.pursuers)
+        assigner = assigner_of(
+            named_plugin(scenario, assignment_key(scenario, group)), assigned, self.faults.append
+        )
+        self.costs = GroupCosts(self.author, group, setup.id) if shares_costs(assigner) else None
+        driven = DynamicsWorld(setup.id, grid, scenario.seed)
+        dynamics = own_dynamics(class_named(scenario, class_name), driven) or dynamics_of(
+            named_plugin(scenario, "vehicles.dynamics"), driven, self.faults.append
+        )
+        bodies = Bodies(grid, as_class.cost.vehicle_radius_m)
+        self.agent = Agent(
+            plan, as_class, self.maps.local, sensor, core.holdings, bodies, assigner, dynamics, self.costs
+        )
+        self.spawning: Spawning | None = None
+        if setup.added is not None:
+            cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
+            self.spawning = Spawning(plan.vehicle_ids, cells, core.holdings, self.agent.is_open)
+
+        # The targets, and what is told of the vehicles.
+        self.detector = TargetDetector(grid, self.author, group, range_m)
+        self.untracked = UntrackedTargets(scenario.untracked, reads)
+        self.target_bodies = TargetBodies(scenario, grid)
+        self.fleet = FleetReport(self.author, group, class_name)
+        self.chasers = ChasersReport(self.author, class_name)
 
 
 def _plan_of(setup: RoleSetup) -> AgentPlan:

@@ -120,7 +120,7 @@ class Bodies:
 
     @property
     def closed(self) -> Container[int]:
-        """The cells that no vehicle may enter; one object for good, which changes with `hear` and `tick`."""
+        """The cells that no vehicle may enter; one object for good, which changes with `take_report` and `tick`."""
         return self._closed
 
     @property
@@ -134,7 +134,7 @@ class Bodies:
 
     # --- reports --------------------------------------------------------------------------------------------
 
-    def hear(self, report: Body, now_ns: int) -> None:
+    def take_report(self, report: Body, now_ns: int) -> None:
         """Take in a report, after `tick` at the same time. One that is older than what is known of its sender
         changes nothing."""
         key = report.id, report.incarnation

@@ -51,7 +51,7 @@ from swarm.wire.topics import (
     Topic,
 )
 from vehicle_agent.agent import AgentAction, AskRoutes
-from vehicle_agent.assemble import assemble
+from vehicle_agent.assemble import AgentParts
 from vehicle_agent.driving.driven_vehicle import Follow, Places
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.target_choice import AskCosts
@@ -90,7 +90,7 @@ class AgentService:
         store: PromiseStore,
     ) -> None:
         self._bus, self._post, self._setup = bus, post, setup
-        self._parts = parts = assemble(setup, terrain, truth, bus, post, store, self._warn)
+        self._parts = parts = AgentParts(setup, terrain, truth, bus, post, store, self._warn)
         self.agent, self._member, self._replica, self._sync = parts.agent, parts.member, parts.replica, parts.sync
         self._maps, self._right_of_way, self._detector = parts.maps, parts.right_of_way, parts.detector
         self._author, self._class = parts.author, self.agent.plan.group.vehicle_class
@@ -185,7 +185,7 @@ class AgentService:
             self._publish_followed(agent.route_pushed(pushed, now_ns))
         if parts.costs is not None:
             for told in self._collected(SHARED_COSTS, SharedCosts):
-                parts.costs.hear(told, now_ns)
+                parts.costs.receive(told, now_ns)
         for placed in self._right_of_way.take_granted(now_ns):
             self._place(placed)
         if parts.spawning is not None:
@@ -299,8 +299,8 @@ class AgentService:
 
     def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         """A vehicle, of ours or of others, has seen a target."""
-        self._detector.hear(sighted)
-        pose = self._parts.untracked.hear(sighted, now_ns)
+        self._detector.note_sighting(sighted)
+        pose = self._parts.untracked.receive(sighted, now_ns)
         if pose is not None:
             self.agent.see_target(pose, now_ns)
             self._take_target_bodies(pose, now_ns)
@@ -309,7 +309,7 @@ class AgentService:
         untracked = self._parts.untracked
         untracked.expire(now_ns)
         self._detector.lose(self.agent.lost(now_ns) - untracked.targets)
-        seen = self._detector.look(places, now_ns)
+        seen = self._detector.detect(places, now_ns)
         if seen:
             self.counters.count("targets_sighted", len(seen))
         for sighted in (*seen, *self._detector.retold(now_ns)):
@@ -319,12 +319,12 @@ class AgentService:
 
     def _take_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
         for body in () if self._parts.flies else self._parts.target_bodies.bodies_of(pose, now_ns):
-            self.agent.bodies.hear(body, now_ns)
+            self.agent.bodies.take_report(body, now_ns)
 
     def _take_bodies(self, now_ns: int) -> None:
         bodies = self.agent.bodies
         for body in self._collected(BODY, Body):
-            bodies.hear(body, now_ns)
+            bodies.take_report(body, now_ns)
             age_ns = now_ns - body.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
                 self.counters.observe("body_ms", age_ns / 1e6)

@@ -71,7 +71,7 @@ class GroupCosts:
             targets=bytes(NO_TARGET if each is None else index.get(each, NO_TARGET) for each in chased),
         )
 
-    def hear(self, message: SharedCosts, now_ns: int) -> None:
+    def receive(self, message: SharedCosts, now_ns: int) -> None:
         """Another agent's word; of two lives of an agent the one that spoke last counts."""
         agent = message.agent
         if agent == self._agent or message.group != self._group:
@@ -125,27 +125,14 @@ class AskCosts:
     cells: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """target   the one to go for; None if there is no route to any
-    settled  False where too few planners have answered to say anything
-    """
-
-    target: str | None
-    settled: bool = True
-
-
-UNSETTLED = Choice(None, settled=False)
-
-
 def choose(
     costs_s: Mapping[str, float],
     allowed: Sequence[str],
     alive: Mapping[str, int],
     current: str | None,
     keep_silent: bool,
-) -> Choice:
-    """The cheapest of a vehicle's targets.
+) -> str | None:
+    """The cheapest of a vehicle's targets; None if no route to any is known.
 
     costs_s      cost-to-go per target that answered, inf where there is no route
     allowed      the vehicle's targets
@@ -153,19 +140,23 @@ def choose(
     keep_silent  stay with a current target whose planner has not answered
     """
     if current is not None and current not in costs_s and (keep_silent or current in alive):
-        return Choice(current)
+        return current
     best, best_s = None, math.inf
     for target in allowed:
         cost_s = costs_s.get(target, math.inf)
         if cost_s < best_s:
             best, best_s = target, cost_s
-    if best is None:
-        answered = [target for target in allowed if target in costs_s]
-        silent = [target for target in allowed if target in alive and target not in costs_s]
-        return Choice(None) if answered and not silent else UNSETTLED
-    if current is not None and best_s > (1.0 - HYSTERESIS) * costs_s.get(current, math.inf):
-        return Choice(current)
-    return Choice(best)
+    if current is not None and math.inf > best_s > (1.0 - HYSTERESIS) * costs_s.get(current, math.inf):
+        return current
+    return best
+
+
+def have_answered(costs_s: Collection[str], allowed: Collection[str], alive: Collection[str]) -> bool:
+    """True if a planner of these targets has answered, and each of theirs that lives has: what none of them has a
+    way to is then out of reach."""
+    return any(target in costs_s for target in allowed) and all(
+        target in costs_s for target in allowed if target in alive
+    )
 
 
 class Assignment:
@@ -316,10 +307,10 @@ class Assignment:
     ) -> None:
         given_up = vehicle.planner_gone and not vehicle.route.left
         given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-        choice = choose(costs_s, self.targets, planners, current, not given_up)
-        if choice.target is not None:
-            vehicle.assign(choice.target, now_ns)
+        target = choose(costs_s, self.targets, planners, current, not given_up)
+        if target is not None:
+            vehicle.assign(target, now_ns)
             if vehicle.target not in planners and not vehicle.planner_gone:
                 vehicle.lose_planner(now_ns)
-        elif choice.settled:
+        elif have_answered(costs_s, self.targets, planners):
             vehicle.no_way()

@@ -145,7 +145,7 @@ class TargetSearch:
         look_m = max(self._hidden.sense_range_m / 2, min(self._hidden.capture_range_m, self._hidden.sense_range_m))
         return lost or (age_ns >= UNSEEN_NS and nearest_m <= look_m)
 
-    def told(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
+    def belief_message(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
         """What is believed, for people to look at; None if it is not time to tell it."""
         if now_ns < self._tell_ns or not (self.active or self._has_told):
             return None

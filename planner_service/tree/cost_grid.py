@@ -376,9 +376,6 @@ class CostGrid:
             raise ValueError(f"padded root {root} is lethal: no tree can lead there")
         if cost.size != self.size or parent.size != self.size:
             raise ValueError(f"a tree of this map has {self.size} cells")
-        return self._grow(root, cost, parent)
-
-    def _grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
         bounds = self.lowest_cell_cost, self.highest_cell_cost, self.dearest_step
         return grow_tree(self.padded, self.climbs, bounds, root, cost, parent)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import chain, takewhile
 
 import msgspec
@@ -89,19 +90,6 @@ class _Said(msgspec.Struct, frozen=True):
     stands: dict[int, _Told]
 
 
-class _PlotOf(dict[int, int]):
-    """Cell -> its plot, of cells that were asked for lately: each is asked for often while a vehicle passes it."""
-
-    def __init__(self, plots: Plots) -> None:
-        self._plots = plots
-
-    def __missing__(self, cell: int) -> int:
-        if len(self) >= _MOST_CELLS:
-            self.clear()
-        plot = self[cell] = self._plots.of(cell)
-        return plot
-
-
 class Holdings:
     """The host's side of right of way.
 
@@ -116,7 +104,7 @@ class Holdings:
 
     def __init__(self, plots: Plots, agent: str, vehicles: Collection[str] | None) -> None:
         self._plots = plots
-        self._plot_of = _PlotOf(plots)
+        self._plot_of = lru_cache(_MOST_CELLS)(plots.of)
         self._agent = agent
         self.refused: list[str] = []
         self._vehicles = None if vehicles is None else frozenset(vehicles)
@@ -264,7 +252,7 @@ class Holdings:
 
     def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
         """Take in the cells that are granted to each vehicle."""
-        before, grants, paths, plot_of = view.seen, granted.grants, self._paths, self._plot_of.__getitem__
+        before, grants, paths, plot_of = view.seen, granted.grants, self._paths, self._plot_of
         view.seen = grants
         changed = [id for id, cells in grants.items() if before.get(id) != cells or id not in paths]
         self._seen_anew.update(changed, [id for id in before if id not in grants])
@@ -395,7 +383,7 @@ class Holdings:
         ahead, wants, better = [*asked.ahead], list[int](), 0
         if len(path) == 1:
             wants, better = [*asked.wants], asked.better
-        plot_of = self._plot_of.__getitem__
+        plot_of = self._plot_of
         concerned = [*path, *ahead[:1], *wants]
         near: Collection[int] = {*map(plot_of, concerned)}
         if len(near) > 1:
@@ -414,7 +402,7 @@ class Holdings:
         if not wanted:
             return wish
         lapsed: set[int] = set()
-        for plot in set(map(self._plot_of.__getitem__, wanted)):
+        for plot in set(map(self._plot_of, wanted)):
             view = self._views.get(plot)
             if view is not None and vehicle in view.seen:
                 lapsed.update(wanted.intersection(view.seen[vehicle]))

@@ -151,7 +151,7 @@ def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(ste
                 if (each.report.id, each.report.incarnation) == (report.id, report.incarnation)
             ]
             if known and report.seq <= known[0]:
-                bodies.hear(report, now_ns)
+                bodies.take_report(report, now_ns)
                 continue
             twin.heard = [
                 each
@@ -159,7 +159,7 @@ def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(ste
                 if (each.report.id, each.report.incarnation, each.report.seq >= report.seq)
                 != (report.id, report.incarnation, True)
             ]
-            bodies.hear(report, now_ns)
+            bodies.take_report(report, now_ns)
             twin.heard.append(Heard(report, now_ns))
         closed = {cell for cell in range(GRID.cells) if cell in bodies.closed}
         assert twin.must() <= closed
@@ -246,7 +246,7 @@ def drive(seed: int, ticks: int = 60) -> Driven:
                     radius_m=chance.uniform(0.0, 6.0),
                     lease_s=chance.choice((0.1, 0.5, 2.0)),
                 )
-                agent.bodies.hear(report, now_ns)
+                agent.bodies.take_report(report, now_ns)
                 twin.heard = [each for each in twin.heard if each.report.id != id]
                 twin.heard.append(Heard(report, now_ns))
         closed = twin.must()

@@ -63,16 +63,6 @@ class GivenRoute(msgspec.Struct, frozen=True):
     turns: tuple[int, ...] = ()
 
 
-class AskRoute(msgspec.Struct, frozen=True):
-    """A vehicle needs a route from its cell. `force` asks the planner to grow its tree for it if it must."""
-
-    vehicle: str
-    target: str
-    cell: int
-    force: bool
-    reason: Reason
-
-
 class Follow(msgspec.Struct, frozen=True):
     """A vehicle has begun a route, from the cell on which it stands.
 
@@ -187,11 +177,8 @@ class Vehicle:
 
     # --- routes ---------------------------------------------------------------------------------------------
 
-    def route_request(self, now_ns: int, cell: int) -> AskRoute | None:
-        """The request for a route, if one is needed and the time for it has come.
-
-        cell  where its path ends, and the route has to begin
-        """
+    def route_request(self, now_ns: int) -> Reason | None:
+        """Why it asks its target's planner for a route, if it needs one and the time for it has come."""
         if self.target is None or self.in_reach or self.planner_gone:
             return None
         if self._need is None and self.state is not VehicleState.STRANDED:
@@ -209,8 +196,7 @@ class Vehicle:
             return None
         self.asked = self.target
         self._ask_due_ns = now_ns + self._retry_ns
-        force = self._need is Reason.RAN_OUT
-        return AskRoute(self.id, self.target, cell, force, self._need)
+        return self._need
 
     def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Follow | None:
         """Begin the route, if it leads to the target and passes a cell of the vehicle's path."""

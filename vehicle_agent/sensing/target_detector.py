@@ -68,7 +68,7 @@ class TargetDetector:
         for target in targets:
             self._true.pop(target, None)
 
-    def hear(self, sighted: Sighted) -> None:
+    def note_sighting(self, sighted: Sighted) -> None:
         """Another author saw a target."""
         last = self._last.get(sighted.target)
         if last is not None and sighted.author != self._author and sighted.stamp_ns > last.stamp_ns:
@@ -85,7 +85,7 @@ class TargetDetector:
             del self._retell_ns[target]
         return [self._last[target] for target in due if target in self._last]
 
-    def look(self, places: Places, now_ns: int) -> list[Sighted]:
+    def detect(self, places: Places, now_ns: int) -> list[Sighted]:
         """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
         due = [id for id in self._true if now_ns - self._told_ns.get(id, -_TELL_NS) >= _TELL_NS]
         if not due or not places.vehicles:
@@ -127,7 +127,7 @@ class UntrackedTargets:
         self.targets = targets
         self._sightings = Sightings(reading)
 
-    def hear(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
+    def receive(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
         """The pose of an untracked target after one more sighting; None if that is no news of one."""
         if sighted.target not in self.targets or not self._sightings.receive(sighted, now_ns):
             return None
@@ -187,7 +187,7 @@ class EmptyPlaces:
         else:
             self._by_sight.discard(target)
 
-    def look(self, stood_at: Iterable[str], now_ns: int) -> bool:
+    def find_gone(self, stood_at: Iterable[str], now_ns: int) -> bool:
         """Find which targets are gone; returns whether one is that was not before.
 
         stood_at  targets that a vehicle has within reach, by what is known

@@ -107,7 +107,7 @@ class Member:
             self._acked_ns = now_ns
         self._wanted_ns = now_ns
         if self.warden is not None:
-            self.warden.hear(standing, now_ns)
+            self.warden.take_standing(standing, now_ns)
 
     # --- what members say -----------------------------------------------------------------------------------
 

@@ -120,7 +120,7 @@ class Warden:
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
-    def hear(self, standing: Standing, now_ns: int) -> None:
+    def take_standing(self, standing: Standing, now_ns: int) -> None:
         host = standing.agent
         if not self._is_welcome(host):
             self.refused.append(f"plot {self._plot} has known {MOST_GUESTS} guests: {host} cannot enter")

@@ -30,7 +30,7 @@ def test_no_follower_stands_outside_the_grid_whatever_status_its_answer_had(
             status=status, start=cell, cost_s=seconds, lower_bound_s=seconds, length_m=seconds, remaining_s=0.0
         )
         followers.given(f"v{n}", route, 0, 0, 0)
-    assert all(0 <= each.cell < GRID.cells for each in followers.all())
+    assert all(0 <= each.cell < GRID.cells for _, each in followers.all_items())
     followers.touch(Window(0, 0, 5, 5), [Window(3, 3, 9, 9)])
 
 
@@ -39,7 +39,7 @@ def test_beyond_the_capacity_those_registered_first_make_way(monkeypatch: pytest
     followers = Followers("t", GRID, 100, 0)
     for n in range(5):
         followers.given(f"v{n}", Route(status=RouteStatus.UNREACHABLE, start=n), 0, n, 0)
-    assert [each.cell for each in followers.all()] == [2, 3, 4]
+    assert [each.cell for _, each in followers.all_items()] == [2, 3, 4]
 
 
 def test_a_tick_pushes_a_bounded_number_and_every_follower_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,7 +133,7 @@ def test_the_rest_of_a_route_is_no_news_from_any_of_its_cells(seed: int) -> None
     for _ in range(200):
         followers, old, other = Followers("t", GRID, 10**9, 0), random_route(chance), random_route(chance)
         followers.given("v", old, 0, 0, 0)
-        (follower,) = followers.all()
+        ((_, follower),) = followers.all_items()
         if old.status is not RouteStatus.OK:
             continue
         cells = walk(GRID, old.start, old.directions)
@@ -152,7 +152,7 @@ def test_an_extension_is_pushed_once_half_of_the_old_route_is_driven() -> None:
     followers, start = Followers("t", GRID, 10, 0), GRID.cell(5, 5)
     cut = Route(status=RouteStatus.OK, start=start, directions=bytes([2] * 8), cost_s=9.0, remaining_s=5.0)
     followers.given("v", cut, 8, 0, 0)
-    (follower,) = followers.all()
+    ((_, follower),) = followers.all_items()
 
     def is_news(driven: int, *turned: int) -> bool:
         directions = bytes([2] * (8 - len(turned)) + list(turned))

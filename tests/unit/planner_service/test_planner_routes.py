@@ -90,7 +90,7 @@ def test_a_follower_whose_route_a_map_change_crosses_is_pushed_a_newer_route(rea
     ready.tree.answers = [Update("repair", Window(9, 12, 12, 13), 3)]
     ready.mark(GRID.cell(10, 12))
     ready.tick()
-    follower, _ = ready.planner.followers.all()
+    (_, follower), _ = ready.planner.followers.all_items()
     # The scripted tree knows no way around: the steps are the old ones, which is no news.
     assert not follower.stale
     ready.chasers(("crossed", GRID.cell(11, 6)), ("clear", GRID.cell(1, 20)))

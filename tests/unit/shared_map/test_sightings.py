@@ -100,11 +100,11 @@ def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
     detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m), 0)
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
-    assert detector.look(Places(GRID, [far]), 0) == []
-    (told,) = detector.look(Places(GRID, [far, near]), 0)
+    assert detector.detect(Places(GRID, [far]), 0) == []
+    (told,) = detector.detect(Places(GRID, [far, near]), 0)
     assert (told.cell, told.until_ns, told.uncertainty_m) == (410, 2_000_000_000, 5.0 + 0.02 * 50.0)
-    assert detector.look(Places(GRID, [near]), 400_000_000) == []  # not so often
-    assert len(detector.look(Places(GRID, [near]), 500_000_000)) == 1
+    assert detector.detect(Places(GRID, [near]), 400_000_000) == []  # not so often
+    assert len(detector.detect(Places(GRID, [near]), 500_000_000)) == 1
 
 
 def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_unless_it_was_a_capture() -> None:
@@ -123,14 +123,14 @@ def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_
 
     assert retold(0) == []
     stand(GRID.cell(10, 10), 1, 2)
-    told = detector.look(near, 2 * NS_PER_S)
+    told = detector.detect(near, 2 * NS_PER_S)
     stand(0, 2, 10)
     assert retold(60) == told
     assert detector.retold(99 * NS_PER_S) == [], "once"
-    detector.hear(sighted(3 * NS_PER_S, author="red.a1.1"))
+    detector.note_sighting(sighted(3 * NS_PER_S, author="red.a1.1"))
     assert retold(100) == [], "another knows better"
     stand(GRID.cell(10, 10), 3, 110)
-    assert detector.look(near, 110 * NS_PER_S)
+    assert detector.detect(near, 110 * NS_PER_S)
     stand(0, 4, 111, jumps=1)
     assert retold(120) == [], "it was captured"
 

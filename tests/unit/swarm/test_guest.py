@@ -47,7 +47,7 @@ def talk(guest: Guest, warden: Warden, now_ns: int = 0) -> None:
     """What the guest says is heard, and what is granted is told, as if it were on file."""
     for action in guest.tick(now_ns):
         assert isinstance(action, Tell)
-        warden.hear(action.standing, now_ns)
+        warden.take_standing(action.standing, now_ns)
     table = warden.tick(now_ns)
     if table is not None:
         for granted in warden.granted(table, now_ns):
@@ -98,20 +98,24 @@ def test_a_host_may_speak_for_vehicles_of_its_own_name_only() -> None:
     lie = entering("rover", 70)
     for vehicle in ("a1-00", "other-00", "rover2-00"):
         stand = Stand(vehicle, 70, 70, [], [70], [], 0, 0)
-        warden.hear(Standing(plot=0, agent="rover", life=5, seq=lie.seq, knows=(0, 0), vehicles=[stand]), 0)
+        warden.take_standing(
+            Standing(plot=0, agent="rover", life=5, seq=lie.seq, knows=(0, 0), vehicles=[stand]), 0
+        )
         table = warden.tick(0)
         assert table is None or not table.grants
 
 
 def test_no_guest_and_not_all_together_take_all_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     warden = warden_of()
-    warden.hear(entering("rover", 0), 0)
+    warden.take_standing(entering("rover", 0), 0)
     warden.tick(0)
     for seq in range(2, 12):  # one vehicle that never moves and always wants more
         cells = warden._grants.of["rover-00"].cells
         ahead = list(range(cells[-1] + 1, cells[-1] + 13))
         stand = Stand("rover-00", 0, cells[-1], cells, ahead, ahead[:1], 1, 0)
-        warden.hear(Standing(plot=0, agent="rover", life=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0)
+        warden.take_standing(
+            Standing(plot=0, agent="rover", life=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0
+        )
         warden.tick(0)
     table = warden.tick(1 << 40)
     assert table is not None
@@ -122,7 +126,7 @@ def test_no_guest_and_not_all_together_take_all_cells(monkeypatch: pytest.Monkey
     monkeypatch.setattr(wardens, "MOST_CELLS_OF_GUESTS", 5)
     warden = warden_of()
     for n in range(4):
-        warden.hear(entering(f"r{n}", 8 * n, ahead=[8 * n, 8 * n + 1, 8 * n + 2, 8 * n + 3]), 0)
+        warden.take_standing(entering(f"r{n}", 8 * n, ahead=[8 * n, 8 * n + 1, 8 * n + 2, 8 * n + 3]), 0)
     table = warden.tick(0)
     assert table is not None
     held = sorted(len(grant.cells) for grant in table.grants.values())
@@ -134,12 +138,14 @@ def test_a_plot_knows_so_many_guests_and_says_whom_it_refuses(monkeypatch: pytes
     monkeypatch.setattr(wardens, "MOST_GUESTS", 2)
     warden = warden_of(hosts={"a1": (1, 1), "r0": (1, 1)})
     for n in (1, 2, 0, 1):
-        warden.hear(entering(f"r{n}", 8 * n, seq=n + 5), 0)
+        warden.take_standing(entering(f"r{n}", 8 * n, seq=n + 5), 0)
     assert warden.refused == ["plot 0 has known 2 guests: r2 cannot enter"]
     table = warden.tick(0)
     assert table is not None
     assert set(table.grants) == {"r0-00", "r1-00"}
-    warden.hear(Standing(plot=0, agent="a2", life=1, seq=1, knows=(0, 0), vehicles=[]), 0)  # of the scenario
+    warden.take_standing(
+        Standing(plot=0, agent="a2", life=1, seq=1, knows=(0, 0), vehicles=[]), 0
+    )  # of the scenario
     assert len(warden.refused) == 1
 
 
@@ -157,7 +163,7 @@ def test_an_operator_frees_what_all_lives_of_a_guest_hold_and_its_next_life_ente
     for beat in range(1, 6):
         now_ns = beat * 300_000_000
         for told in removal.tick(now_ns):
-            warden.hear(told.standing, now_ns)
+            warden.take_standing(told.standing, now_ns)
         table = warden.tick(now_ns)
         assert table is not None
         for granted in warden.granted(table, now_ns):
@@ -194,11 +200,11 @@ def test_what_was_shut_for_a_guest_is_opened_only_by_a_life_that_counts_and_is_i
     shut = [Shut("rover", 5, [70, 71])]
     warden = warden_of(hosts={"rover": (1 << 40, 9)}, shut=shut)
     older = entering("rover", 70, life=1 << 33)
-    warden.hear(Standing(**{**fields_of(older), "dead": [5]}), 0)
+    warden.take_standing(Standing(**{**fields_of(older), "dead": [5]}), 0)
     assert warden._shut == {("rover", 5): [70, 71]}
-    warden.hear(entering("a1", 71), 0)
+    warden.take_standing(entering("a1", 71), 0)
     younger = entering("rover", 70, life=(1 << 40) + 1)
-    warden.hear(Standing(**{**fields_of(younger), "dead": [5]}), 0)
+    warden.take_standing(Standing(**{**fields_of(younger), "dead": [5]}), 0)
     table = warden.tick(0)
     assert table is not None
     assert table.grants["rover-00"].cells == [70]

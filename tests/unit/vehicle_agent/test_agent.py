@@ -31,7 +31,7 @@ from vehicle_agent.driving.driven_vehicle import Places, Vehicle
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.reports import FleetReport
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.target_choice import UNSETTLED, AskCosts, Choice, choose
+from vehicle_agent.target_choice import AskCosts, choose, have_answered
 
 GRID = GridSpec(12, 12, 10.0)
 LEVEL = np.full((12, 12), 0.1, np.float32)
@@ -163,12 +163,6 @@ def test_an_old_pose_does_not_undo_a_newer_one(agent: Agent) -> None:
     assert agent.vehicles["a0-00"].state is VehicleState.ARRIVED
 
 
-def test_a_target_outside_the_terrain_is_not_believed(agent: Agent) -> None:
-    outside = TargetPose(target="t0", incarnation=1, seq=9, stamp_ns=0, cell=144, x_m=0.0, y_m=0.0)
-    agent.hear_pose(outside, 0)
-    agent.decide(0)
-
-
 def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal() -> None:
     scenario = parse_scenario(TEXT)
     agent = agent_of(scenario)
@@ -218,30 +212,29 @@ ALIVE = {"t0": 1, "t1": 1, "t2": 1}
 TARGETS = ["t0", "t1", "t2"]
 
 
-def test_the_cheapest_of_the_allowed_targets_is_chosen() -> None:
-    costs = {"t0": 9.0, "t1": 5.0, "t2": 1.0}
-    assert choose(costs, ["t0", "t1"], ALIVE, None, True) == Choice("t1")
-
-
-@pytest.mark.parametrize(("other_s", "chosen"), [(8.6, "t0"), (8.4, "t1")])
-def test_another_target_must_be_worth_the_change(other_s: float, chosen: str) -> None:
-    assert choose({"t0": 10.0, "t1": other_s}, TARGETS, {"t0": 1}, "t0", True) == Choice(chosen)
-
-
-def test_a_target_that_cannot_be_reached_any_more_is_left_for_any_other() -> None:
-    assert choose({"t0": math.inf, "t1": 1e6}, TARGETS, ALIVE, "t0", True) == Choice("t1")
-
-
-def test_a_silent_planner_keeps_its_vehicles_until_they_give_it_up() -> None:
-    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", True) == Choice("t0")
-    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", False) == Choice("t1")
+@pytest.mark.parametrize(
+    ("costs_s", "alive", "current", "keep_silent", "chosen"),
+    [
+        ({"t0": 9.0, "t1": 5.0, "t2": 6.0, "t3": 1.0}, ALIVE, None, True, "t1"),  # t3 is not allowed
+        ({"t0": 10.0, "t1": 8.6}, {"t0": 1}, "t0", True, "t0"),
+        ({"t0": 10.0, "t1": 8.4}, {"t0": 1}, "t0", True, "t1"),
+        ({"t0": math.inf, "t1": 1e6}, ALIVE, "t0", True, "t1"),
+        ({"t1": 1.0}, {"t1": 1}, "t0", True, "t0"),
+        ({"t1": 1.0}, {"t1": 1}, "t0", False, "t1"),
+    ],
+)
+def test_the_cheapest_target_is_chosen_if_it_is_worth_the_change_from_one_whose_planner_is_not_given_up(
+    costs_s: dict[str, float], alive: dict[str, int], current: str | None, keep_silent: bool, chosen: str
+) -> None:
+    assert choose(costs_s, TARGETS, alive, current, keep_silent) == chosen
 
 
 def test_no_way_is_certain_only_when_all_live_planners_have_said_so() -> None:
     walled_in = {"t0": math.inf, "t1": math.inf}
-    assert choose(walled_in, TARGETS, ALIVE, None, True) == UNSETTLED
-    assert choose(walled_in, TARGETS, {"t0": 1, "t1": 1}, None, True) == Choice(None)
-    assert choose({}, TARGETS, {}, None, True) == UNSETTLED
+    assert choose(walled_in, TARGETS, ALIVE, None, True) is None
+    assert not have_answered(walled_in, TARGETS, ALIVE)
+    assert have_answered(walled_in, TARGETS, {"t0": 1, "t1": 1})
+    assert not have_answered({}, TARGETS, {})
 
 
 # --- where they start ---------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ def closed(bodies: Bodies) -> set[tuple[int, int]]:
 
 
 def test_a_body_closes_its_cell_until_its_lease_ends_by_our_clock_whatever_its_own_says(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5, lease_s=0.3, stamp_ns=NOW - 3600 * NS_PER_S), NOW)
+    bodies.take_report(body(5.5, 5.5, lease_s=0.3, stamp_ns=NOW - 3600 * NS_PER_S), NOW)
     assert closed(bodies) == {(5, 5)}
     for tick in range(1, 4):
         assert closed(bodies) == {(5, 5)}
@@ -57,17 +57,17 @@ def test_a_body_closes_its_cell_until_its_lease_ends_by_our_clock_whatever_its_o
 
 
 def test_a_moving_body_closes_the_way_that_it_may_have_gone_since_it_was_heard(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5, heading_rad=math.pi / 2, speed_m_per_s=20.0, lease_s=2.0), NOW)
+    bodies.take_report(body(5.5, 5.5, heading_rad=math.pi / 2, speed_m_per_s=20.0, lease_s=2.0), NOW)
     assert closed(bodies) == {(5, 5), (5, 6)}
     for tick in range(1, 11):
         bodies.tick(NOW + tick * TICK)
     assert closed(bodies) == {(5, col) for col in range(5, 9)}
-    bodies.hear(body(5.5, 7.5, seq=2, heading_rad=0.0, speed_m_per_s=20.0), NOW + 10 * TICK)
+    bodies.take_report(body(5.5, 7.5, seq=2, heading_rad=0.0, speed_m_per_s=20.0), NOW + 10 * TICK)
     assert closed(bodies) == {(5, 7), (4, 7)}
 
 
 def test_without_a_heading_it_may_go_any_way(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5, speed_m_per_s=10.0), NOW)
+    bodies.take_report(body(5.5, 5.5, speed_m_per_s=10.0), NOW)
     assert closed(bodies) == {(row, col) for row in (4, 5, 6) for col in (4, 5, 6)} - {
         (4, 4),
         (4, 6),
@@ -77,8 +77,8 @@ def test_without_a_heading_it_may_go_any_way(bodies: Bodies) -> None:
 
 
 def test_a_body_that_says_that_it_leaves_opens_its_cells_at_once(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5), NOW)
-    bodies.hear(body(5.5, 5.5, seq=2, lease_s=0.0), NOW)
+    bodies.take_report(body(5.5, 5.5), NOW)
+    bodies.take_report(body(5.5, 5.5, seq=2, lease_s=0.0), NOW)
     assert closed(bodies) == set()
     assert not bodies.any
 
@@ -93,9 +93,9 @@ def test_a_body_that_says_that_it_leaves_opens_its_cells_at_once(bodies: Bodies)
     ],
 )
 def test_a_report_that_cannot_be_taken_in_is_named_once_and_counted(bodies: Bodies, said, why) -> None:
-    bodies.hear(body(5.5, 5.5), NOW)
+    bodies.take_report(body(5.5, 5.5), NOW)
     for seq in range(2, 6):
-        bodies.hear(body(5.5, 5.5, seq=seq, **said), NOW)
+        bodies.take_report(body(5.5, 5.5, seq=seq, **said), NOW)
     assert closed(bodies) == {(5, 5)}, "what was known before lasts until its lease ends"
     (text,) = bodies.complaints
     assert text.startswith("body r1 is not avoided: ")
@@ -112,8 +112,8 @@ def test_what_is_no_number_is_refused_at_the_door_by_the_name_of_its_field(field
 
 
 def test_a_body_that_leaps_keeps_both_places_closed_and_is_named(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5), NOW)
-    bodies.hear(body(30.5, 30.5, seq=2), NOW + TICK)
+    bodies.take_report(body(5.5, 5.5), NOW)
+    bodies.take_report(body(30.5, 30.5, seq=2), NOW + TICK)
     assert closed(bodies) == {(5, 5), (30, 30)}
     assert bodies.complaints == ["body r1 leaps 354 m: where it was stays closed until the lease of that ends"]
     for tick in range(1, 11):
@@ -122,25 +122,25 @@ def test_a_body_that_leaps_keeps_both_places_closed_and_is_named(bodies: Bodies)
 
 
 def test_two_senders_under_one_id_are_two_bodies_and_one_that_was_started_again_is_not(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5, incarnation=1), NOW)
-    bodies.hear(body(30.5, 30.5, incarnation=2), NOW + 1)
-    bodies.hear(body(30.5, 30.5, incarnation=2, seq=2), NOW + 2)
+    bodies.take_report(body(5.5, 5.5, incarnation=1), NOW)
+    bodies.take_report(body(30.5, 30.5, incarnation=2), NOW + 1)
+    bodies.take_report(body(30.5, 30.5, incarnation=2, seq=2), NOW + 2)
     assert closed(bodies) == {(5, 5), (30, 30)}
     assert bodies.complaints == []
-    bodies.hear(body(5.5, 5.5, incarnation=1, seq=2), NOW + 3)
+    bodies.take_report(body(5.5, 5.5, incarnation=1, seq=2), NOW + 3)
     assert closed(bodies) == {(5, 5), (30, 30)}
     assert bodies.complaints == ["body r1 has two senders, of incarnations 2 and 1: both places are closed"]
 
 
 def test_too_many_bodies_and_too_many_cells_are_refused_and_those_before_stay(bodies: Bodies) -> None:
     for number in range(MOST_BODIES + 5):
-        bodies.hear(body(5.5, 5.5, id=f"r{number}"), NOW)
+        bodies.take_report(body(5.5, 5.5, id=f"r{number}"), NOW)
     assert bodies.refused == 5
     assert "256 others already" in bodies.complaints[0]
     fine = Bodies(GridSpec(2000, 2000, 1.0))
     fine.tick(NOW)
     for number in range(10):
-        fine.hear(body(20.0 + number, 20.0, id=f"r{number}", radius_m=95.0), NOW)
+        fine.take_report(body(20.0 + number, 20.0, id=f"r{number}", radius_m=95.0), NOW)
     assert fine.refused == 8
     assert "expected at most 100000" in fine.complaints[0]
     for tick in range(1, 21):
@@ -148,12 +148,12 @@ def test_too_many_bodies_and_too_many_cells_are_refused_and_those_before_stay(bo
         fine.tick(NOW + tick * TICK)
     assert not bodies.any
     assert not fine.any
-    fine.hear(body(20.0, 20.0, radius_m=95.0), NOW + 2 * NS_PER_S)
+    fine.take_report(body(20.0, 20.0, radius_m=95.0), NOW + 2 * NS_PER_S)
     assert fine.any, "what was given back can be used again"
 
 
 def test_a_stopped_process_forgets_no_body_in_the_time_in_which_it_did_not_listen(bodies: Bodies) -> None:
-    bodies.hear(body(5.5, 5.5, lease_s=1.0), NOW)
+    bodies.take_report(body(5.5, 5.5, lease_s=1.0), NOW)
     bodies.tick(NOW + 60 * NS_PER_S)
     assert closed(bodies) == {(5, 5)}
     assert bodies.is_deaf, "what came meanwhile may not have been read: nobody drives in this tick"
@@ -179,9 +179,11 @@ def steering(bodies: Bodies, pace: np.ndarray) -> Steering:
 
 
 def standing(bodies: Bodies, report: Body) -> None:
-    bodies.hear(report, NOW)
+    bodies.take_report(report, NOW)
     bodies.tick(NOW + NS_PER_S - 1)
-    bodies.hear(Body(**{f: getattr(report, f) for f in report.__struct_fields__} | {"seq": 2}), NOW + NS_PER_S - 1)
+    bodies.take_report(
+        Body(**{f: getattr(report, f) for f in report.__struct_fields__} | {"seq": 2}), NOW + NS_PER_S - 1
+    )
     bodies.tick(NOW + NS_PER_S)
 
 
@@ -248,14 +250,14 @@ def test_where_there_is_no_way_around_it_is_seldom_looked_for(bodies: Bodies) ->
 
 
 def test_a_body_that_drives_on_is_waited_for(bodies: Bodies) -> None:
-    bodies.hear(body(20.5, 20.5, radius_m=5.0, heading_rad=0.0, speed_m_per_s=1.0), NOW)
+    bodies.take_report(body(20.5, 20.5, radius_m=5.0, heading_rad=0.0, speed_m_per_s=1.0), NOW)
     _vehicle, detours = drive_around(bodies, np.full((40, 40), 0.1, np.float32), ticks=1)
     assert detours.found == 0
 
 
 def test_a_vehicle_at_rest_makes_way_for_a_body_that_comes(bodies: Bodies) -> None:
     pace = np.full((40, 40), 0.1, np.float32)
-    bodies.hear(body(20.5, 10.5, radius_m=2.0, heading_rad=math.pi / 2, speed_m_per_s=20.0), NOW)
+    bodies.take_report(body(20.5, 10.5, radius_m=2.0, heading_rad=math.pi / 2, speed_m_per_s=20.0), NOW)
     bodies.tick(NOW)
 
     def wish_at(cell: int) -> Wish:

@@ -40,7 +40,7 @@ def test_a_target_closes_its_cell_and_those_that_it_drives_to() -> None:
     made, bodies = TargetBodies(parse_scenario(TEXT.format(radius=2)), GRID), Bodies(GRID)
     for number, col in enumerate((3.5, 4.5)):
         (body,) = made.bodies_of(pose(col), NOW + number * NS_PER_S // 2)
-        bodies.hear(body, NOW)
+        bodies.take_report(body, NOW)
     assert body.heading_rad == pytest.approx(math.pi / 2)
     assert body.speed_m_per_s == pytest.approx(20.0)
     assert cells(bodies) == {(5, 4), (5, 5)}
@@ -50,7 +50,7 @@ def test_a_captured_target_that_jumps_leaves_its_old_place_open_and_nobody_is_to
     made, bodies = TargetBodies(parse_scenario(TEXT.format(radius=2)), GRID), Bodies(GRID)
     for number, (col, jumps) in enumerate(((3.5, 0), (15.5, 1))):
         for body in made.bodies_of(pose(col, jumps=jumps), NOW + number * NS_PER_S // 5):
-            bodies.hear(body, NOW + number * NS_PER_S // 5)
+            bodies.take_report(body, NOW + number * NS_PER_S // 5)
     assert cells(bodies) == {(5, 15)}
     assert bodies.complaints == []
 

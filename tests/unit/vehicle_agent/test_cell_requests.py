@@ -113,7 +113,7 @@ class Place:
             radius_m=self.chance.uniform(1.0, 9.0),
             lease_s=self.chance.choice((0.3, 2.0)),
         )
-        self.bodies.hear(report, self.now_ns)
+        self.bodies.take_report(report, self.now_ns)
 
     def push(self) -> None:
         self.held.pushed[self.chance.choice(self.vehicles).id] = self.chance.choice((0, 900))

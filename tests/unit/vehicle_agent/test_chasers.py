@@ -73,7 +73,7 @@ def test_a_planner_knows_its_chasers_at_every_tick_and_a_cell_that_each_can_stil
                 followers.drop_silent(now_ns)
                 chasers = {id for id in driven if chased[id] == target}
                 assert set(followers.ids()) == chasers
-                for id, follower in zip(followers.ids(), followers.all(), strict=True):
+                for id, follower in followers.all_items():
                     assert driven[id] <= follower.cell < driven[id] + 4
         assert messages < 120 * 3 / 2
 

@@ -237,7 +237,7 @@ class Two:
         assert told is not None
         for other, costs in self.costs.items():
             if other != agent:
-                costs.hear(decode(encode(told), SharedCosts), now_ns)
+                costs.receive(decode(encode(told), SharedCosts), now_ns)
 
     def chased(self, agent: str) -> list[str | None]:
         return [vehicle.target for vehicle in self.vehicles[agent].values()]
@@ -289,17 +289,17 @@ def test_a_target_that_nobody_can_reach_is_left_out_and_one_that_only_others_kno
 
 def test_of_two_lives_of_an_agent_the_one_that_spoke_last_counts_and_none_speaks_for_another() -> None:
     costs = GroupCosts("all.a0.1", "all", "a0")
-    costs.hear(told("all.a1.1", 5.0, stamp_ns=20), 20)
-    costs.hear(told("all.a1.2", 6.0, stamp_ns=30), 30)
-    costs.hear(told("all.a1.1", 7.0, stamp_ns=10), 40)
-    costs.hear(told("all.a0.9", 8.0, stamp_ns=50), 50)
+    costs.receive(told("all.a1.1", 5.0, stamp_ns=20), 20)
+    costs.receive(told("all.a1.2", 6.0, stamp_ns=30), 30)
+    costs.receive(told("all.a1.1", 7.0, stamp_ns=10), 40)
+    costs.receive(told("all.a0.9", 8.0, stamp_ns=50), 50)
     assert costs.rows(["t0"])[1].tolist() == [[6.0]]
 
 
 def test_however_many_agents_strangers_invent_only_so_many_are_kept() -> None:
     costs = GroupCosts("all.a0.1", "all", "a0")
     for n in range(1000):
-        costs.hear(told(f"all.b{n}.1", 5.0, stamp_ns=n), n)
+        costs.receive(told(f"all.b{n}.1", 5.0, stamp_ns=n), n)
     assert len(costs.rows(["t0"])[0]) == 256
 
 

@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteStatus
-from vehicle_agent.driving.driven_vehicle import AskRoute, Follow, GivenRoute, Reason, Vehicle
+from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle
 
 GRID = GridSpec(10, 10, 10.0)
 S = NS_PER_S
@@ -30,7 +30,7 @@ def vehicle() -> Vehicle:
 @pytest.fixture
 def follower(vehicle: Vehicle) -> Vehicle:
     vehicle.assign("t0", S)
-    vehicle.route_request(S, vehicle.cell)
+    vehicle.route_request(S)
     vehicle.give_route(ROUTE, [vehicle.cell], S)
     return vehicle
 
@@ -42,23 +42,11 @@ def run_out(vehicle: Vehicle) -> None:
         vehicle.route.moved(cell)
 
 
-def test_without_a_target_it_is_idle_and_asks_nobody(vehicle: Vehicle) -> None:
-    assert vehicle.route_request(S, vehicle.cell) is None
-    assert vehicle.state is VehicleState.IDLE
-
-
 def test_given_a_target_it_asks_once_and_waits(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    assert vehicle.route_request(S, vehicle.cell) == AskRoute("v", "t0", 11, False, Reason.ASSIGNED)
-    assert vehicle.route_request(2 * S, vehicle.cell) is None
+    assert vehicle.route_request(S) is Reason.ASSIGNED
+    assert vehicle.route_request(2 * S) is None
     assert vehicle.state is VehicleState.WAITING
-
-
-def test_given_a_route_it_follows_it_and_says_so(vehicle: Vehicle) -> None:
-    vehicle.assign("t0", S)
-    vehicle.route_request(S, vehicle.cell)
-    assert vehicle.give_route(ROUTE, [vehicle.cell], S) == Follow("v", "t0", (11, 12, 13, 14), 3.0, 2.5)
-    assert vehicle.state is VehicleState.FOLLOWING
 
 
 def test_without_an_answer_it_asks_again_later_and_later(vehicle: Vehicle) -> None:
@@ -66,7 +54,7 @@ def test_without_an_answer_it_asks_again_later_and_later(vehicle: Vehicle) -> No
     asked_at = []
     for tick in range(200):
         now_ns = tick * S // 10
-        if vehicle.route_request(now_ns, vehicle.cell):
+        if vehicle.route_request(now_ns):
             asked_at.append(tick)
             vehicle.no_answer(now_ns)
     waits = [after - before for before, after in pairwise(asked_at)]
@@ -75,27 +63,25 @@ def test_without_an_answer_it_asks_again_later_and_later(vehicle: Vehicle) -> No
 
 def test_a_route_that_ran_out_is_asked_for_by_force(follower: Vehicle) -> None:
     run_out(follower)
-    assert follower.route_request(2 * S, follower.cell) == AskRoute("v", "t0", 14, True, Reason.RAN_OUT)
+    assert follower.route_request(2 * S) is Reason.RAN_OUT
     assert follower.state is VehicleState.WAITING
 
 
 def test_with_its_target_in_reach_it_has_arrived_and_asks_nothing(follower: Vehicle) -> None:
     run_out(follower)
     follower.set_in_reach(True)
-    assert follower.route_request(3 * S, follower.cell) is None
+    assert follower.route_request(3 * S) is None
     assert follower.state is VehicleState.ARRIVED
     follower.set_in_reach(False)
     assert follower.state is VehicleState.WAITING
-    request = follower.route_request(4 * S, follower.cell)
-    assert request is not None
-    assert request.force
+    assert follower.route_request(4 * S) is Reason.RAN_OUT
 
 
 def test_a_route_given_in_parts_is_asked_for_before_it_ends(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S, vehicle.cell)
+    vehicle.route_request(S)
     vehicle.give_route(GivenRoute("t0", (11, 12, 13), 9.0, 9.0, partial=True), [vehicle.cell], S)
-    assert vehicle.route_request(2 * S, vehicle.cell) == AskRoute("v", "t0", 11, False, Reason.CONTINUED)
+    assert vehicle.route_request(2 * S) is Reason.CONTINUED
     assert not Reason.CONTINUED.is_reroute
 
 
@@ -110,7 +96,7 @@ def test_a_pushed_route_replaces_the_old_one_from_here_on(follower: Vehicle) -> 
 def test_a_pushed_route_that_does_not_pass_here_makes_it_stop_and_ask(follower: Vehicle) -> None:
     pushed = GivenRoute("t0", (44, 45), 3.0, 3.0, partial=False, pushed=True)
     assert follower.give_route(pushed, [follower.cell], 2 * S) is None
-    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.ASSIGNED)
+    assert follower.route_request(3 * S) is Reason.ASSIGNED
 
 
 def test_a_route_to_another_target_is_ignored(follower: Vehicle) -> None:
@@ -129,31 +115,24 @@ def test_a_route_may_begin_where_the_path_ends_that_it_still_drives(follower: Ve
     assert follower.route.after(13, 9) == [23, 33]
 
 
-def test_a_closure_ahead_makes_it_ask_for_another_way(follower: Vehicle) -> None:
-    follower.route.cut(lambda cells: cells.index(13))
-    follower.cut_route(2 * S)
-    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.CUT)
-    assert follower.state is VehicleState.FOLLOWING
-
-
 def test_its_planner_gone_it_keeps_its_route_and_is_lost_until_the_planner_is_back(follower: Vehicle) -> None:
     follower.lose_planner(2 * S)
     assert follower.state is VehicleState.LOST
     assert follower.route.ahead() == [12, 13, 14]
     run_out(follower)
-    assert follower.route_request(3 * S, follower.cell) is None
+    assert follower.route_request(3 * S) is None
     assert follower.state is VehicleState.LOST
     follower.regain_planner(4 * S)
-    assert follower.route_request(4 * S, follower.cell) == AskRoute("v", "t0", 14, False, Reason.PLANNER_BACK)
+    assert follower.route_request(4 * S) is Reason.PLANNER_BACK
 
 
 def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S, vehicle.cell)
+    vehicle.route_request(S)
     vehicle.refuse_route("t0", RouteStatus.UNREACHABLE, S)
     assert vehicle.state is VehicleState.STRANDED
-    assert vehicle.route_request(2 * S, vehicle.cell) is None
-    assert vehicle.route_request(5 * S, vehicle.cell) is not None
+    assert vehicle.route_request(2 * S) is None
+    assert vehicle.route_request(5 * S) is not None
     assert vehicle.state is VehicleState.STRANDED
     vehicle.give_route(ROUTE, [vehicle.cell], 5 * S)
     assert vehicle.state is VehicleState.FOLLOWING
@@ -161,40 +140,26 @@ def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(vehicle: Veh
 
 def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S, vehicle.cell)
+    vehicle.route_request(S)
     vehicle.refuse_route("t0", RouteStatus.NO_TARGET, S)
     assert vehicle.state is VehicleState.WAITING
-    assert vehicle.route_request(2 * S, vehicle.cell) is not None
+    assert vehicle.route_request(2 * S) is not None
 
 
-def test_no_way_to_any_target_is_stranded_even_before_it_had_one(vehicle: Vehicle) -> None:
-    vehicle.no_way()
-    assert vehicle.state is VehicleState.STRANDED
-    vehicle.assign("t1", 2 * S)
-    assert vehicle.route_request(2 * S, vehicle.cell) == AskRoute("v", "t1", 11, False, Reason.ASSIGNED)
-
-
-def test_its_target_s_tracker_lost_it_drives_on_and_says_that_it_goes_by_an_old_pose(follower: Vehicle) -> None:
-    follower.set_tracked(False)
-    assert follower.state is VehicleState.OUTDATED
-    assert follower.route.ahead() == [12, 13, 14]
-    follower.set_in_reach(True)
-    assert follower.state is VehicleState.OUTDATED, "nobody has arrived at a target that may be anywhere"
-    follower.set_tracked(True)
-    assert follower.state is VehicleState.ARRIVED
-    follower.set_in_reach(False)
-    assert follower.state is VehicleState.FOLLOWING
-
-
-def test_a_jump_of_its_target_makes_it_ask_at_once(follower: Vehicle) -> None:
-    follower.target_jumped(2 * S)
-    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.JUMPED)
-
-
-def test_whoever_is_blocked_for_long_asks_but_keeps_its_route(follower: Vehicle) -> None:
-    follower.blocked_for_long(2 * S)
-    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.BLOCKED)
-    assert follower.route.left == 3
+@pytest.mark.parametrize(
+    ("happen", "reason"),
+    [
+        (Vehicle.blocked_for_long, Reason.BLOCKED),
+        (Vehicle.cut_route, Reason.CUT),
+        (Vehicle.target_jumped, Reason.JUMPED),
+    ],
+)
+def test_whoever_needs_another_route_asks_and_drives_its_own_on(
+    follower: Vehicle, happen: Callable[[Vehicle, int], None], reason: Reason
+) -> None:
+    happen(follower, 2 * S)
+    assert follower.route_request(3 * S) is reason
+    assert (follower.route.left, follower.state) == (3, VehicleState.FOLLOWING)
 
 
 Happening = Callable[[Vehicle, int], object]
@@ -231,7 +196,7 @@ def test_whatever_happens_the_state_tells_what_is_so_and_it_never_gives_up(happe
     vehicle = Vehicle("v", GRID, 11)
     for second, happening in enumerate(happened):
         happening(vehicle, second * S)
-        vehicle.route_request(second * S, vehicle.cell)
+        vehicle.route_request(second * S)
         if vehicle.target is not None:
             assert (vehicle.state is VehicleState.ARRIVED) == (vehicle.in_reach and vehicle.tracked)
             if vehicle.state is VehicleState.OUTDATED:
@@ -248,7 +213,7 @@ def test_whatever_happens_the_state_tells_what_is_so_and_it_never_gives_up(happe
     vehicle.no_answer(end_ns)
     vehicle.regain_planner(end_ns)
     vehicle.set_in_reach(False)
-    assert any(vehicle.route_request(end_ns + wait * S, vehicle.cell) for wait in range(10))
+    assert any(vehicle.route_request(end_ns + wait * S) for wait in range(10))
 
 
 def random_call(vehicle: Vehicle, chance: random.Random) -> None:
@@ -273,7 +238,7 @@ def random_call(vehicle: Vehicle, chance: random.Random) -> None:
         (target is not None, lambda: vehicle.regain_planner(0)),
         (target is not None, lambda: vehicle.set_in_reach(flag)),
         (target is not None, lambda: vehicle.target_jumped(0)),
-        (True, lambda: vehicle.route_request(10 * S, vehicle.cell)),
+        (True, lambda: vehicle.route_request(10 * S)),
         (flag or asked is not None, lambda: vehicle.give_route(route, [11], 0)),
         *[(asked is not None, lambda: vehicle.refuse_route(asked or "", status, 0))] * 3,
         *[(asked is not None, lambda: vehicle.no_answer(0))] * 3,
