@@ -122,7 +122,7 @@ class MoversView:
             case Believed() as believed:
                 self._believed[believed.target] = believed, now_ns
             case Body() as body:
-                self._bodies.hear(body, now_ns)
+                self._bodies.take_report(body, now_ns)
             case Followed() as followed:
                 try:
                     self._vehicles.begun(followed, now_ns)

@@ -30,7 +30,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import TILE_CELLS, walk
-from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, RouteRequest, TargetPose
@@ -255,18 +254,6 @@ def test_no_route_of_a_class_enters_what_is_lethal_to_it(world: _World, name: st
         elif np.isinf(own[route.start]):
             assert route.status is RouteStatus.LETHAL_START
     assert found > 5
-
-
-def test_what_one_class_reaches_another_may_not(world: _World) -> None:
-    cells = list(range(world.terrain.grid.cells))
-    costs = {
-        name: column(world.ask(CostRequest(cells=cells, vehicle_class=name)).cost_to_go_s, "<f4")
-        for name in ("ground", "walker", "low")
-    }
-    reached = {name: int(np.isfinite(each).sum()) for name, each in costs.items()}
-    assert reached["walker"] > reached["ground"] > reached["low"] > 0
-    both = np.isfinite(costs["walker"]) & np.isfinite(costs["ground"]) & (costs["ground"] > 0)
-    assert (costs["walker"][both] > costs["ground"][both]).mean() > 0.9  # on foot
 
 
 def test_while_the_kernels_of_classes_are_compiled_a_class_is_refused_at_once_and_the_ground_is_served() -> None:

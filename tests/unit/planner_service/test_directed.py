@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import get_args
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -22,12 +19,11 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.config.values import Strategy
 from swarm.errors import ConfigError
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
+from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.lock_regions import Plots
 from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
-from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.sensing.sensor import TruthSensor
@@ -46,43 +42,6 @@ def climb_on(elevation_m, rule="energy", res=RES, **cost) -> Climb:
 def ramp(rows=3, cols=12, per_cell_m=1.0):
     """Ground that rises to the east, 10 % steep."""
     return np.tile(np.arange(cols, dtype=np.float32) * per_cell_m, (rows, 1))
-
-
-def slow_costs(pace, climb, root, octile=True, corners=False, four=False):
-    """An independent Dijkstra over every step written out."""
-    rows, cols = pace.shape
-    cells, free = np.arange(pace.size).reshape(rows, cols), np.isfinite(pace)
-    tails, heads, costs = [], [], []
-    for k in range(0, 8, 2 if four else 1):
-        dr, dc = STEP_ROW[k], STEP_COL[k]
-        here = np.s_[max(0, -dr) : rows - max(0, dr), max(0, -dc) : cols - max(0, dc)]
-        there = np.s_[max(0, dr) : rows - max(0, -dr), max(0, dc) : cols - max(0, -dc)]
-        ok = free[here] & free[there]
-        if k & 1 and not corners:
-            ok &= free[here[0], there[1]] & free[there[0], here[1]]
-        tail, head = cells[here][ok], cells[there][ok]
-        length = climb.grid.resolution_m * (math.sqrt(2) if k & 1 and octile else 1.0)
-        tails.append(tail)
-        heads.append(head)
-        costs.append(pace.reshape(-1)[head].astype(np.float64) * length * climb.along(tail, head))
-    backward = (np.concatenate(heads), np.concatenate(tails))
-    return dijkstra(csr_array((np.concatenate(costs), backward), shape=(pace.size,) * 2), indices=root)
-
-
-def rough(rng, rows, cols, spread=1.0, walls=0.2):
-    pace = (0.1 * np.exp(rng.normal(0, spread, (rows, cols)))).astype(np.float32)
-    pace[rng.random((rows, cols)) < walls] = np.inf
-    return pace
-
-
-def recomputed(route: Route, pace, climb: Climb, octile=True) -> float:
-    """What a route costs, cell by cell, as a vehicle drives it."""
-    cells = walk(climb.grid, route.start, route.directions)
-    total = 0.0
-    for direction, (tail, head) in zip(route.directions, itertools.pairwise(cells), strict=True):
-        length = climb.grid.resolution_m * (math.sqrt(2) if direction & 1 and octile else 1.0)
-        total += length * float(pace.reshape(-1)[head]) * climb.of_step(tail, head)
-    return total
 
 
 # --- the table --------------------------------------------------------------------------------------------------
@@ -132,54 +91,6 @@ def test_one_step_and_many_steps_read_the_same_table():
 # --- trees ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(12))
-@pytest.mark.parametrize("rule", ["quadratic", "tobler", "energy"])
-def test_costs_equal_an_independent_dijkstra(seed, rule):
-    rng = np.random.default_rng([seed, 1])
-    rows, cols = (int(n) for n in rng.integers(4, 60, 2))
-    climb = climb_on(mountain_noise(rng, rows, cols, 12.0).whole() * np.float32(rng.choice([0, 20, 200])), rule)
-    pace = rough(rng, rows, cols, float(rng.choice([0.1, 1.0, 3.0])), float(rng.choice([0.0, 0.3])))
-    root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-    octile, corners, four = bool(seed & 1), bool(seed & 2), seed % 5 == 4
-    config = PlannerConfig(
-        edge="octile" if octile else "paper", corner_cutting=corners, neighbours=4 if four else 8
-    )
-    tree = TargetTree(climb.grid, config, climb)
-    assert tree.update(pace, root, [], 0).kind == "full"
-    np.testing.assert_allclose(
-        tree.cost_to_go_at(np.arange(pace.size)),
-        np.where(np.isfinite(pace).reshape(-1), slow_costs(pace, climb, root, octile, corners, four), np.inf),
-        rtol=3e-6,
-    )
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_routes_end_at_the_target_over_passable_cells_and_cost_what_they_say(seed):
-    rng = np.random.default_rng([seed, 2])
-    climb = climb_on(
-        mountain_noise(rng, 40, 50, 12.0).whole() * 150, "tobler" if seed & 1 else "energy", max_slope_deg=75
-    )
-    pace = rough(rng, 40, 50)
-    root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-    tree = TargetTree(climb.grid, PlannerConfig(), climb)
-    tree.update(pace, root, [], 0)
-    routes = tree.routes(np.arange(pace.size))
-    ways = [route for route in routes if route.status is RouteStatus.OK]
-    assert len(ways) > 100
-    for route in ways:
-        cells = walk(climb.grid, route.start, route.directions)
-        assert cells[-1] == root
-        assert np.isfinite(pace.reshape(-1)[cells]).all()
-        assert route.cost_s == pytest.approx(recomputed(route, pace, climb), rel=2e-3)
-        assert 0 <= route.lower_bound_s <= route.cost_s <= route.lower_bound_s * 1.001
-        for direction, cell in zip(route.directions, cells, strict=False):
-            if direction & 1:
-                row, col = divmod(cell, 50)
-                assert np.isfinite(
-                    [pace[row + STEP_ROW[direction], col], pace[row, col + STEP_COL[direction]]]
-                ).all()
-
-
 def test_a_part_of_a_route_says_what_is_left_of_it():
     climb = climb_on(ramp(5, 30))
     pace = np.full((5, 30), 0.1, np.float32)
@@ -190,65 +101,6 @@ def test_a_part_of_a_route_says_what_is_left_of_it():
     assert part.cost_s == pytest.approx(whole.cost_s)
     assert part.remaining_s == pytest.approx(whole.cost_s * 22 / 29)
     assert whole.cost_s == pytest.approx(29.0 * climb.of_step(0, 1))  # 10 m x 0.1 s/m: a second a cell on the level
-
-
-def test_the_way_back_down_is_another_and_cheaper():
-    """A hill in the way: up it costs, down it does not."""
-    climb = climb_on(ramp(21, 40))
-    pace = np.full((21, 40), 0.1, np.float32)
-    low, high = 10 * 40, 10 * 40 + 39
-    up, down = (TargetTree(climb.grid, PlannerConfig(), climb) for _ in range(2))
-    up.update(pace, high, [], 0)
-    down.update(pace, low, [], 0)
-    assert up.cost_to_go_at([low])[0] > 2 * down.cost_to_go_at([high])[0]
-
-
-def test_a_ridge_is_crossed_where_it_is_low_only_if_the_climb_is_worth_the_detour():
-    heights = np.zeros((31, 31), np.float32)
-    heights[:26, 15] = 30.0  # a wall of earth with a gap in the south, passable everywhere
-    climb = climb_on(heights, max_slope_deg=80)
-    pace = np.full((31, 31), 0.1, np.float32)
-    tree = TargetTree(climb.grid, PlannerConfig(), climb)
-    tree.update(pace, 20 * 31 + 30, [], 0)
-    cells = walk(climb.grid, 20 * 31, tree.routes([20 * 31])[0].directions)
-    assert all(heights.reshape(-1)[cell] == 0 for cell in cells)
-
-
-def test_after_marks_the_tree_is_one_grown_from_scratch_and_still_exact():
-    rng = np.random.default_rng(3)
-    climb = climb_on(mountain_noise(rng, 40, 40, 12.0).whole() * 100)
-    pace = rough(rng, 40, 40, 0.5, 0.1)
-    pace[20, 20] = 0.1
-    tree = TargetTree(climb.grid, PlannerConfig(), climb)
-    tree.update(pace, 820, [], 0)
-    for version, value in ((1, np.inf), (2, 0.05), (3, 0.4)):
-        pace[5:9, 10:30] = value
-        assert tree.update(pace, 820, [Window(5, 10, 9, 30)], version).kind in ("repair", "full")
-        fresh = TargetTree(climb.grid, PlannerConfig(), climb)
-        fresh.update(pace, 820, [], 0)
-        every = np.arange(1600)
-        np.testing.assert_array_equal(tree.cost_to_go_at(every), fresh.cost_to_go_at(every))
-
-
-def test_a_tree_grown_by_a_worker_is_the_same():
-    rng = np.random.default_rng(5)
-    climb = climb_on(mountain_noise(rng, 40, 40, 12.0).whole() * 100)
-    pace = rough(rng, 40, 40, 0.5, 0.0)
-    tree = TargetTree(climb.grid, PlannerConfig(), climb)
-    tree.update(pace, 820, [], 0)
-    before = tree.cost_to_go_at(np.arange(1600))
-    tree.adopt(tree.full_job(820)(), pace, 820, [], 0, np.arange(0, 1600, 50))
-    np.testing.assert_array_equal(tree.cost_to_go_at(np.arange(1600)), before)
-    np.testing.assert_allclose(tree.last_gaps, 1.0, rtol=1e-5)
-
-
-def test_auto_grows_windows_where_whole_trees_are_too_dear():
-    climb = climb_on(ramp(60, 60))
-    pace = np.full((60, 60), 0.1, np.float32)
-    tree = TargetTree(climb.grid, PlannerConfig(cpu_budget=0.01, k_min=0), climb)
-    tree.times.observe_full_ns(10**9)
-    kinds = [tree.update(pace, 1830 + step, [], step).kind for step in range(5)]
-    assert kinds == ["full", *["window"] * 4]
 
 
 # --- in a run ---------------------------------------------------------------------------------------------------

@@ -207,26 +207,6 @@ def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.Monke
     assert not disk.started
 
 
-def test_a_directed_terrain_waits_for_the_kernels_that_grow_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    disk = Disk(monkeypatch)
-    needed = needed_kernels(scenario(directional=True))
-    disk.coming = [*map(name_of, needed.later), *map(name_of, needed.first)]
-    loader = KernelLoader(needed, whole=False)
-    loader.load_first()
-    assert not disk.coming
-    assert "grow_directed_by_buckets" in disk.options
-
-
-def test_what_only_the_other_kind_of_map_needs_is_not_compiled() -> None:
-    """Uphill is not downhill: other growths, one of which serves all costs, and else as many kernels."""
-    alike, directed = (
-        {name_of(kernel) for kernel in needed_kernels(scenario(directional=kind))} for kind in (False, True)
-    )
-    assert len(alike) == len(directed) + 1
-    assert {name for name in alike & directed if name.startswith("grow")} == set()
-    assert not any("directed" in name for name in alike)
-
-
 @pytest.mark.parametrize(
     ("options", "wanted"),
     [

@@ -35,7 +35,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
     TargetPose,
 )
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.routes import RouteStatus
 from swarm.wire.topics import CHASERS, COST, POSE, ROUTE, Topic
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
@@ -44,13 +44,6 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     load_all()
-
-
-def test_before_any_pose_a_route_is_no_target() -> None:
-    swarm = Swarm()
-    swarm.run(0.5)
-    reply = swarm.ear.routes(7)
-    assert (reply.target_cell, list(reply.routes)) == (None, [Route(status=RouteStatus.NO_TARGET, start=7)])
 
 
 def test_half_a_second_after_the_first_pose_routes_are_the_best_there_are() -> None:
@@ -116,15 +109,6 @@ def test_one_wildcard_question_brings_the_costs_of_all_planners() -> None:
     assert all(isinstance(reply, CostReply) for reply in replies)
 
 
-def test_a_person_asks_by_row_and_col_and_outside_is_a_status() -> None:
-    swarm = Swarm()
-    swarm.cells["t"] = GRID.cell(10, 10)
-    swarm.run(0.3)
-    inside = swarm.ear.routes(row=10, col=13).routes
-    assert [(route.start, list(route.directions)) for route in inside] == [(GRID.cell(10, 13), [6, 6, 6])]
-    assert [route.status for route in swarm.ear.routes(row=10, col=COLS).routes] == [RouteStatus.OUTSIDE]
-
-
 def test_a_target_on_lethal_ground_has_no_routes_until_it_is_back() -> None:
     pace = flat()
     pace[5, 5] = np.inf
@@ -187,21 +171,6 @@ def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None
     assert sum(stats.histograms["mark_to_tree_ms"].values()) == 1
 
 
-def test_followers_of_a_moving_target_are_pushed_routes_to_where_it_is_now() -> None:
-    swarm = Swarm()
-    swarm.cells["t"] = GRID.cell(20, 20)
-    swarm.run(0.3)
-    swarm.ear.routes(GRID.cell(0, 0), vehicles=["v"])
-    for n in range(40):
-        swarm.cells["t"] += 1 if n % 2 else COLS if n % 4 == 0 else 0
-        swarm.report(("v", GRID.cell(0, 0)))
-        swarm.run(0.1)
-    pushes = swarm.ear.of(PushedRoute)
-    assert 3 <= len(pushes) <= 5
-    for pushed in pushes:
-        assert walk(GRID, pushed.route.start, pushed.route.directions)[-1] == pushed.target_cell
-
-
 def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_marks() -> None:
     swarm = Swarm()
     swarm.keeper("keeper", KeeperStore(":memory:"))
@@ -243,19 +212,6 @@ def test_a_driver_killed_under_way_goes_on_where_the_planners_saw_its_targets() 
     assert all(GRID.distance_cells(before[id], after[id]) <= 1 for id in before)
 
 
-def test_after_a_restart_followers_are_found_by_their_reports() -> None:
-    swarm = Swarm()
-    swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.kill("planner-t-1")
-    swarm.planner("t", incarnation=2)
-    for _ in range(5):
-        swarm.report(("v", 3))
-        swarm.run(0.1)
-        swarm.cells["t"] += 1
-    (pushed, *_) = swarm.ear.of(PushedRoute)
-    assert (pushed.vehicle, pushed.incarnation, pushed.route.start) == ("v", 2, 3)
-
-
 def test_gaps_are_measured_over_those_who_follow() -> None:
     swarm = Swarm(rough(8))
     chance = random.Random(1)
@@ -285,14 +241,6 @@ def test_windows_and_the_exact_trees_that_renew_them_are_counted() -> None:
     assert stats.counts["window_growths"] > 10
     assert sum(stats.histograms["window_ms"].values()) == stats.counts["window_growths"]
     assert swarm.ear.of(PlannerStatus)[-1].gap_max >= 1.0
-
-
-def test_a_request_for_more_routes_than_a_message_holds_is_refused_in_words() -> None:
-    swarm = Swarm()
-    swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.run(0.3)
-    assert swarm.ear.ask(ROUTE, RouteRequest(cells=[0] * (MOST_ROUTES + 1)), target="t") == []
-    assert swarm.ear.ended[-1].failure == "20001 routes at once, at most 20000: ask in parts"
 
 
 def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
@@ -335,14 +283,6 @@ def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
     stand(10, 3, 2 * NS_PER_S)
     assert counters.histograms["held_gap_excess"].quantile(1.0) == pytest.approx(2.0, rel=0.03)
     assert counters.histograms["gap_excess"].quantile(1.0) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_declared_counts_are_told_before_anything_happens() -> None:
-    swarm = Swarm()
-    swarm.run(0.1)
-    counts = swarm.ear.last_stats().counts
-    for name in ("routes_served", "growths", "window_growths", "pushes", "marks_merged"):
-        assert counts[name] == 0
 
 
 @settings(deadline=None, max_examples=15)

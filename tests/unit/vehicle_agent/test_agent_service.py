@@ -24,14 +24,6 @@ def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() ->
     world.assert_lawful()
 
 
-def test_four_agents_share_the_ground_without_meeting() -> None:
-    world = AgentWorld(scenario(8, capture=15.0), pace_of(OPEN))
-    world.put_target("t", 10, 10)
-    world.start_all()
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
-    world.assert_lawful()
-
-
 # --- driving ------------------------------------------------------------------------------------------------
 
 
@@ -85,19 +77,6 @@ def test_slow_ground_is_marked_and_driven_at_its_own_pace() -> None:
     # 12 cells, four of them at three times the pace.
     assert 19.4 <= took_s <= 22.0
     assert world.count("marks") == 4
-
-
-def test_a_vehicle_goes_on_when_its_target_jumps() -> None:
-    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
-    world.put_target("t", 10, 8)
-    world.start_all()
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
-    world.put_target("t", 2, 17, jumped=True)
-    world.run(1.0)
-    assert world.all_in(VehicleState.FOLLOWING)
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
-    row, col = world.where()["a0-00"]
-    assert abs(row - 2) + abs(col - 17) == 1
 
 
 def test_routes_given_in_parts_are_driven_without_a_stop() -> None:
@@ -179,17 +158,6 @@ def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
     assert world.all_in(VehicleState.FOLLOWING)
     assert world.planners["t"].requests[0].vehicles == ["a0-00"]
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
-
-
-def test_a_planner_that_does_not_answer_is_asked_again_and_again_but_not_in_a_frenzy() -> None:
-    world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN))
-    world.put_target("t", 10, 5)
-    world.start_all()
-    world.planners["t"].mute = True
-    world.run(5.0)
-    assert world.all_in(VehicleState.IDLE)
-    world.planners["t"].mute = False
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=10)
 
 
 # --- crashes and bad links ----------------------------------------------------------------------------------

@@ -34,18 +34,20 @@ def climb_on(elevation_m: np.ndarray) -> Climb:
     return climb
 
 
-def steering_on(climb: Climb, pace: np.ndarray = LEVEL) -> Steering:
-    return Steering(GRID, pace, PlannerConfig(), 4, Bodies(GRID), climb)
+def steering_on(climb: Climb | None, pace: np.ndarray = LEVEL, corners: bool = False) -> Steering:
+    return Steering(GRID, pace, PlannerConfig(corner_cutting=corners), 4, Bodies(GRID), climb)
 
 
-@given(st.integers(0, 1 << 32), st.floats(0.0, 0.3))
-@settings(max_examples=few(30), deadline=None)
-def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(seed: int, share: float) -> None:
+@given(st.integers(0, 1 << 32), st.floats(0.0, 0.4), st.booleans(), st.booleans())
+@settings(max_examples=few(60), deadline=None)
+def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(
+    seed: int, share: float, corners: bool, level: bool
+) -> None:
     chance = random.Random(seed)
     heights = np.array([chance.gauss(0, 2) for _ in range(GRID.cells)]).reshape(8, 8)
     pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
-    climb = climb_on(heights)
-    steering = steering_on(climb, pace.reshape(8, 8))
+    climb = None if level else climb_on(heights)
+    steering = steering_on(climb, pace.reshape(8, 8), corners)
     cells = [chance.randrange(GRID.cells)]
     for _ in range(chance.randint(0, 20)):
         cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))
@@ -53,7 +55,7 @@ def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(seed: i
     assert steering.passable_steps(cells) == [*one_by_one, False].index(False)
     near = [other for _, other in GRID.neighbours(cells[0])]
     assert sorted(steering.steps(cells[0])) == sorted(each for each in near if steering.passable(cells[0], each))
-    assert all(climb.allows(cells[0], each) for each in steering.steps(cells[0]))
+    assert climb is None or all(climb.allows(cells[0], each) for each in steering.steps(cells[0]))
 
 
 class Held:
@@ -144,21 +146,6 @@ def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int
     back = [climb.allows(each, here) for each in wants]
     assert sorted(wants) == sorted(steering.steps(here))
     assert back == sorted(back, reverse=True)
-
-
-@given(st.integers(0, 1 << 32), st.booleans(), st.floats(0.0, 0.4))
-def test_steps_of_a_route_around_corners_are_judged_together_as_they_are_one_by_one(
-    seed: int, corners: bool, share: float
-) -> None:
-    chance = random.Random(seed)
-    pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
-    rules = PlannerConfig(corner_cutting=corners)
-    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, Bodies(GRID))
-    cells = [chance.randrange(GRID.cells)]
-    for _ in range(chance.randint(0, 20)):
-        cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))
-    one_by_one = [steering.passable(tail, head) for tail, head in pairwise(cells)]
-    assert steering.passable_steps(cells) == [*one_by_one, False].index(False)
 
 
 def test_one_that_stands_though_its_route_goes_on_is_blocked_and_one_that_moves_is_not() -> None:
