@@ -6,16 +6,20 @@ slope has none. Models are looked at in a sample of at most `level_ground.MOST_S
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
+from shared_map.terrain.row_bands import bands
 
 _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
 """So many of its eight neighbours are as high as a cell of a patch: those of a creek one cell wide are two. Among
 means of blocks a chain of equal ones is a contour line."""
+_RUNS_AT_ONCE = 1 << 18
+"""Runs of a model in whole metres may be as many as a third of its cells."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
 _COUNTS = ("edge", "differ", "beside", "below", "lower", "ripple", "terrace", "steep")
 _RIPPLE_CELLS, _RIPPLE = 3, 4.0
@@ -84,13 +88,13 @@ def level_patches(
         elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE if ripples else _LEAST_ALIKE_MEANS
     )
     many = len(cells)
-    at = np.flatnonzero(labels)
-    of_cell, height_m = labels.reshape(-1)[at], elevation_m.reshape(-1)[at]
-    lowest, highest = np.full(many, np.inf, np.float32), np.full(many, -np.inf, np.float32)
-    np.minimum.at(lowest, of_cell, height_m)
-    np.maximum.at(highest, of_cell, height_m)
-    first = np.full(many, np.nan, np.float32)
-    first[of_cell[::-1]] = height_m[::-1]  # of cells of one patch the last that is written stays
+    first, lowest, highest = (np.full(many, fill, np.float32) for fill in (np.nan, np.inf, -np.inf))
+    for row0, row1 in reversed(bands(elevation_m.shape[0])):
+        at = np.flatnonzero(labels[row0:row1])[::-1]  # backwards: what is written of a patch's first cell stays
+        of_cell, height_m = labels[row0:row1].reshape(-1)[at], elevation_m[row0:row1].reshape(-1)[at]
+        np.minimum.at(lowest, of_cell, height_m)
+        np.maximum.at(highest, of_cell, height_m)
+        first[of_cell] = height_m
     border = np.zeros(many, np.bool_)
     for line in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         border[line] = True
@@ -105,10 +109,11 @@ def _sides(
     """The counts of `Patches`, `edge` and what follows it: what lies beyond the sides of each patch's cells."""
     height, width = elevation_m.shape
     total = {name: np.zeros(len(cells), np.int64) for name in _COUNTS}
-    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        top, left = max(-down, 0), max(-right, 0)
-        of_cell = labels[top : height - max(down, 0), left : width - max(right, 0)]
-        of_next = labels[max(down, 0) : height - top, max(right, 0) : width - left]
+    for (row0, row1), (down, right) in itertools.product(bands(height), ((-1, 0), (1, 0), (0, -1), (0, 1))):
+        top, end = max(row0, -down), min(row1, height - down)
+        left, stop = max(-right, 0), width - max(right, 0)
+        of_cell = labels[top:end, left:stop]
+        of_next = labels[top + down : end + down, left + right : stop + right]
         row, col = np.nonzero((of_cell > 0) & (of_next != of_cell))
         patch, beyond = of_cell[row, col], of_next[row, col]
         row, col = row + top, col + left
@@ -188,13 +193,18 @@ def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[La
 def _touching(elevation_m: Floats, starts: Labels, ends: Labels, same_m: np.float32) -> tuple[Labels, Labels]:
     """Numbers of runs, and of runs in the row below that touch them, be it at a corner, and are as high."""
     flat_m, cols = elevation_m.reshape(-1), elevation_m.shape[1]
-    row = starts // cols
-    first = np.searchsorted(ends, np.maximum(starts + (cols - 1), (row + 1) * cols))
-    last = np.searchsorted(starts, np.minimum(ends + (cols + 1), (row + 2) * cols - 1), "right")
-    many = np.maximum(last - first, 0)
-    above = np.repeat(np.arange(starts.size, dtype=np.int32), many)
-    below = np.arange(above.size, dtype=np.int32) + np.repeat(first - (np.cumsum(many) - many), many)
-    at = np.clip(starts[below] - cols, starts[above], ends[above])
-    under = np.clip(at + cols, starts[below], ends[below])
-    same = np.abs(flat_m[at] - flat_m[under]) <= same_m
-    return above[same], below[same].astype(np.int32)
+    ones, others = [], []
+    for n in range(0, starts.size, _RUNS_AT_ONCE):
+        begin, end = starts[n : n + _RUNS_AT_ONCE], ends[n : n + _RUNS_AT_ONCE]
+        row = begin // cols
+        first = np.searchsorted(ends, np.maximum(begin + (cols - 1), (row + 1) * cols))
+        last = np.searchsorted(starts, np.minimum(end + (cols + 1), (row + 2) * cols - 1), "right")
+        many = np.maximum(last - first, 0)
+        above = np.repeat(np.arange(begin.size), many)
+        below = np.arange(above.size) + np.repeat(first - (np.cumsum(many) - many), many)
+        at = np.clip(starts[below] - cols, begin[above], end[above])
+        under = np.clip(at + cols, starts[below], ends[below])
+        same = np.abs(flat_m[at] - flat_m[under]) <= same_m
+        ones.append((above[same] + n).astype(np.int32))
+        others.append(below[same].astype(np.int32))
+    return np.concatenate(ones), np.concatenate(others)

@@ -114,7 +114,7 @@ def tiles(
 ) -> Iterator[tuple[slice, Features]]:
     """The tiles of the band from row0 to row1: which columns, and the features. Beyond the photo it is mirrored.
 
-    Other arguments are as of `photo_classes.class_readings`.
+    Other arguments are as of `classify.class_readings`.
     """
     rows, cols = rgb.shape[:2]
     padded_m = None if elevation_m is None else padded_rows(elevation_m, row0, row1)

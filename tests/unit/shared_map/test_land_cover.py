@@ -22,10 +22,8 @@ from shared_map.importers.cover.cover_codes import (
 )
 from shared_map.importers.cover.land_cover import read_cover
 from shared_map.terrain.layers import TerrainClass
-from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import COVER_TABLES, parse_scenario
-from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 
@@ -106,16 +104,6 @@ def test_codes_of_each_table_become_its_grounds(tmp_path: Path, dem: Path, key: 
     np.testing.assert_array_equal(source.classes, kinds)
     np.testing.assert_allclose(source.factor, factors)
     assert said(source.notes, f"land cover: {TABLES[key].title}")
-
-
-def test_paces_follow_from_class_and_factor(tmp_path: Path) -> None:
-    flat = written(tmp_path / "flat.tif", np.add.outer(np.zeros(40), np.arange(40.0) / 100))
-    codes = np.tile(np.repeat([10, 20, 30, 80], 10), (40, 1))
-    cover = written(tmp_path / "cover.tif", codes, "uint8")
-    config = TerrainConfig(source=str(flat), cover=str(cover), cover_codes="worldcover", cover_classes={"30": 4.0})
-    pace = build_terrain(Scenario(terrain=config)).pace_s_per_m[20]
-    np.testing.assert_allclose(pace[[5, 15, 25]] * 10, [1.8, 1.5, 4.0], rtol=1e-3)
-    assert np.isinf(pace[35])
 
 
 # --- which table ----------------------------------------------------------------------------------------------

@@ -118,14 +118,6 @@ def test_voids_nan_and_infinite_cells_are_voids_counted_and_said(tmp_path: Path,
     assert (np.isinf(terrain.pace_s_per_m) == np.isnan(source.elevation_m)).all()
 
 
-def test_voids_are_filled_on_request(tmp_path: Path) -> None:
-    values = heights()
-    values[5:10, 5:10] = -9999
-    source = load(write(tmp_path / "a.tif", values, nodata=-9999), nodata="fill")
-    assert said(source, "filled")
-    np.testing.assert_allclose(source.elevation_m, heights(), atol=6.0)
-
-
 def test_54_percent_voids_are_lethal_with_a_hint(tmp_path: Path) -> None:
     values = heights(50, 50)
     values[:27] = -9999
