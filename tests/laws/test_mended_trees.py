@@ -37,11 +37,7 @@ class Mended:
     def __init__(self, seed: int, priced: dict[str, Any], rows: int = 45, cols: int = 52) -> None:
         self.rng = np.random.default_rng(seed)
         rules = dict(priced)
-        climb = (
-            random_climb(self.rng, GridSpec(rows, cols, 1.0), 0.15, 0.5)
-            if rules.pop("directional", False)
-            else None
-        )
+        climb = steep_climb(self.rng, rows, cols) if rules.pop("directional", False) else None
         self.pace = random_pace(self.rng, rows, cols, (1.0, 3.0, 60.0)[seed % 3], (0.0, 0.2, 0.35)[seed // 3 % 3])
         self.costs = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**rules), climb)
         self.costs.load(self.pace)

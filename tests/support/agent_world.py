@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from support.slow_twins import cost_to_go, way_down
 from support.swarm_model import SwarmModel
@@ -59,10 +60,6 @@ def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
     """Pace from a picture: '#' is lethal, '~' is three times as slow, anything else is level ground."""
     values = {"#": math.inf, "~": 3 * pace}
     return np.array([[values.get(sign, pace) for sign in line] for line in picture], np.float32)
-
-
-def places(picture: Sequence[str], sign: str) -> list[tuple[int, int]]:
-    return [(r, c) for r, line in enumerate(picture) for c, found in enumerate(line) if found == sign]
 
 
 class FakePlanner:
@@ -278,16 +275,7 @@ class AgentWorld(SwarmModel):
 
     def _tell(self, target: str) -> None:
         old = self.poses[target]
-        self.poses[target] = TargetPose(
-            target=target,
-            incarnation=1,
-            seq=old.seq + 1,
-            stamp_ns=self.now_ns,
-            cell=old.cell,
-            x_m=old.x_m,
-            y_m=old.y_m,
-            jumps=old.jumps,
-        )
+        self.poses[target] = replace(old, seq=old.seq + 1, stamp_ns=self.now_ns)
         self._watch.publish(POSE, self.poses[target], target=target)
         self.scheduler.after(NS_PER_S // 10, lambda: self._tell(target))
 

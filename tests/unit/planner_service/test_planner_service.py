@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s, flat, optimum_s, rough
 
-from launch_scripts.simulation.world.service import TargetsService
 from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.target_tree import TargetTree
@@ -185,31 +184,6 @@ def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_m
     reply = swarm.ear.routes(GRID.cell(20, 10))
     assert reply.incarnation == 2
     assert GRID.cell(ROWS - 1, 25) in walk(GRID, reply.routes[0].start, reply.routes[0].directions)
-
-
-def test_a_driver_killed_under_way_goes_on_where_the_planners_saw_its_targets() -> None:
-    swarm = Swarm(targets=3)
-
-    def drive(incarnation: int) -> None:
-        setup = swarm.setup("targets", "0", incarnation)
-        swarm.start(
-            f"targets{incarnation}",
-            lambda bus, post: TargetsService(setup, swarm.terrain, swarm.pace, bus, post),
-            phase_ns=0,
-        )
-
-    drive(1)
-    swarm.run(4)
-    swarm.kill("targets1")
-    swarm.run(0.2)
-    poses: list[TargetPose] = []
-    swarm.ear.bus.subscribe(POSE, lambda event: poses.append(event.message))  # type: ignore[union-attr,arg-type]
-    before = {reply.target: reply.target_cell for reply in swarm.ear.ask(COST, CostRequest())}
-    drive(2)
-    swarm.run(0.3)
-    after = {pose.target: pose.cell for pose in reversed(poses)}
-    assert len(before) == len(after) == 3
-    assert all(GRID.distance_cells(before[id], after[id]) <= 1 for id in before)
 
 
 def test_gaps_are_measured_over_those_who_follow() -> None:

@@ -117,17 +117,6 @@ def test_a_diagonal_step_is_longer_and_heads_south_east() -> None:
     assert motion.heading_rad == pytest.approx(0.75 * math.pi)
 
 
-def test_a_vehicle_turns_back_as_long_as_it_has_not_left_its_cell() -> None:
-    motion = Motion(GRID, 11)
-    motion.set_out(12)
-    motion.advance(0.3, 0.1)
-    motion.turn_back()
-    assert (motion.cell, motion.entering) == (11, None)
-    assert motion.advance(0.5, 0.1) == pytest.approx(0.2)
-    assert motion.at_rest
-    assert motion.cell == 11
-
-
 def test_a_vehicle_that_has_left_its_cell_does_not_turn_back() -> None:
     motion = Motion(GRID, 11)
     motion.set_out(12)
