@@ -161,7 +161,7 @@ class Planner:
     def on_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
         if pose.target == self.target:
-            self._watch.on_pose(pose, now_ns)
+            self._watch.watch_pose(pose, now_ns)
 
     def on_sighting(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target is, by the best sighting of it: sightings are ordered before they come here."""

@@ -211,9 +211,13 @@ class PlannerService:
                 self._on_grown(tag, grown, took_ns, now_ns)
             case WorkDone(tag=tag, result=StrideSearch() as search):
                 self._on_strides(tag, search)
-            case _ if not self._member.handle(event):
+            case _ if not self._member.on_member_event(event):
                 # Each takes what is its own.
-                handlers = self._sync.handle, self._candidacy.handle, self._obedience.handle
+                handlers = (
+                    self._sync.on_map_event,
+                    self._candidacy.on_election_event,
+                    self._obedience.on_order_event,
+                )
                 any(handle(event, now_ns) for handle in handlers)
 
     def _on_grown(self, tag: str, grown: GrownTree, took_ns: int, now_ns: int) -> None:

@@ -66,10 +66,10 @@ class TargetWatch:
         """Whether nobody tracks the target now."""
         return self._tracking.lost(now_ns)
 
-    def on_pose(self, pose: TargetPose, now_ns: int) -> None:
+    def watch_pose(self, pose: TargetPose, now_ns: int) -> None:
         """A tracker tells a pose of the target."""
         before, heard_ns = self._tracking.pose, self._tracking.heard_ns
-        verdict = self._tracking.on_pose(pose, now_ns)
+        verdict = self._tracking.judge(pose, now_ns)
         if verdict is Verdict.COUNTS:
             self._check_clock(pose, now_ns)
             self._check_speed(before, heard_ns, pose, now_ns)

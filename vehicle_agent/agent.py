@@ -353,7 +353,7 @@ class Agent:
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
         """Where a tracker of a target says it is; returns that, with its cell, if it counts."""
-        counts = self._trackings.on_pose(pose, now_ns)
+        counts = self._trackings.counted(pose, now_ns)
         if counts is not None:
             self._empty.placed(pose.target, by_sight=False)
             self._moved(counts, now_ns)

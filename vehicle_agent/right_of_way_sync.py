@@ -118,7 +118,7 @@ class RightOfWaySync:
         self._bus.collect(GRANTED, host=self._id)
         self._ask_known()
 
-    def handle(self, event: Event, now_ns: int) -> bool:
+    def on_cells_event(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
         core, own_ns = self.core, self._own_time.at(now_ns)
         core.silent = not self._store.ready

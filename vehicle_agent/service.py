@@ -147,9 +147,9 @@ class AgentService:
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, LinkChanged) and event.up:
             self.agent.bodies.listen_anew(now_ns)
-        if self._member.handle(event) or self._sync.handle(event, now_ns):
+        if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
-        if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):
+        if self._right_of_way.on_cells_event(event, now_ns) or self._obedience.on_order_event(event, now_ns):
             return
         match event:
             case Asked(topic=topic, request=RemoveVehicles() as request) if topic is LEAVE:

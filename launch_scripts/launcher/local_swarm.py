@@ -255,7 +255,7 @@ class LocalSwarm:
         of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
         SIGKILL."""
         now_s = time.monotonic()
-        still = self._hang_watch.look(self.seen, now_s)
+        still = self._hang_watch.find_hanging(self.seen, now_s)
         for running in self.running if still else ():
             process = running.process
             if running.spec.name not in still or process is None:
@@ -430,7 +430,7 @@ class HangWatch:
         self._since: dict[str, tuple[int, float]] = {}
         """Name -> the stamp that it has shown last, and `_awake_s` when that was new."""
 
-    def look(self, seen: Callable[[], Iterable[Process]], now_s: float) -> list[str]:
+    def find_hanging(self, seen: Callable[[], Iterable[Process]], now_s: float) -> list[str]:
         """Names of processes whose loop has stood still for `STILL_S`; none between two looks.
 
         seen   how each process is; not asked between two looks

@@ -48,7 +48,7 @@ class OrderedPlanners:
         """Planner -> since when it has been missing."""
         self._refused: set[str] = set()
 
-    def look(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
+    def follow_orders(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
         """Start what is missing, and end what is not wanted any more.
 
         alive  (role, id) of the processes that are up, anywhere

@@ -66,7 +66,7 @@ class RouterService:
         self._member.join()
 
     def handle(self, event: Event, now_ns: int) -> None:
-        self._member.handle(event)
+        self._member.on_member_event(event)
 
     def tick(self, now_ns: int) -> None:
         if (bus := self._reopened()) is not None:

@@ -69,7 +69,7 @@ class TakeOver:
         """Whether all of this machine's part has been taken over."""
         return self._asked and all(running.alive for running in self._running)
 
-    def look(self, now_s: float) -> None:
+    def advance(self, now_s: float) -> None:
         """Do what has become possible. `now_s`: of a clock that only goes on."""
         if self._asked:
             return

@@ -292,10 +292,10 @@ class _Run:
         self._book = watcher.known.observed.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
-            ordered.look(self._book, set(watcher.known.observed.up()), time.monotonic())
+            ordered.follow_orders(self._book, set(watcher.known.observed.up()), time.monotonic())
             watcher.look_after([running.spec for running in self._swarm.running])
             if self._take_over is not None:
-                self._take_over.look(time.monotonic())
+                self._take_over.advance(time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S if self._startup_s is None else _CALM_TURN_S)
             self._tell(watcher)
@@ -346,7 +346,7 @@ class _Run:
         known = watcher.known
         up = known.up() if isinstance(known, OwnPart) else None
         self._signals.turned(known.observed, self._started_ns, self._missing(watcher), up)
-        if (sentence := self._disk.look(time.monotonic())) is not None:
+        if (sentence := self._disk.check_room(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         if (compiled := self._warm_up.news()) is not None:
             self._terminal.say(compiled)

@@ -79,7 +79,7 @@ class LoadingMonitor:
             self._service = cast("_Make", event.result)(self._member)
             self._service.start(now_ns)
         else:
-            self._member.handle(event)
+            self._member.on_member_event(event)
 
     def tick(self, now_ns: int) -> None:
         if self._service is not None:

@@ -130,7 +130,7 @@ class MonitorService:
         if isinstance(event, Appeared | Disappeared):
             self._alive(event.peer, isinstance(event, Appeared), now_ns)
             return
-        if self._member.handle(event) or self._sync.handle(event, now_ns):
+        if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
         match event:
             case Replied(message=Stats()):
@@ -170,7 +170,7 @@ class MonitorService:
 
     def _hear(self, heard: Heard, now_ns: int) -> None:
         self._observer.take(heard, now_ns)
-        self._movers.hear(heard.message, now_ns)
+        self._movers.on_observed(heard.message, now_ns)
         match heard.message:
             case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)

@@ -212,7 +212,7 @@ class LatestState(Counts):
         match message:
             case Stats():
                 self.count(message)
-                self.loads.hear(message)
+                self.loads.on_stats(message)
                 self._told_ns[message.role, message.id] = now_ns
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
@@ -232,7 +232,7 @@ class LatestState(Counts):
                     self._fleet_told_ns[agent_of(message.ids[0])] = now_ns
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
-                pose = self._trackings.on_pose(message, now_ns)
+                pose = self._trackings.counted(message, now_ns)
                 if pose is not None:
                     self.poses[pose.target] = pose
                 return pose

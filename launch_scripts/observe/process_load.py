@@ -61,7 +61,7 @@ class ProcessLoads:
     def __init__(self) -> None:
         self._told: dict[tuple[str, str], tuple[Stats | None, Stats]] = {}
 
-    def hear(self, stats: Stats) -> None:
+    def on_stats(self, stats: Stats) -> None:
         """Take in what a process says; of an earlier life, or older, nothing."""
         key = (stats.role, stats.id)
         _, last = self._told.get(key, (None, None))

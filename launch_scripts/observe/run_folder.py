@@ -206,7 +206,7 @@ class DiskWatch:
         self._said_s: float | None = None
         """When it was last said that there is no space; None while there is."""
 
-    def look(self, now_s: float) -> str | None:
+    def check_room(self, now_s: float) -> str | None:
         """A sentence for the user; None if there is nothing new to say. Call it often."""
         if now_s < self._due_s:
             return None

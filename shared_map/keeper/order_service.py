@@ -56,7 +56,7 @@ class KeptOrders:
         # A store may be new while the swarm is old.
         self._bus.ask(ORDERS, Nothing(), self._post, tag=_TAG)
 
-    def handle(self, event: Event, now_ns: int) -> Order | str | bool:
+    def take_order_event(self, event: Event, now_ns: int) -> Order | str | bool:
         """Whether the event was about orders and is done with; if one was given, the order, or why not."""
         match event:
             case Appeared(peer=Peer(role="agent", id=id)):

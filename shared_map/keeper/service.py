@@ -142,15 +142,15 @@ class KeeperService:
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
             return
-        ordered = self._orders.handle(event, now_ns)
+        ordered = self._orders.take_order_event(event, now_ns)
         if ordered is not False:
             if isinstance(ordered, Order):
                 self._member.note(now_ns, "order", described(ordered))
             elif isinstance(ordered, str):
                 self.counters.count("orders_refused")
             return
-        if not self._member.handle(event):
-            self._sync.handle(event, now_ns)
+        if not self._member.on_member_event(event):
+            self._sync.on_map_event(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
         if now_ns >= self._save_due_ns:

@@ -55,9 +55,9 @@ _WARN_AGAIN_NS = 60 * NS_PER_S
 class MapSync:
     """Keeps a replica equal to the others.
 
-    The service calls `handle` and `tick` before its own work, and `publish` with what `replica.write` returns. A
-    replica with an author serves and digests its own sets. A keeper serves all sets and digests those it has
-    committed.
+    The service calls `on_map_event` and `tick` before its own work, and `publish` with what `replica.write`
+    returns. A replica with an author serves and digests its own sets. A keeper serves all sets and digests
+    those it has committed.
 
     name         sender of digests; default: the replica's author; without one no digests are sent
     serves_all   answer for all authors
@@ -156,7 +156,7 @@ class MapSync:
         else:
             self._bus.subscribe(MARKS, self._post, together=True, **fields)
 
-    def handle(self, event: Event, now_ns: int) -> bool:
+    def on_map_event(self, event: Event, now_ns: int) -> bool:
         """True if the event concerns the map only, so that no other part needs to handle it."""
         match event:
             case HeardMany(topic=topic, samples=samples) if topic is MARKS:

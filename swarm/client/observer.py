@@ -189,7 +189,7 @@ class Observer:
             case Heard(message=Body() as body):
                 self._bodies[body.id] = body, now_ns
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
-                if self._trackings.on_pose(pose, now_ns) is not None:
+                if self._trackings.counted(pose, now_ns) is not None:
                     self._targets[pose.target] = None
             case Heard(message=Followed() as followed):
                 self._on_followed(followed)

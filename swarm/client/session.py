@@ -70,7 +70,7 @@ class Session:
         self.counts: Counter[str] = Counter()
         self.lock = threading.RLock()
         """Held while anything below, or a part, is read or changed."""
-        self.post: Post = post if post is not None else self.handle
+        self.post: Post = post if post is not None else self.on_session_event
         self.connected = True
         """Whether the link to the router is up, as far as is known."""
         self.ended: SwarmError | None = None
@@ -231,7 +231,7 @@ class Session:
 
     # --- events -------------------------------------------------------------------------------------------------
 
-    def handle(self, event: Event) -> None:
+    def on_session_event(self, event: Event) -> None:
         now_ns = self.now_ns()
         with self.lock:
             self._owner = threading.get_ident()
@@ -326,7 +326,7 @@ class SwarmThread:
         while not self._ended.is_set():
             event = self._take(max(0.0, due_s - time.monotonic()))
             if event is not None:
-                self._session.handle(event)
+                self._session.on_session_event(event)
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + TICK_S
                 self._session.tick()

@@ -58,7 +58,7 @@ class Target(Reported):
     def on_event(self, event: Event, now_ns: int) -> None:
         match event:
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE and pose.target == self.id:
-                verdict = self._tracking.on_pose(pose, now_ns)
+                verdict = self._tracking.judge(pose, now_ns)
                 if not self._is_ours(pose):
                     self._on_other(pose, verdict)
             case LinkChanged(up=True):

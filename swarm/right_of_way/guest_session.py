@@ -110,7 +110,7 @@ class GuestService:
             self.guest.leave()
         self.tell(now_ns)
 
-    def handle(self, event: Event, now_ns: int) -> bool:
+    def on_guest_event(self, event: Event, now_ns: int) -> bool:
         """True if the event was about the right of way of this guest."""
         match event:
             case Heard(topic=topic, message=Granted() as granted) if topic is GRANTED and granted.host == self.name:
@@ -362,7 +362,7 @@ class GuestSession:
                         return
                     now_ns = self._clock.now_ns()
                     if event is not None:
-                        self._service.handle(event, now_ns)
+                        self._service.on_guest_event(event, now_ns)
                     if now_ns >= due_ns:
                         due_ns = now_ns + int(_TICK_S * NS_PER_S)
                         self._service.tick(now_ns)

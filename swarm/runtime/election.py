@@ -168,7 +168,7 @@ class Candidacy:
             id = ranked_id(job_of(self._setup.id), rank)
             self._bus.subscribe(LEAD, self._post, role=self._setup.role, id=id)
 
-    def handle(self, event: Event, now_ns: int) -> bool:
+    def on_election_event(self, event: Event, now_ns: int) -> bool:
         """Whether the event was a beat, and is done with."""
         if isinstance(event, Heard) and isinstance(event.message, Beat):
             self._core.on_beat(event.message, now_ns)

@@ -161,7 +161,7 @@ class Member:
         self._bus = bus
         self.join()
 
-    def handle(self, event: Event) -> bool:
+    def on_member_event(self, event: Event) -> bool:
         """Whether the event was about membership only and is done with. Raises RunMismatchError."""
         match event:
             case Asked(topic=topic) if topic is RUN:

@@ -61,7 +61,7 @@ class OrderClient:
         self._bus.subscribe(ORDERS, self._post, role="keeper")
         self._ask(now_ns)
 
-    def handle(self, event: Event, now_ns: int) -> bool:
+    def on_order_event(self, event: Event, now_ns: int) -> bool:
         """Whether the event was about orders, and is done with."""
         match event:
             case Heard(message=Orders() as orders) | Replied(message=Orders() as orders):

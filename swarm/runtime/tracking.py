@@ -96,7 +96,7 @@ class Tracking:
         """Time since the newest pose that counts arrived; None before the first."""
         return None if self.pose is None else max(now_ns - self.heard_ns, 0)
 
-    def on_pose(self, pose: TargetPose, now_ns: int) -> Verdict:
+    def judge(self, pose: TargetPose, now_ns: int) -> Verdict:
         """Take in a pose of this target. Only if it counts has `pose` changed."""
         if pose.cell == CELL_OF_PLACE:
             pose = msgspec.structs.replace(pose, cell=self._grid.cell_at(pose.x_m, pose.y_m))
@@ -151,14 +151,14 @@ class Trackings:
         self._grid = grid
         self._of: dict[str, Tracking] = {}
 
-    def on_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+    def counted(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
         """Take in a pose of any target; returns it, with its cell, if it counts."""
         tracking = self._of.get(pose.target)
         if tracking is None:
             if len(self._of) >= _MOST_TARGETS:
                 return None
             tracking = Tracking(self._grid)
-        verdict = tracking.on_pose(pose, now_ns)
+        verdict = tracking.judge(pose, now_ns)
         if tracking.pose is not None:
             self._of[pose.target] = tracking
         return tracking.pose if verdict is Verdict.COUNTS else None

@@ -336,7 +336,7 @@ class ChaosRun:
         with contextlib.suppress(ProtocolError):
             fleet = decode(payload, FLEET.message)
             self._recovery.hear(fleet, self._now_s)  # type: ignore[arg-type]
-            for broken in self._referee.hear(fleet):  # type: ignore[arg-type]
+            for broken in self._referee.on_fleet(fleet):  # type: ignore[arg-type]
                 if isinstance(broken, Collision):
                     text = f"{broken.first} and {broken.second} on cell {broken.cell} at {self._now_s:.1f} s"
                     self.results.collisions.append(text)

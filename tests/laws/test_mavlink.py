@@ -134,7 +134,7 @@ class Laws:
         self.spoken_ns = 0
         self.items = self.asked = self.tries = 0
         """Of the mission in flight: how many it has, how many were asked for, how often `spoken` was said."""
-        hear = world.adapter.hear
+        hear = world.adapter.on_message
 
         def listen(message: codec.Incoming, now_ns: int) -> None:
             if type(message) in self.heard_ns:
@@ -146,7 +146,7 @@ class Laws:
                 self.asked, self.asked_ns = self.asked + 1, now_ns
             hear(message, now_ns)
 
-        world.adapter.hear = listen  # type: ignore[method-assign]
+        world.adapter.on_message = listen  # type: ignore[method-assign]
 
     def run(self, ticks: int) -> None:
         for _ in range(ticks):

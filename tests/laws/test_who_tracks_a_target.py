@@ -92,7 +92,7 @@ def test_receivers_agree_on_the_oldest_tracker_that_lives_whatever_each_has_hear
                     arrivals.append((at_ns + chance.randrange(NS_PER_S // 20), receiver, pose))
     for at_ns, receiver, pose in sorted(arrivals, key=lambda each: each[:2]):
         tracking, offset_ns = receivers[receiver]
-        tracking.on_pose(pose, START_NS + at_ns + offset_ns)
+        tracking.judge(pose, START_NS + at_ns + offset_ns)
     end_ns = START_NS + 12 * NS_PER_S
     owners = {owner_of(tracking, end_ns + offset_ns) for tracking, offset_ns in receivers}
     alive = [each for each in trackers if ends_ns[id(each)] == 12 * NS_PER_S]
@@ -122,23 +122,23 @@ def test_a_second_tracker_steals_no_target_while_the_first_lives_whatever_the_cl
     tracking = Tracking(GRID)
     for at_ns in range(0, 20 * NS_PER_S, NS_PER_S // 2):
         now_ns = START_NS + at_ns
-        assert tracking.on_pose(first.pose(now_ns), now_ns + receiver_ns) is Verdict.COUNTS
+        assert tracking.judge(first.pose(now_ns), now_ns + receiver_ns) is Verdict.COUNTS
         if now_ns >= second.began_ns:
             refused = second.pose(now_ns + 1, cell=7)
-            assert tracking.on_pose(refused, now_ns + 1 + receiver_ns) is Verdict.REFUSED
+            assert tracking.judge(refused, now_ns + 1 + receiver_ns) is Verdict.REFUSED
         assert tracking.pose is not None
         assert tracking.pose.cell == 5
     # The first dies: its lease ends, and the second counts from its next pose on.
     last_ns = START_NS + 20 * NS_PER_S - NS_PER_S // 2
-    assert tracking.on_pose(second.pose(last_ns + 1), last_ns + NS_PER_S + receiver_ns) is Verdict.REFUSED
-    assert tracking.on_pose(second.pose(last_ns + 2), last_ns + 2 * NS_PER_S + receiver_ns) is Verdict.COUNTS
+    assert tracking.judge(second.pose(last_ns + 1), last_ns + NS_PER_S + receiver_ns) is Verdict.REFUSED
+    assert tracking.judge(second.pose(last_ns + 2), last_ns + 2 * NS_PER_S + receiver_ns) is Verdict.COUNTS
 
 
 @given(st.sampled_from([0.0, 1e-9, 0.5, 2.0, 60.0]))
 def test_a_target_is_lost_when_the_lease_has_passed_since_the_last_arrival_and_not_before(lease_s: float) -> None:
     tracking, tracker = Tracking(GRID), Tracker("a", START_NS, lease_s=lease_s)
     assert not tracking.lost(START_NS)
-    tracking.on_pose(tracker.pose(START_NS), START_NS)
+    tracking.judge(tracker.pose(START_NS), START_NS)
     end_ns = START_NS + int(lease_s * NS_PER_S)
     assert not tracking.lost(end_ns - 1)
     assert tracking.lost(end_ns)
@@ -150,30 +150,30 @@ def test_a_lease_of_zero_hands_the_target_over_and_what_comes_late_does_not_take
     first, second, tracking = Tracker("a", START_NS), Tracker("b", START_NS + NS_PER_S), Tracking(GRID)
     now_ns = START_NS + 2 * NS_PER_S
     late = first.pose(now_ns)
-    tracking.on_pose(first.pose(now_ns), now_ns)
-    assert tracking.on_pose(second.pose(now_ns), now_ns) is Verdict.REFUSED
+    tracking.judge(first.pose(now_ns), now_ns)
+    assert tracking.judge(second.pose(now_ns), now_ns) is Verdict.REFUSED
     first.lease_s = 0.0
-    assert tracking.on_pose(first.pose(now_ns), now_ns) is Verdict.COUNTS
-    assert tracking.on_pose(second.pose(now_ns), now_ns) is Verdict.COUNTS
-    assert tracking.on_pose(late, now_ns + 1) is Verdict.LATE
-    assert tracking.on_pose(second.pose(now_ns), now_ns + 2) is Verdict.COUNTS
+    assert tracking.judge(first.pose(now_ns), now_ns) is Verdict.COUNTS
+    assert tracking.judge(second.pose(now_ns), now_ns) is Verdict.COUNTS
+    assert tracking.judge(late, now_ns + 1) is Verdict.LATE
+    assert tracking.judge(second.pose(now_ns), now_ns + 2) is Verdict.COUNTS
 
 
 def test_a_tracker_that_starts_again_takes_over_from_its_earlier_life_at_once() -> None:
     tracking, first, again = Tracking(GRID), Tracker("a", START_NS), Tracker("a", START_NS + 10)
     last = first.pose(START_NS + 20)
-    tracking.on_pose(first.pose(START_NS + 20), START_NS + 20)
-    assert tracking.on_pose(again.pose(START_NS + 30), START_NS + 30) is Verdict.COUNTS
-    assert tracking.on_pose(last, START_NS + 31) is Verdict.LATE
-    assert tracking.on_pose(first.pose(START_NS + 32), START_NS + 32) is Verdict.REFUSED
+    tracking.judge(first.pose(START_NS + 20), START_NS + 20)
+    assert tracking.judge(again.pose(START_NS + 30), START_NS + 30) is Verdict.COUNTS
+    assert tracking.judge(last, START_NS + 31) is Verdict.LATE
+    assert tracking.judge(first.pose(START_NS + 32), START_NS + 32) is Verdict.REFUSED
 
 
 def test_of_two_trackers_with_one_name_the_later_counts_until_it_is_silent() -> None:
     tracking, first, second = Tracking(GRID), Tracker("a", START_NS), Tracker("a", START_NS + NS_PER_S)
     for at_ns in range(2 * NS_PER_S, 4 * NS_PER_S, NS_PER_S // 4):
-        assert tracking.on_pose(second.pose(START_NS + at_ns), START_NS + at_ns) is Verdict.COUNTS
-        assert tracking.on_pose(first.pose(START_NS + at_ns), START_NS + at_ns) is Verdict.REFUSED
-    assert tracking.on_pose(first.pose(START_NS), START_NS + 6 * NS_PER_S) is Verdict.COUNTS
+        assert tracking.judge(second.pose(START_NS + at_ns), START_NS + at_ns) is Verdict.COUNTS
+        assert tracking.judge(first.pose(START_NS + at_ns), START_NS + at_ns) is Verdict.REFUSED
+    assert tracking.judge(first.pose(START_NS), START_NS + 6 * NS_PER_S) is Verdict.COUNTS
 
 
 def test_trackers_that_began_together_are_ordered_by_name_for_all_receivers() -> None:
@@ -182,7 +182,7 @@ def test_trackers_that_began_together_are_ordered_by_name_for_all_receivers() ->
     for order in ((a, b, none), (none, b, a), (b, none, a)):
         tracking = Tracking(GRID)
         for each in order:
-            tracking.on_pose(each.pose(now_ns), now_ns)
+            tracking.judge(each.pose(now_ns), now_ns)
         assert owner_of(tracking, now_ns) == ("a", a.began_ns)
 
 
@@ -190,12 +190,12 @@ def test_trackers_that_began_together_are_ordered_by_name_for_all_receivers() ->
 def test_an_incarnation_that_is_no_time_gives_no_seniority(incarnation: int) -> None:
     tracker, tracking = Tracker("z", START_NS), Tracking(GRID)
     now_ns = START_NS + NS_PER_S
-    tracking.on_pose(tracker.pose(now_ns), now_ns)
+    tracking.judge(tracker.pose(now_ns), now_ns)
     odd = msgspec.structs.replace(Tracker("a", 0).pose(now_ns), incarnation=incarnation)
     assert odd.stamp_ns - incarnation not in range(LONGEST_AGE_NS)
-    assert tracking.on_pose(odd, now_ns) is Verdict.REFUSED
+    assert tracking.judge(odd, now_ns) is Verdict.REFUSED
     # Alone it is heard all the same.
-    assert Tracking(GRID).on_pose(odd, now_ns) is Verdict.COUNTS
+    assert Tracking(GRID).judge(odd, now_ns) is Verdict.COUNTS
 
 
 @given(st.lists(st.tuples(st.integers(0, (1 << 62) - 1), st.integers(0, (1 << 62) - 1)), max_size=60))
@@ -205,9 +205,9 @@ def test_whatever_is_made_up_a_tracker_that_goes_on_is_heard_after_the_longest_l
     tracking, tracker = Tracking(GRID), Tracker("a", START_NS)
     for incarnation, seq in lies:
         lie = msgspec.structs.replace(tracker.pose(START_NS), incarnation=incarnation, seq=seq)
-        tracking.on_pose(msgspec.structs.replace(lie, tracker=None if seq % 2 else "a"), START_NS)
+        tracking.judge(msgspec.structs.replace(lie, tracker=None if seq % 2 else "a"), START_NS)
     heard = [
-        tracking.on_pose(tracker.pose(START_NS + at), START_NS + at) for at in range(0, 4 * NS_PER_S, NS_PER_S // 4)
+        tracking.judge(tracker.pose(START_NS + at), START_NS + at) for at in range(0, 4 * NS_PER_S, NS_PER_S // 4)
     ]
     assert heard[-1] is Verdict.COUNTS
     assert len(tracking._lives) <= MOST_LIVES
@@ -216,22 +216,22 @@ def test_whatever_is_made_up_a_tracker_that_goes_on_is_heard_after_the_longest_l
 def test_a_flood_of_young_trackers_does_not_push_out_the_owner() -> None:
     tracking, owner = Tracking(GRID), Tracker("z", START_NS)
     now_ns = START_NS + 10 * NS_PER_S
-    tracking.on_pose(owner.pose(now_ns), now_ns)
+    tracking.judge(owner.pose(now_ns), now_ns)
     for n in range(100):
         young = Tracker(None, START_NS + 2 * NS_PER_S + n)
-        assert tracking.on_pose(young.pose(now_ns), now_ns) is Verdict.REFUSED
-        assert tracking.on_pose(owner.pose(now_ns), now_ns) is Verdict.COUNTS
+        assert tracking.judge(young.pose(now_ns), now_ns) is Verdict.REFUSED
+        assert tracking.judge(owner.pose(now_ns), now_ns) is Verdict.COUNTS
     assert len(tracking._lives) == MOST_LIVES
 
 
 @pytest.mark.parametrize("cell", [-2, GRID.cells, (1 << 32) - 1])
 def test_a_pose_off_the_map_neither_counts_nor_keeps_its_tracker_alive(cell: int) -> None:
     trackings, tracker = Trackings(GRID), Tracker("a", START_NS)
-    assert trackings.on_pose(tracker.pose(START_NS, cell), START_NS) is None
+    assert trackings.counted(tracker.pose(START_NS, cell), START_NS) is None
     assert trackings.of("t") is None
-    trackings.on_pose(tracker.pose(START_NS), START_NS)
+    trackings.counted(tracker.pose(START_NS), START_NS)
     now_ns = START_NS + 2 * NS_PER_S
-    assert trackings.on_pose(tracker.pose(now_ns, cell), now_ns) is None
+    assert trackings.counted(tracker.pose(now_ns, cell), now_ns) is None
     assert trackings.lost(now_ns) == {"t"}
 
 
@@ -240,10 +240,10 @@ def test_replaying_everything_that_was_heard_changes_nothing() -> None:
     trackers = [Tracker("a", START_NS), Tracker("b", START_NS + 5 * NS_PER_S)]
     told = [each.pose(START_NS + at_ns) for at_ns in range(0, NS_PER_S, NS_PER_S // 10) for each in trackers]
     for pose in told:
-        tracking.on_pose(pose, START_NS)
+        tracking.judge(pose, START_NS)
     before = tracking.pose
     chance.shuffle(told)
-    assert {tracking.on_pose(pose, START_NS + 1) for pose in told} == {Verdict.LATE}
+    assert {tracking.judge(pose, START_NS + 1) for pose in told} == {Verdict.LATE}
     assert tracking.pose is before
 
 
@@ -252,15 +252,15 @@ def test_a_pose_that_comes_late_does_not_make_its_tracker_younger() -> None:
     for at_ns in range(3 * NS_PER_S, 9 * NS_PER_S, NS_PER_S // 2):
         late_ns = 0 if at_ns == 3 * NS_PER_S else 7 * NS_PER_S // 5
         arrives_ns = START_NS + at_ns + late_ns
-        assert tracking.on_pose(first.pose(START_NS + at_ns), arrives_ns) is Verdict.COUNTS
-        assert tracking.on_pose(second.pose(arrives_ns), arrives_ns) is Verdict.REFUSED
+        assert tracking.judge(first.pose(START_NS + at_ns), arrives_ns) is Verdict.COUNTS
+        assert tracking.judge(second.pose(arrives_ns), arrives_ns) is Verdict.REFUSED
 
 
 @given(st.floats(-50, 450), st.floats(-300, 50))
 def test_a_pose_without_a_cell_is_in_the_cell_of_its_place_or_outside(x_m: float, y_m: float) -> None:
     trackings, tracker = Trackings(GRID), Tracker("a", START_NS)
     pose = msgspec.structs.replace(tracker.pose(START_NS), cell=CELL_OF_PLACE, x_m=x_m, y_m=y_m)
-    counts = trackings.on_pose(pose, START_NS)
+    counts = trackings.counted(pose, START_NS)
     if counts is None:
         assert not (0 <= x_m < 400 and -250 < y_m <= 0)
         return

@@ -54,7 +54,7 @@ class Member:
     def closed(self, cell: int) -> bool:
         """After everything that has come by now."""
         while (event := self.inbox.take(0.0)) is not None:
-            self.sync.handle(event, time.time_ns())
+            self.sync.on_map_event(event, time.time_ns())
         self.sync.tick(time.time_ns())
         return bool(np.isinf(self.cost_map.ground_s_per_m.reshape(-1)[cell]))
 

@@ -49,7 +49,7 @@ class Participant:
         while time.monotonic() < until_s:
             event = self.inbox.take(0.01)
             if event is not None:
-                self.sync.handle(event, self.clock.now_ns())
+                self.sync.on_map_event(event, self.clock.now_ns())
             self.sync.tick(self.clock.now_ns())
 
     def write(self, cells: object, kind: MarkKind) -> None:

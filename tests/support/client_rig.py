@@ -48,7 +48,7 @@ class Program:
 
     def _post(self, event: Event) -> None:
         if not self.bus.closed:
-            self.session.handle(event)
+            self.session.on_session_event(event)
 
     def _tick(self) -> None:
         if not self.bus.closed:

@@ -119,7 +119,7 @@ class World:
         return actions
 
     def hear(self, message: codec.Incoming) -> None:
-        self.adapter.hear(message, self.now_ns)
+        self.adapter.on_message(message, self.now_ns)
 
     def told(self) -> list[str]:
         return [action.sentence for _, action in self.said if isinstance(action, Tell)]

@@ -138,7 +138,7 @@ class Guest:
 
     def hear(self, event: Event) -> None:
         if self.service is not None:
-            self.service.handle(event, self.now_ns)
+            self.service.on_guest_event(event, self.now_ns)
 
     def crash(self) -> None:
         if self.service is not None:

@@ -38,7 +38,7 @@ class SyncService:
         self.sync = sync
         self.replica = sync.replica
         self.counters = Counters()
-        self.start, self.handle, self.tick = sync.start, sync.handle, sync.tick
+        self.start, self.handle, self.tick = sync.start, sync.on_map_event, sync.tick
 
     def stop(self, now_ns: int) -> None:
         pass

@@ -101,7 +101,7 @@ class Adapter:
 
     # --- what comes -----------------------------------------------------------------------------------------------
 
-    def hear(self, message: codec.Incoming, now_ns: int) -> None:
+    def on_message(self, message: codec.Incoming, now_ns: int) -> None:
         """Takes in a message of the vehicle."""
         match message:
             case codec.Beat():
@@ -112,9 +112,9 @@ class Adapter:
                 self._warn_due_ns = now_ns + _WARN_NS
                 self._tells.append(f"the vehicle says: {text}")
             case codec.CommandAnswered() if self._arming is not None:
-                self._tells += self._arming.hear(message)
+                self._tells += self._arming.on_command_answer(message)
             case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, Missions):
-                self._guide.hear(message)
+                self._guide.on_mission_message(message)
 
     def hear_way(self, way: Way) -> None:
         """Takes in a route to the target that is followed."""

@@ -145,7 +145,7 @@ class Arming:
         self._holding = self._held = True
         return self._send(self._kind.set_mode(modes.hold), now_ns)
 
-    def hear(self, answer: codec.CommandAnswered) -> list[str]:
+    def on_command_answer(self, answer: codec.CommandAnswered) -> list[str]:
         """Takes in what the vehicle says to a command. Returns sentences about it."""
         if answer.result == codec.ACCEPTED:
             if answer.command == codec.MISSION_START:

@@ -136,7 +136,7 @@ class Upload:
         """When it is said (again); None: at once."""
         self._tries = self._asked = 0
 
-    def hear(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
+    def on_mission_message(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
         """Takes in that the vehicle asks for an item, or answers to all."""
         if self.accepted or self.why:
             return
@@ -185,10 +185,10 @@ class Missions(_Guide):
         """The link is lost: nobody knows what the vehicle has."""
         self._upload, self._seen, self._accepted = None, (), False
 
-    def hear(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
+    def on_mission_message(self, message: codec.ItemAsked | codec.MissionAnswered) -> None:
         """Takes in that the vehicle asks for an item, or answers."""
         if self._upload is not None:
-            self._upload.hear(message)
+            self._upload.on_mission_message(message)
 
     def ready(self, now_ns: int) -> bool:
         """Whether the vehicle may be brought into the mode in which it drives for us."""

@@ -101,7 +101,7 @@ class Shell:
             if heard:
                 self._link.answer_last()
             for message in heard:
-                self._adapter.hear(message, self._now_ns())
+                self._adapter.on_message(message, self._now_ns())
         else:
             time.sleep(_TURN_S / 4)
         self._adapter.hear_swarm(self._swarm.connected)

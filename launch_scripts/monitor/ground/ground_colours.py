@@ -254,7 +254,7 @@ class CostSamples:
         self.targets.rotate(-1)
         return self.targets[-1] if self.targets else None
 
-    def hear(self, reply: CostReply) -> bool:
+    def on_costs(self, reply: CostReply) -> bool:
         """Takes an answer in. Returns whether it says something."""
         costs = column(reply.cost_to_go_s, "<f4")
         if reply.target not in self.targets or len(costs) != len(self.request.cells):

@@ -187,7 +187,7 @@ class GroundView:
 
     def hear_costs(self, reply: CostReply, now_ns: int) -> None:
         """Draws what a planner answered."""
-        if not self.samples.hear(reply):
+        if not self.samples.on_costs(reply):
             return
         layer = self._to_target
         if layer is not None and layer.target == reply.target and reply.target in self.samples.costs_s:

@@ -112,7 +112,7 @@ class MoversView:
         self._vehicles.draw_anew()
         self._limit.all_due()
 
-    def hear(self, message: Message, now_ns: int) -> None:
+    def on_observed(self, message: Message, now_ns: int) -> None:
         """Takes a message in."""
         match message:
             case Fleet():

@@ -142,12 +142,12 @@ class Referee:
 
     def hear_body(self, body: Body, now_ns: int) -> None:
         """Take in where a body is."""
-        self._bodies.hear(body, now_ns)
+        self._bodies.on_body(body, now_ns)
 
-    def hear(self, fleet: Fleet) -> list[Broken]:
+    def on_fleet(self, fleet: Fleet) -> list[Broken]:
         """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
         if self._air is not None and fleet.vehicle_class in self._aloft:
-            return self._air.hear(fleet)
+            return self._air.on_fleet(fleet)
         broken: list[Broken] = []
         author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
         vehicles, stays, covered = self._vehicles, self._stays, self._bodies.covered
@@ -245,7 +245,7 @@ class BodyReferee:
         self._met: Encounters = {}
         self._swept_ns = 0
 
-    def hear(self, body: Body, now_ns: int) -> None:
+    def on_body(self, body: Body, now_ns: int) -> None:
         """Take in a report; one that is no news, or that no agent would avoid, changes nothing."""
         key = body.id, body.incarnation
         record = self._records.get(key)

@@ -67,7 +67,7 @@ class Rovers:
         self._turn(rover)
         return rover
 
-    def hear(self, body: Body) -> None:
+    def note_body(self, body: Body) -> None:
         """Take in where the process that leads has moved a rover: one that takes over goes on from there."""
         rover = self._by_id.get(body.id)
         if rover is not None and self._passable(body.x_m, body.y_m):

@@ -112,9 +112,9 @@ class TargetsService:
                 self._bus.subscribe(self._topic(id), self._post, target=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if self._member.handle(event) or self._candidacy.handle(event, now_ns):
+        if self._member.on_member_event(event) or self._candidacy.on_election_event(event, now_ns):
             return
-        if self._obedience.handle(event, now_ns):
+        if self._obedience.on_order_event(event, now_ns):
             return
         match event:
             case Heard(message=Fleet() as fleet):

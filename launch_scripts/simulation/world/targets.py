@@ -239,7 +239,7 @@ class TargetWorld:
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
-        if (counted := self._trackings.on_pose(pose, now_ns)) is None:
+        if (counted := self._trackings.counted(pose, now_ns)) is None:
             return
         pose = counted
         if target.config.is_simulated:
@@ -259,11 +259,11 @@ class TargetWorld:
     def hear_body(self, body: Body, now_ns: int) -> None:
         """Takes where a body is: of anybody's for the referee, of a rover that another leader moves for itself."""
         if not self.leads:
-            self._rovers.hear(body)
+            self._rovers.note_body(body)
         self._referee.hear_body(body, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
-        seen = self._referee.hear(fleet)
+        seen = self._referee.on_fleet(fleet)
         actions: list[Action] = []
         if self.leads and not self.paused:
             for index, vehicle in self._catchers(fleet, now_ns):

@@ -210,7 +210,7 @@ def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
             while not sync.joined and time.monotonic_ns() - began_ns < _LONGEST_S * NS_PER_S:
                 event = inbox.take(0.1)
                 if event is not None:
-                    sync.handle(event, time.monotonic_ns())
+                    sync.on_map_event(event, time.monotonic_ns())
             times["ours"].append((time.monotonic_ns() - began_ns) / 1e6)
             cpu["ours"].append((time.process_time_ns() - used_ns) / 1e6)
             if len(replica.held.tiles) != sets:

@@ -79,8 +79,8 @@ class MapService:
         self._sync.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if not self._member.handle(event):
-            self._sync.handle(event, now_ns)
+        if not self._member.on_member_event(event):
+            self._sync.on_map_event(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
         if self.writing and now_ns >= self._write_due_ns:

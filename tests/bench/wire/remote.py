@@ -103,7 +103,7 @@ def _map_service(sync: MapSync, pipe: Connection) -> Parts:
         sync.start(now_ns)
         pipe.send("ready")
 
-    return Parts(start, sync.handle, sync.tick)
+    return Parts(start, sync.on_map_event, sync.tick)
 
 
 def map_peer(network: NetworkConfig, pipe: Connection) -> None:

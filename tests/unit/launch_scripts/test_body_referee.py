@@ -32,7 +32,7 @@ def judged(*reports: tuple[int, Body | Fleet]) -> list[BodyHit]:
         if isinstance(report, Body):
             referee.hear_body(report, at_ms * MS)
         else:
-            hits += [each for each in referee.hear(report) if isinstance(each, BodyHit)]
+            hits += [each for each in referee.on_fleet(report) if isinstance(each, BodyHit)]
     return hits
 
 

@@ -67,11 +67,11 @@ def test_few_cells_are_asked_about_the_shown_target_most_and_all_others_in_turn(
 def test_an_answer_that_fits_no_question_is_left_out() -> None:
     samples = CostSamples(GridSpec(40, 50, 10.0), "t0")
     right = len(samples.request.cells)
-    assert not samples.hear(answer(samples, "t0", [1.0] * right)), "nobody said that there is such a target"
+    assert not samples.on_costs(answer(samples, "t0", [1.0] * right)), "nobody said that there is such a target"
     samples.hear_target("t0")
-    assert not samples.hear(answer(samples, "t0", [1.0] * (right - 1)))
-    assert samples.hear(answer(samples, "t0", [1.0] * right))
-    assert samples.hear(answer(samples, "t0", [math.inf] * right)), "a target that nobody reaches any more"
+    assert not samples.on_costs(answer(samples, "t0", [1.0] * (right - 1)))
+    assert samples.on_costs(answer(samples, "t0", [1.0] * right))
+    assert samples.on_costs(answer(samples, "t0", [math.inf] * right)), "a target that nobody reaches any more"
     assert samples.costs_s == {}
 
 
@@ -148,7 +148,7 @@ def test_the_heat_map_is_bright_at_the_target_and_dark_afar_and_says_where_there
     pace[:, 70:72] = np.inf
     drawn, samples = pictures(terrain_of_pace(pace, 10.0))
     costs = costs_to(pace, 30, 5) * 10
-    samples.hear(answer(samples, "t0", costs.reshape(-1)[samples.request.cells].tolist()))
+    samples.on_costs(answer(samples, "t0", costs.reshape(-1)[samples.request.cells].tolist()))
     image = drawn.to_target("t0").astype(int)
     height, width, _ = image.shape
     near, far, cut_off = (image[height // 2, round(share * width)] for share in (0.06, 0.8, 0.97))

@@ -256,12 +256,12 @@ def test_who_is_killed_stood_still_for_a_minute_in_which_the_launcher_turned(
     looks: list[tuple[float, bool]],
 ) -> None:
     watch, now_s, stamp_ns, still_s = HangWatch(), 1000.0, 1, 0.0
-    watch.look(partial(running, stamp_ns), now_s)
+    watch.find_hanging(partial(running, stamp_ns), now_s)
     looked_s = now_s
     for passed_s, ticked in looks:
         now_s += passed_s
         stamp_ns += ticked
-        found = watch.look(partial(running, stamp_ns), now_s)
+        found = watch.find_hanging(partial(running, stamp_ns), now_s)
         turned_s = 0.0 if now_s - looked_s < LOOK_EVERY_S else min(now_s - looked_s, 2.0)
         still_s = 0.0 if ticked else still_s + turned_s
         if turned_s:
@@ -275,14 +275,14 @@ def test_nobody_is_killed_who_starts_ends_or_says_nothing(phase: Phase | None, e
     watch = HangWatch()
     for second in range(300):
         vitals = None if phase is None else Vitals(1, 0, phase, ())
-        assert watch.look(lambda vitals=vitals: [Process("a", vitals, ended)], float(second)) == []
+        assert watch.find_hanging(lambda vitals=vitals: [Process("a", vitals, ended)], float(second)) == []
 
 
 def test_who_stands_still_for_a_minute_is_found_then_and_at_every_look_until_it_ticks() -> None:
     watch = HangWatch()
 
     def found(second: int, stamp_ns: int) -> list[str]:
-        return watch.look(partial(running, stamp_ns), float(second))
+        return watch.find_hanging(partial(running, stamp_ns), float(second))
 
     assert not any(found(second, 1) for second in range(60))
     assert [found(second, 1) for second in range(60, 64)] == [["a"]] * 4

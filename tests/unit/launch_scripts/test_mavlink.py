@@ -257,20 +257,20 @@ def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
     upload = Upload(items)
     assert upload.tick(0) == codec.MissionCount(3)
     for seq in (2, 0, 0, 1):
-        upload.hear(codec.ItemAsked(seq))
+        upload.on_mission_message(codec.ItemAsked(seq))
         assert upload.tick(0) == items[seq]
-    upload.hear(codec.ItemAsked(9))
-    upload.hear(codec.MissionAnswered(0))
+    upload.on_mission_message(codec.ItemAsked(9))
+    upload.on_mission_message(codec.MissionAnswered(0))
     assert not upload.accepted, "it has not had the last item since"
-    upload.hear(codec.ItemAsked(2))
-    upload.hear(codec.MissionAnswered(0))
+    upload.on_mission_message(codec.ItemAsked(2))
+    upload.on_mission_message(codec.MissionAnswered(0))
     assert upload.accepted
 
 
 def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
     upload = Upload([codec.MissionItem(0, codec.NAV_WAYPOINT, codec.ABOVE_HOME, 1.0, 2.0, 0.0)])
     for _ in range(100):
-        upload.hear(codec.ItemAsked(0))
+        upload.on_mission_message(codec.ItemAsked(0))
         upload.tick(0)
     assert upload.why
 

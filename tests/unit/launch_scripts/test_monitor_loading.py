@@ -37,7 +37,7 @@ class View:
 
     def handle(self, event: Event, now_ns: int) -> None:
         self.calls.append("handle")
-        self.member.handle(event)
+        self.member.on_member_event(event)
 
     def tick(self, now_ns: int) -> None:
         self.calls.append("tick")

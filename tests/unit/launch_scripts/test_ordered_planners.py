@@ -61,7 +61,7 @@ USUAL = ["t0", "t0.r1", "t1", "t1.r1"]
 def test_nothing_happens_while_nothing_is_ordered() -> None:
     swarm = Swarm()
     ordered, said = planners(swarm)
-    ordered.look(book(), set(), 0.0)
+    ordered.follow_orders(book(), set(), 0.0)
     assert swarm.ids == USUAL
     assert said == []
 
@@ -70,18 +70,18 @@ def test_an_added_target_gets_its_planner_and_standbys_and_loses_them_again() ->
     swarm = Swarm()
     ordered, _ = planners(swarm)
     for now_s in (0.0, 1.0):
-        ordered.look(book(("x", 1, False)), set(), now_s)
+        ordered.follow_orders(book(("x", 1, False)), set(), now_s)
     assert swarm.ids == [*USUAL, "x", "x.r1"]
-    ordered.look(book(("x", 2, True)), set(), 2.0)
+    ordered.follow_orders(book(("x", 2, True)), set(), 2.0)
     assert swarm.ids == USUAL
 
 
 def test_a_target_of_the_scenario_that_is_removed_gets_its_planner_back_with_it() -> None:
     swarm = Swarm()
     ordered, _ = planners(swarm)
-    ordered.look(book(("t0", 1, True)), set(), 0.0)
+    ordered.follow_orders(book(("t0", 1, True)), set(), 0.0)
     assert swarm.ids == ["t1", "t1.r1"]
-    ordered.look(book(("t0", 2, False)), set(), 1.0)
+    ordered.follow_orders(book(("t0", 2, False)), set(), 1.0)
     assert swarm.ids == USUAL
 
 
@@ -89,20 +89,20 @@ def test_a_launcher_leaves_planners_of_the_scenario_that_it_did_not_start_to_oth
     swarm = Swarm()
     swarm.running = [running for running in swarm.running if running.spec.id in ("t0", "t1.r1")]
     ordered, _ = planners(swarm)
-    ordered.look(book(("t0", 1, True), ("t1", 1, True)), set(), 0.0)
-    ordered.look(book(("t0", 2, False), ("t1", 2, False)), set(), 1.0)
+    ordered.follow_orders(book(("t0", 1, True), ("t1", 1, True)), set(), 0.0)
+    ordered.follow_orders(book(("t0", 2, False), ("t1", 2, False)), set(), 1.0)
     assert swarm.ids == ["t0", "t1.r1"]
 
 
 def test_a_part_of_a_swarm_leaves_it_to_others_for_a_while() -> None:
     swarm = Swarm()
     ordered, _ = planners(swarm, whole=False, ranks=(0,))
-    ordered.look(book(("x", 1, False)), set(), 0.0)
+    ordered.follow_orders(book(("x", 1, False)), set(), 0.0)
     assert swarm.ids == USUAL
-    ordered.look(book(("x", 1, False)), {("planner", "x")}, LEAVES_TO_OTHERS_S + 1)
+    ordered.follow_orders(book(("x", 1, False)), {("planner", "x")}, LEAVES_TO_OTHERS_S + 1)
     assert swarm.ids == USUAL, "another launcher started it"
-    ordered.look(book(("x", 1, False)), set(), 10.0)
-    ordered.look(book(("x", 1, False)), set(), 10.0 + LEAVES_TO_OTHERS_S)
+    ordered.follow_orders(book(("x", 1, False)), set(), 10.0)
+    ordered.follow_orders(book(("x", 1, False)), set(), 10.0 + LEAVES_TO_OTHERS_S)
     assert swarm.ids == [*USUAL, "x"]
 
 
@@ -110,7 +110,7 @@ def test_a_launcher_that_starts_no_planners_starts_none_of_these() -> None:
     swarm = Swarm()
     swarm.running = []
     ordered, _ = planners(swarm, ranks=())
-    ordered.look(book(("x", 1, False)), set(), 0.0)
+    ordered.follow_orders(book(("x", 1, False)), set(), 0.0)
     assert swarm.ids == []
 
 
@@ -118,7 +118,7 @@ def test_one_that_cannot_start_is_said_once_and_ends_nothing() -> None:
     swarm = Swarm(refuses=True)
     ordered, said = planners(swarm, ranks=(0,))
     for now_s in (0.0, 1.0, 2.0):
-        ordered.look(book(("x", 1, False)), set(), now_s)
+        ordered.follow_orders(book(("x", 1, False)), set(), now_s)
     assert said == ["planner-x: no certificate"]
     assert swarm.tried == 1
 

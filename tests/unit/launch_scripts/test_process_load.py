@@ -29,17 +29,17 @@ def told(id: str, at_s: float, cpu_s: float, late: int, life: int = 1, role: str
 
 def test_rates_are_of_the_last_two_words_of_one_life() -> None:
     loads = ProcessLoads()
-    loads.hear(told("a0", 1.0, 5.0, 10))
+    loads.on_stats(told("a0", 1.0, 5.0, 10))
     (line,) = loads.lines({("agent", "a0")})
     assert (line.cpu_percent, line.late_per_s, line.rss_bytes) == (None, None, 90e6)
-    loads.hear(told("a0", 3.0, 6.0, 14))
+    loads.on_stats(told("a0", 3.0, 6.0, 14))
     (line,) = loads.lines({("agent", "a0")})
     assert (line.cpu_percent, line.late_per_s, line.messages_per_s, line.alive) == (50.0, 2.0, 1234.0, True)
-    loads.hear(told("a0", 3.1, 9.0, 99))  # too soon for a rate
-    loads.hear(told("a0", 2.0, 0.0, 0))  # late
+    loads.on_stats(told("a0", 3.1, 9.0, 99))  # too soon for a rate
+    loads.on_stats(told("a0", 2.0, 0.0, 0))  # late
     assert loads.lines({("agent", "a0")}) == [line]
-    loads.hear(told("a0", 9.0, 0.1, 0, life=2))
-    loads.hear(told("a0", 10.0, 7.0, 20))  # the last word of the life before
+    loads.on_stats(told("a0", 9.0, 0.1, 0, life=2))
+    loads.on_stats(told("a0", 10.0, 7.0, 20))  # the last word of the life before
     (line,) = loads.lines(())
     assert (line.cpu_percent, line.restarts, line.alive) == (None, 1, False)
 
@@ -47,9 +47,9 @@ def test_rates_are_of_the_last_two_words_of_one_life() -> None:
 def test_a_role_is_the_sum_of_its_living_processes_and_the_worst_of_their_lateness() -> None:
     loads = ProcessLoads()
     for id, cpu_s, late in (("a0", 0.5, 3), ("a1", 0.25, 8), ("a2", 1.0, 0)):
-        loads.hear(told(id, 1.0, 0.0, 0))
-        loads.hear(told(id, 2.0, cpu_s, late))
-    loads.hear(told("0", 1.0, 0.0, 0, role="router"))
+        loads.on_stats(told(id, 1.0, 0.0, 0))
+        loads.on_stats(told(id, 2.0, cpu_s, late))
+    loads.on_stats(told("0", 1.0, 0.0, 0, role="router"))
     up = {("agent", "a0"), ("agent", "a1"), ("router", "0")}
     router, agents = by_role(loads.lines(up), ROLES)
     assert (router.role, router.alive, router.known) == ("router", 1, 1)
@@ -69,7 +69,7 @@ def large_run() -> tuple[RunState, ProcessLoads, set[tuple[str, str]]]:
         recorder.alive(Peer(role, id, 1), True, now_ns)
         up.add((role, id))
         for at_s in (1.0, 2.0):
-            loads.hear(told(id, at_s, at_s * 0.9, 3, role=role))
+            loads.on_stats(told(id, at_s, at_s * 0.9, 3, role=role))
     return recorder.summary(now_ns), loads, up
 
 

@@ -18,7 +18,7 @@ from swarm.wire.messages.vehicles import Fleet
 
 def judged(*reports: Fleet, truth: NDArray[np.float32] | None = None) -> list[Collision | LethalEntry]:
     referee = Referee({"ground": np.ones(100, np.float32) if truth is None else truth}, GridSpec(10, 10, 10.0))
-    return [broken for report in reports for broken in referee.hear(report)]
+    return [broken for report in reports for broken in referee.on_fleet(report)]
 
 
 def b(stamp_ms: float, cell: int) -> Fleet:
@@ -88,15 +88,15 @@ def test_a_cell_outside_the_grid_is_nobodys_business() -> None:
 
 def test_what_ended_long_ago_is_forgotten_and_where_vehicles_stand_is_not() -> None:
     referee = Referee({"ground": np.ones(100, np.float32)}, GridSpec(10, 10, 10.0))
-    referee.hear(b(50, 99))
+    referee.on_fleet(b(50, 99))
     for n in range(1, 200):
-        referee.hear(a(100 * n, n % 90))
+        referee.on_fleet(a(100 * n, n % 90))
     held = [stay for stays in referee._stays.values() for stay in stays]
     assert {stay.vehicle for stay in held} == {"a", "b"}
     # 5 s of cells, ten a second, those of the last second, after which nobody has looked yet, and where both stand.
     assert 50 <= len(held) <= 50 + 10 + 2
     reports = [report for n in (200, 201) for report in (a(100 * n, 99), b(100 * n, 99))]
-    (collision,) = [broken for report in reports for broken in referee.hear(report)]
+    (collision,) = [broken for report in reports for broken in referee.on_fleet(report)]
     assert isinstance(collision, Collision)
 
 
@@ -105,9 +105,9 @@ def test_the_cells_of_all_vehicles_are_those_they_reported_last() -> None:
     vehicles = [f"v{n}" for n in range(150)]
     for tick in range(1, 4):
         cells = [(n * tick) % 900 for n in range(150)]
-        referee.hear(fleet(100 * tick, *zip(vehicles, cells, strict=True)))
+        referee.on_fleet(fleet(100 * tick, *zip(vehicles, cells, strict=True)))
         before = referee.cells
         assert before.tolist() == cells
-    referee.hear(fleet(400, ("v3", 7)))
+    referee.on_fleet(fleet(400, ("v3", 7)))
     assert referee.cells.tolist() == [*cells[:3], 7, *cells[4:]]
     assert before.tolist() == cells, "what was read stays as it was"

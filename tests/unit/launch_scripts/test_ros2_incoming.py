@@ -113,7 +113,7 @@ def test_the_swarm_is_told_valid_places_at_a_bounded_rate_whatever_comes(words: 
     told_ns: list[int] = []
 
     def take(message: Any, now_ns: int) -> None:
-        assert_valid(track.hear(message, now_ns))
+        assert_valid(track.on_reading(message, now_ns))
         told_ns.append(now_ns)
 
     node: Any = FakeNode(TYPES)
@@ -156,15 +156,15 @@ def test_a_robot_that_drives_backwards_is_told_to_go_where_it_goes() -> None:
 
 def test_poses_tell_a_speed_that_the_messages_do_not() -> None:
     track = Track(FrameReader(MAP), 2.0)
-    track.hear(n(header=header(), pose=pose(50, 50)), 0)
-    found = track.hear(n(header=header(), pose=pose(50, 53)), NS_PER_S)
+    track.on_reading(n(header=header(), pose=pose(50, 50)), 0)
+    found = track.on_reading(n(header=header(), pose=pose(50, 53)), NS_PER_S)
     assert (found.heading_rad, found.speed_m_per_s) == (pytest.approx(0.0), pytest.approx(3.0))
 
 
 def test_a_reason_is_said_once_until_a_good_message_comes(caplog: pytest.LogCaptureFixture) -> None:
     node: Any = FakeNode(TYPES)
     track = Track(FrameReader(MAP), 2.0)
-    poses = Input(node, "/uav/odom", KINDS[0], 10.0, track.hear)  # type: ignore[arg-type]
+    poses = Input(node, "/uav/odom", KINDS[0], 10.0, track.on_reading)  # type: ignore[arg-type]
     for number, frame in enumerate(["odom"] * 20 + ["map", "odom"]):
         node.topics["/uav/odom"].waiting.append(odometry(50, 50, frame=frame))
         poses.tick(number * NS_PER_S)

@@ -80,8 +80,8 @@ def test_one_that_takes_over_goes_on_from_where_the_other_was(scenario: Scenario
     ticks = driven(Rovers(scenario, ground(), 1), 20.0)
     second = Rovers(scenario, ground(), 2)
     for body in ticks[-1].values():
-        second.hear(body)
-    second.hear(msgspec.structs.replace(ticks[-1]["r0"], id="nobody"))
+        second.note_body(body)
+    second.note_body(msgspec.structs.replace(ticks[-1]["r0"], id="nobody"))
     for id, body in driven(second, 0.1)[0].items():
         last = ticks[-1][id]
         assert (body.x_m, body.y_m) == (last.x_m, last.y_m)

@@ -71,7 +71,7 @@ class Machine:
 
     def turn(self) -> None:
         """What the launcher does in each turn: look, then start what may begin."""
-        self.over.look(self.now_s)
+        self.over.advance(self.now_s)
         for index, each in enumerate(self.running):
             if each.process is None and (each.begins_when is None or each.begins_when()):
                 each.begins_when = None

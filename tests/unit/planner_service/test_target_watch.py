@@ -39,7 +39,7 @@ class Watch:
             target="t0", tracker=tracker, incarnation=START_NS, seq=self.seq, stamp_ns=self.now_ns, cell=cell,
             x_m=x_m, y_m=y_m,
         )  # fmt: skip
-        self.watch.on_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
+        self.watch.watch_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
 
     def tick(self, times: int = 1) -> None:
         for _ in range(times):

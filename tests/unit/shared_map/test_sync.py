@@ -212,7 +212,7 @@ def test_events_of_others_are_left_to_others() -> None:
     swarm = SwarmModel()
     listener = swarm.listener("p")
     note = set_of("a", 0, 1, {})
-    assert not listener.sync.handle(Heard(NOTE, {}, note), 0)
+    assert not listener.sync.on_map_event(Heard(NOTE, {}, note), 0)
 
 
 @settings(max_examples=25, deadline=None)

@@ -286,17 +286,17 @@ def test_a_process_is_ready_once_its_link_is_up_its_run_is_known_and_its_needs_a
     fed: list[bool] = []
     member.needs("food", lambda: bool(fed))
     assert member.lacks() == ["word of its run", "food"]
-    member.handle(AskEnded("run-check", RUN, 0, None))
+    member.on_member_event(AskEnded("run-check", RUN, 0, None))
     assert member.lacks() == ["food"], "whoever is alone in its namespace begins the run"
     fed.append(True)
     assert member.lacks() == []
-    member.handle(LinkChanged(up=False, beyond=True))
+    member.on_member_event(LinkChanged(up=False, beyond=True))
     assert member.lacks() == [], "a link between routers is not ours"
-    member.handle(LinkChanged(up=False))
-    member.handle(LinkChanged(up=True, beyond=True))
+    member.on_member_event(LinkChanged(up=False))
+    member.on_member_event(LinkChanged(up=True, beyond=True))
     assert member.lacks() == ["its router"]
     member.publish_stats(1)
     assert member.counters.gauges[READY] == 0.0
-    member.handle(LinkChanged(up=True))
+    member.on_member_event(LinkChanged(up=True))
     member.publish_stats(2)
     assert member.counters.gauges[READY] == 1.0

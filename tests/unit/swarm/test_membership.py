@@ -31,7 +31,7 @@ class Node:
 
     def post(self, event: Event) -> None:
         try:
-            if not self.member.handle(event):
+            if not self.member.on_member_event(event):
                 self.rest.append(event)
         except RunMismatchError as error:
             self.failure = error

@@ -141,7 +141,7 @@ class Track:
         self._reader, self._lease_s = reader, lease_s
         self._heard_ns = 0
 
-    def hear(self, message: Any, now_ns: int) -> Place:
+    def on_reading(self, message: Any, now_ns: int) -> Place:
         """Takes in where it is. Without a twist its speed is what two poses tell. Raises ConfigError."""
         found, before, since_ns = robot_place(self._reader, message), self.place, now_ns - self._heard_ns
         if before is not None and not hasattr(message, "twist") and _LEAST_GAP_NS <= since_ns <= _MOST_GAP_NS:

@@ -106,7 +106,7 @@ class Robot:
 
     def _hear_pose(self, message: Any, now_ns: int) -> None:
         """Raises SwarmError."""
-        place, robots = self._track.hear(message, now_ns), self._robots
+        place, robots = self._track.on_reading(message, now_ns), self._robots
         if self._is_taken(self.id):  # which may be seen late: the swarm's vehicles come after the connection
             self._leave()
             raise ConfigError(
