@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.wire_strategies import EXAMPLES, MESSAGES
+from support.wire_strategies import BY_TYPE, EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_JSON_BYTES, decode, encode, encode_json, may_be_json, packed_json
@@ -26,7 +26,6 @@ from swarm.wire.topics import TOPICS
 
 PUT = tuple({topic.message for topic in TOPICS if topic.published})
 ASKED = tuple({topic.request for topic in TOPICS if topic.request is not None})
-BY_TYPE = {type(example): example for example in EXAMPLES}
 
 
 def read(text: str | bytes, kind: type[Message], **named: str) -> Message:

@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import random
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from launch_scripts.ports import free_ports
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.learning.measurements import ONE, Measurement, columns_of
@@ -98,9 +98,7 @@ class Load:
 def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
     """Kill a keeper so often; returns how much was put, acknowledged and lost."""
     chance = random.Random(seed)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
     spawning = multiprocessing.get_context("forkserver")
     spawning.set_forkserver_preload([__name__ if __name__ != "__main__" else "test_keeper_kill"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ from support.processes import eventually
 from typer.testing import CliRunner
 
 from launch_scripts.commands.map_commands import app
+from launch_scripts.ports import free_ports
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.learning.measurements import ONE, Measurement
@@ -31,9 +31,7 @@ from swarm.wire.topics import MARKS
 
 @pytest.mark.network
 def test_a_running_swarm_says_what_was_learned(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
     terrain = terrain_of_pace(np.ones((40, 50), np.float32))
     scenario = Scenario(network=network, map=MapConfig(learning=True))

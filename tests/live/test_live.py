@@ -95,12 +95,6 @@ def test_top_tells_what_every_process_takes_up(live: LiveSwarm) -> None:
     eventually(told_of_all, 30, "figures of all processes")
 
 
-def test_any_zenoh_session_gets_a_readable_route(live: LiveSwarm, bus: ZenohBus) -> None:
-    row, col = served_cell(bus)
-    (reply,) = bus.session.get(f"swarm/target/t0/route?format=json;row={row};col={col}")
-    assert json.loads(reply.ok.payload.to_string())["routes"][0]["status"] == "ok"
-
-
 def test_garbage_on_every_key_is_counted_and_dropped(live: LiveSwarm, bus: ZenohBus) -> None:
     garbage = (b"", b"\xc1", b"\x00" * 4000, b"\xff" * 17, b"\x80", b'{"schema": "run/1"}', b"\xdd\xff\xff\xff\xff")
     fields = {name: "0" for topic in TOPICS for name in topic.fields} | {"target": "t0", "agent": "a0"}

@@ -22,6 +22,7 @@ from support.fake_run import fake_run
 from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
 
 from launch_scripts.monitor.live_layout import BACKGROUND
+from launch_scripts.ports import free_ports
 from launch_scripts.web.live_page import viewer_program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -97,7 +98,7 @@ def test_the_native_viewer_shows_the_same(shown: Rig, tmp_path: Path) -> None:
 
     location = shown.sinks.stream_url
     assert location is not None
-    port = free_port()
+    port = free_ports(1)[0]
     viewer = subprocess.Popen(
         [viewer_program(), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1280x800",
          location],
@@ -125,11 +126,3 @@ def connected(client_type: Any, url: str) -> Any:
             if time.monotonic() > deadline_s:
                 raise
             time.sleep(0.2)
-
-
-def free_port() -> int:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

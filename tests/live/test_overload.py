@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 
 import pytest
 
+from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, AskEnded, Event, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
@@ -55,9 +55,7 @@ class Slow:
 
 
 def test_under_twice_the_load_nine_of_ten_answers_go_to_those_who_still_wait():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
     inbox = Inbox()
     replies: list[Replied] = []

@@ -6,11 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
+from support.process_usage import in_session
+from support.processes import eventually
 from support.small_study import STUDY, dies_of_seed_one, write_study
 
 from launch_scripts.simulation.study import cluster
@@ -22,20 +23,6 @@ from swarm.errors import BusError
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(280)]
 COMMAND = (sys.executable, "-c", "import sys; from launch_scripts.entry import main; sys.exit(main())")
-
-
-def wait_until(happens: Callable[[], bool], within_s: float = 200.0) -> None:
-    until_s = time.monotonic() + within_s
-    while not happens():
-        assert time.monotonic() < until_s
-        time.sleep(0.05)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: Path):
@@ -50,7 +37,7 @@ def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: 
             if len(found) == 1:
                 os.kill(pids[0], signal.SIGKILL)
     assert found == {trial.key: run_trial(trial).figures for trial in trials}
-    assert not any(alive(pid) for pid in pids)
+    assert not any(map(psutil.pid_exists, pids))
 
 
 @pytest.mark.thorough
@@ -71,15 +58,11 @@ def test_a_trial_that_kills_its_workers_is_given_up_and_the_others_are_not(
 )
 def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_path: Path, number: signal.Signals):
     path, out = write_study(tmp_path, STUDY.replace('"0:3"', '"0:100"')), tmp_path / "out"
+    kept_by_now = out / "results.jsonl"
     words = [*COMMAND, "sweep", str(path), "--workers", "1", "--out", str(out)]
     running = subprocess.Popen(words, stderr=subprocess.PIPE, start_new_session=True, text=True)
     try:
-        wait_until(
-            lambda: (
-                ((out / "results.jsonl").exists() and (out / "results.jsonl").stat().st_size > 0)
-                or running.poll() is not None
-            )
-        )
+        eventually(lambda: (kept_by_now.exists() and kept_by_now.stat().st_size) or running.poll() is not None, 200)
         if number == signal.SIGINT:
             os.killpg(running.pid, number)  # as a terminal does
         else:
@@ -95,25 +78,12 @@ def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_pa
         assert "Traceback" not in said
     else:
         assert running.returncode == -number
-    wait_until(lambda: not _left(running.pid))
+    eventually(lambda: not in_session(running.pid), 200, "the end of its workers")
     sweep = Sweep(path, out)
     assert len(sweep.missing) == 200 - len(kept)
     path.write_text(STUDY.replace('"0:3"', '"0:1"').replace("[60, 120]", "[60]"), encoding="utf-8")
     assert subprocess.run(words, capture_output=True, check=True, timeout=200).returncode == 0
     assert (out / RESULTS).is_file()
-
-
-def _left(session: int) -> list[int]:
-    """Processes of a session that are left."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == session and fields[0] != "Z":
-            found.append(int(stat.parent.name))
-    return found
 
 
 def test_a_scheduler_that_is_there_is_used_and_one_that_is_not_is_named(

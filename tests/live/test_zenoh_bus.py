@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +22,7 @@ from support.query_behaviour import *  # noqa: F403
 from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
 
+from launch_scripts.ports import free_ports
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
@@ -52,13 +52,6 @@ with open_bus(NetworkConfig(listen=(sys.argv[1],)), mode="router"):
     print("up", flush=True)
     sys.stdin.read()
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Router:
@@ -122,7 +115,7 @@ class ZenohWorld:
 
 @pytest.fixture(scope="module")
 def router() -> Iterator[Router]:
-    router = Router(f"tcp/127.0.0.1:{free_port()}")
+    router = Router(f"tcp/127.0.0.1:{free_ports(1)[0]}")
     yield router
     router.kill()
 
@@ -290,7 +283,7 @@ def test_closing_takes_seconds_at_most_though_the_router_hangs(world):
 
 
 def test_nobody_to_reach_is_a_sentence(world):
-    network = NetworkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=0.3)
+    network = NetworkConfig(connect=(f"tcp/127.0.0.1:{free_ports(1)[0]}",), connect_timeout_s=0.3)
     with pytest.raises(
         BusError, match=r"cannot reach a router at tcp/127.0.0.1:\d+: .*is `swarm router` running there"
     ):

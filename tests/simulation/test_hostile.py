@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from support.wire_strategies import EXAMPLES
+from support.wire_strategies import BY_TYPE
 
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
@@ -16,7 +16,6 @@ from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import TOPICS, Topic
 
 KNOWN = ("t0", "t1", "a0", "a1", "a2", "a0-00", "a1-01", "0", "3", "keeper", "planner", "agent", "targets")
-BY_TYPE = {type(example): example for example in EXAMPLES}
 FORGEABLE = [topic for topic in TOPICS if topic.published]
 
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import socket
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_strategies import Acknowledged, Composite, set_of
+from support.map_strategies import Composite, set_of
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.mark_store import KeeperStore
@@ -19,16 +15,10 @@ from shared_map.keeper.service import KeeperService
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
-from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import Asked, Heard
-from swarm.bus.zenoh_bus import ZenohBus, open_bus
-from swarm.clock import NS_PER_S, MonotonicClock
-from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
-from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
+from swarm.bus.bus import Asked
+from swarm.clock import NS_PER_S
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarksRequest
-from swarm.wire.topics import DIGEST, MARKS, NOTE
+from swarm.wire.topics import DIGEST, MARKS
 
 LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
 
@@ -39,14 +29,6 @@ def write(service: SyncService, swarm: SwarmModel, cells: list[int], kind: MarkK
 
 def all_equal(services: Sequence[SyncService | KeeperService]) -> bool:
     return len({service.replica.held.fingerprint() for service in services}) == 1
-
-
-def test_a_mark_reaches_every_replica_at_once() -> None:
-    swarm = SwarmModel()
-    author, listener = swarm.writer("a1.1"), swarm.listener("p")
-    write(author, swarm, [5])
-    swarm.run(0.01)
-    assert listener.replica.winners(0).kinds.tolist() == [LETHAL]
 
 
 def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked_what_it_holds() -> None:
@@ -208,13 +190,6 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
     assert pending.digest.held == {"a1.1": kept[3]}
 
 
-def test_events_of_others_are_left_to_others() -> None:
-    swarm = SwarmModel()
-    listener = swarm.listener("p")
-    note = set_of("a", 0, 1, {})
-    assert not listener.sync.on_map_event(Heard(NOTE, {}, note), 0)
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32),
@@ -245,92 +220,3 @@ def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_a
     sinks = [service.replica._cost_map for service in [*authors, listener]]
     assert all(isinstance(sink, Composite) and sink.same(sinks[0]) for sink in sinks)  # type: ignore[arg-type]
     assert len(list(store.load())) == sum(len(keeper.replica.held.of_tile(t)) for t in keeper.replica.held.tiles)
-
-
-# --- on real zenoh ------------------------------------------------------------------------------------------
-
-
-class Running:
-    """Services on threads, each with its own zenoh session; closed in reverse order."""
-
-    def __init__(self, network: NetworkConfig) -> None:
-        self.network = network
-        self.terrain = terrain_of_pace(np.ones((64, 64), np.float32))
-        self.scenario = Scenario(network=network)
-        self._undo: list[Callable[[], None]] = []
-
-    def sync(self, author: str | None) -> SyncService:
-        bus, inbox = open_bus(self.network), Inbox()
-        replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
-        service = SyncService(MapSync(replica, bus, inbox.post, MapConfig(), "agent"))
-        self._run(service, bus, inbox)
-        return service
-
-    def keeper(self, store: KeeperStore) -> KeeperService:
-        bus, inbox = open_bus(self.network), Inbox()
-        setup = RoleSetup(self.scenario, "run", "keeper", "keeper", time.time_ns(), 0)
-        service = KeeperService(setup, self.terrain, bus, inbox.post, store)
-        self._run(service, bus, inbox)
-        return service
-
-    def acknowledged(self) -> Acknowledged:
-        bus = open_bus(self.network)
-        self._undo.append(bus.close)
-        return Acknowledged(bus)
-
-    def _run(self, service: SyncService | KeeperService, bus: ZenohBus, inbox: Inbox) -> None:
-        process = Process(service, inbox, MonotonicClock(), 10.0)
-        thread = threading.Thread(target=process.run)
-        thread.start()
-
-        def undo() -> None:
-            process.stop()
-            thread.join(5)
-            bus.close()
-
-        self._undo.append(undo)
-
-    def stop_last(self) -> None:
-        self._undo.pop()()
-
-    def close(self) -> None:
-        while self._undo:
-            self.stop_last()
-
-
-@pytest.fixture
-def running() -> Iterator[Running]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
-    with open_bus(network, mode="router"):
-        swarm = Running(network)
-        try:
-            yield swarm
-        finally:
-            swarm.close()
-
-
-def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> None:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline, "not in time"
-        time.sleep(0.02)
-
-
-@pytest.mark.network
-def test_on_real_zenoh_marks_are_heard_kept_and_handed_to_who_comes_late(running: Running) -> None:
-    store = KeeperStore(":memory:")
-    running.keeper(store)
-    listener = running.sync(None)
-    acknowledged = running.acknowledged()
-    author = running.sync("a1.1")
-    author.sync.publish(author.replica.write([5, 3000], LETHAL, 0.0, time.time_ns()))
-    eventually(lambda: listener.replica.held.fingerprint() == author.replica.held.fingerprint())
-    eventually(lambda: acknowledged.not_yet(author) == 0)
-    running.stop_last()  # the author ends; the keeper answers for it
-    late = running.sync(None)
-    eventually(lambda: late.replica.held.fingerprint() == author.replica.held.fingerprint(), within_s=2)
-    assert late.sync.joined
-    assert len(list(store.load())) == 2
