@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support import slow_twins as naive
 from support.effort import few
+from support.makers import target_pose
 from support.planner_strategies import STRATEGIES, random_pace
 from support.scripted_planner import TICK, World, chasers
 
@@ -57,9 +58,7 @@ class Watched:
             cell = int(self.rng.choice(near)) if len(near) else cell
         self.at = cell
         self.seq += 1
-        told = TargetPose(
-            target="t0", tracker="radar", incarnation=1, seq=self.seq, stamp_ns=0, cell=cell, x_m=0, y_m=0
-        )
+        told = target_pose("t0", cell, tracker="radar", seq=self.seq)
         self.planner.on_pose(told, self.now_ns)
 
     def mark(self) -> None:

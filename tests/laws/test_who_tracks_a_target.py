@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
+from support.makers import target_pose
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -35,17 +36,11 @@ class Tracker:
 
     def pose(self, now_ns: int, cell: int = 5) -> TargetPose:
         self.seq += 1
-        return TargetPose(
-            target="t",
-            tracker=self.name,
-            incarnation=self.began_ns + self.offset_ns,
-            seq=self.seq,
-            stamp_ns=now_ns + self.offset_ns,
+        incarnation, stamp_ns = self.began_ns + self.offset_ns, now_ns + self.offset_ns
+        return target_pose(
+            "t", cell, tracker=self.name, incarnation=incarnation, seq=self.seq, stamp_ns=stamp_ns,
             lease_s=self.lease_s,
-            cell=cell,
-            x_m=0.0,
-            y_m=0.0,
-        )
+        )  # fmt: skip
 
 
 def owner_of(tracking: Tracking, now_ns: int) -> tuple[str | None, int] | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from support.client_rig import run_info as client_run_info
+from support.client_rig import keeper_info
 from support.live_swarm import Hands, swarm
 from support.processes import eventually
 
@@ -141,7 +141,7 @@ def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_on
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
     hands.start("router", str(hands.path), "--listen", endpoint, *tls(certs))
     eventually(lambda: swarm("status", "--connect", endpoint, *tls(certs)).returncode == 0, 30, "the router")
-    run = msgspec.structs.replace(client_run_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns())
+    run = msgspec.structs.replace(keeper_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns())
     heard: list[str] = []
 
     def tell(event: Event) -> None:

@@ -17,7 +17,8 @@ import msgspec
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_world import Box, answering, asked, pose, run_info
+from support.bus_world import Box, answering, asked, pose
+from support.makers import run_info
 from support.query_behaviour import *  # noqa: F403
 from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
@@ -217,7 +218,7 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
 
 def test_threads_that_post_replies_keep_what_python_knows_of_them(world):
     a, b = world.bus("a"), world.bus("b")
-    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
     world.settle()
     own = threading.local()
     calls: list[tuple[int, int]] = []
@@ -250,7 +251,7 @@ def test_garbage_is_logged_once_per_key(world, caplog):
 def test_a_router_killed_and_started_again_is_found_by_everybody(world):
     a, b = world.bus("a"), world.bus("b")
     links, heard = Box(), Box()
-    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
     a.watch_links(links)
     a.subscribe(POSE, heard)
     world.settle()
@@ -405,7 +406,7 @@ def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
         "token": lambda: b.watch_alive(broken),
         "link": lambda: b.watch_links(broken),
     }[what]
-    a.serve(RUN, answering((run_info("a"), {})), role="agent", id="a")
+    a.serve(RUN, answering((run_info(id="a"), {})), role="agent", id="a")
     a.declare_alive(Peer("agent", "a1", 7))
     world.settle()
     service = Deaf(listen)
@@ -507,7 +508,7 @@ def test_who_leaves_before_it_obeys_is_not_called_silent_and_who_hangs_is(world:
     members = {role: world.bus(role) for role in ("keeper", "planner", "agent", "targets")}
     for role, bus in members.items():
         bus.declare_alive(Peer(role, "x", 1))
-        info = msgspec.structs.replace(run_info("x"), role=role)
+        info = msgspec.structs.replace(run_info(id="x"), role=role)
         bus.serve(RUN, answering((info, {"role": role, "id": "x"})), role=role, id="x")
     given = Order(subject="pause", name="", stamp_ns=1)
     book = (Orders(role="keeper", id="x", orders=[given], given=given), {"keeper": "x"})

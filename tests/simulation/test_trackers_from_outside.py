@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from support.makers import target_pose
 from support.simulated import vehicles
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
@@ -27,7 +28,6 @@ from swarm.wire.messages.planning import (
     RouteReply,
     RouteRequest,
     Sighted,
-    TargetPose,
 )
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.vehicles import VehicleState
@@ -65,18 +65,10 @@ class OutsideTracker:
         grid = self.simulation.terrain.grid
         cell = grid.cell(self.rows, grid.cols // 2)
         self.seq += 1
-        x_m, y_m = grid.centre_m(cell)
-        pose = TargetPose(
-            target="x",
-            tracker=self.name,
-            incarnation=self.stamp_ns(self.from_s),
-            seq=self.seq,
-            stamp_ns=self.stamp_ns(self.simulation.now_s),
-            lease_s=0.0 if over else 2.0,
-            cell=cell,
-            x_m=x_m,
-            y_m=y_m,
-        )
+        pose = target_pose(
+            "x", cell, grid, tracker=self.name, incarnation=self.stamp_ns(self.from_s), seq=self.seq,
+            stamp_ns=self.stamp_ns(self.simulation.now_s), lease_s=0.0 if over else 2.0,
+        )  # fmt: skip
         self.bus.publish(POSE, pose, target="x")
 
     def stamp_ns(self, at_s: float) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
+from support.makers import target_pose
 from support.slow_twins import cost_to_go, way_down
 from support.swarm_model import SwarmModel
 
@@ -259,16 +260,9 @@ class AgentWorld(SwarmModel):
         """A target is somewhere, and says so ten times a second from now on."""
         known = self.poses.get(target)
         cell = self.terrain.grid.cell(row, col)
-        x_m, y_m = self.terrain.grid.centre_m(cell)
-        self.poses[target] = TargetPose(
-            target=target,
-            incarnation=1,
-            seq=0 if known is None else known.seq,
-            stamp_ns=self.now_ns,
-            cell=cell,
-            x_m=x_m,
-            y_m=y_m,
-            jumps=0 if known is None else known.jumps + jumped,
+        seq, jumps = (0, 0) if known is None else (known.seq, known.jumps + jumped)
+        self.poses[target] = target_pose(
+            target, cell, self.terrain.grid, seq=seq, stamp_ns=self.now_ns, jumps=jumps
         )
         if known is None:
             self._tell(target)

@@ -36,12 +36,3 @@ def bench(*words: str) -> dict[str, Any]:
     assert done.exit_code == 0, done.output
     report: dict[str, Any] = json.loads(done.stdout)
     return report
-
-
-def assert_fits(*words: str) -> str:
-    """What a benchmark prints, of which no line is longer than 80 columns and no word is cut."""
-    done = run(*words)
-    assert done.exit_code == 0, done.output
-    assert max(len(line.rstrip()) for line in done.output.splitlines()) <= 80, done.output
-    assert "…" not in done.output, done.output
-    return done.output

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import pytest
-from support.bus_world import Box, World, answering, asked, marks, note, pose, run_info
+from support.bus_world import Box, World, answering, asked, marks, note, pose
+from support.makers import run_info
 
 from docs.generate.wire_page import PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
@@ -244,7 +245,7 @@ def test_a_subscription_with_a_field_hears_only_that_key(world: World):
 def test_what_is_served_no_more_is_not_asked_and_may_be_served_again(world: World):
     a, b, c = world.bus("a"), world.bus("b"), world.bus("c")
     for bus, id in ((a, "a0"), (b, "a1")):
-        bus.serve(RUN, answering((run_info(id), {})), role="agent", id=id)
+        bus.serve(RUN, answering((run_info(id=id), {})), role="agent", id=id)
     world.settle()
     assert len(asked(world, c, RUN, Nothing()).of(Replied)) == 2
     a.unserve(RUN, role="agent", id="a0")
@@ -252,7 +253,7 @@ def test_what_is_served_no_more_is_not_asked_and_may_be_served_again(world: Worl
     world.settle()
     assert [reply.message.id for reply in asked(world, c, RUN, Nothing()).of(Replied)] == ["a1"]
     assert asked(world, c, RUN, Nothing(), id="a0").of(AskEnded) == [AskEnded("q", RUN, 0, None)]
-    a.serve(RUN, answering((run_info("a0"), {})), role="agent", id="a0")
+    a.serve(RUN, answering((run_info(id="a0"), {})), role="agent", id="a0")
     world.settle()
     assert len(asked(world, c, RUN, Nothing()).of(Replied)) == 2
 
@@ -272,7 +273,7 @@ def test_two_namespaces_do_not_hear_each_other(world: World):
     box, foreign = Box(), Box()
     b.subscribe(NOTE, box)
     other.subscribe(NOTE, foreign)
-    other.serve(RUN, answering((run_info("c"), {})), role="agent", id="c")
+    other.serve(RUN, answering((run_info(id="c"), {})), role="agent", id="c")
     world.settle()
     a.publish(NOTE, note("x"), role="agent", id="a0")
     world.until(lambda: box)
@@ -346,7 +347,7 @@ def test_a_cut_link_is_told_and_what_was_declared_works_again_when_it_heals(worl
     heard, tokens, links = Box(), Box(), Box()
     peer = Peer("agent", "a0", 7)
     a.declare_alive(peer)
-    a.serve(RUN, answering((run_info("a"), {})), role="agent", id="a")
+    a.serve(RUN, answering((run_info(id="a"), {})), role="agent", id="a")
     b.subscribe(NOTE, heard)
     b.watch_alive(tokens)
     b.watch_links(links)
@@ -379,7 +380,7 @@ def test_after_close_nothing_is_sent_heard_or_raised(world: World):
     a.close()
     a.close()
     a.publish(NOTE, note("x"), role="agent", id="a0")
-    kept[0].answer(run_info("a"))
+    kept[0].answer(run_info(id="a"))
     kept[0].refuse("gone")
     kept[0].end()
     a.ask(RUN, Nothing(), box, tag="q")

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from swarm.bus.bus import Asked, AskEnded, Bus, Event
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import TargetPose
-from swarm.wire.messages.processes import Note, RunInfo
+from swarm.wire.messages.processes import Note
 from swarm.wire.topics import Topic
 
 
@@ -46,13 +46,6 @@ def pose(target: str = "t0", seq: int = 1) -> TargetPose:
 
 def note(text: str, id: str = "a0") -> Note:
     return Note(role="agent", id=id, stamp_ns=1, kind="test", text=text)
-
-
-def run_info(id: str) -> RunInfo:
-    return RunInfo(
-        run_id="r", role="agent", id=id, incarnation=1, scenario="s", terrain="0", rows=1, cols=1, resolution_m=1.0,
-        started_ns=0,
-    )  # fmt: skip
 
 
 def marks(author: str, tile: int) -> MarkSet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from support.makers import run_info
 from support.swarm_model import SwarmModel
 
 from swarm.bus.bus import Event
@@ -12,12 +13,9 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.processes import RunInfo
 
 
-def run_info(grid: GridSpec, run_id: str = "run") -> RunInfo:
-    return RunInfo(
-        run_id=run_id, role="keeper", id="0", incarnation=1, scenario="s", terrain="0", rows=grid.rows,
-        cols=grid.cols, resolution_m=grid.resolution_m, started_ns=0, west_m=grid.west_m, north_m=grid.north_m,
-        crs=grid.crs, classes=["walker", "truck"],
-    )  # fmt: skip
+def keeper_info(grid: GridSpec, run_id: str = "run") -> RunInfo:
+    """What a keeper answers of a run with two classes of vehicles."""
+    return run_info(grid, run_id=run_id, role="keeper", id="0", classes=["walker", "truck"])
 
 
 class SlowClock:
@@ -40,7 +38,7 @@ class Program:
         self.world = world
         self.bus = world.bus(node)
         clock = SlowClock(world.scheduler.clock, slow_ns)
-        self.session = Session(self.bus, run_info(world.terrain.grid), clock, self._post, ahead_ns=slow_ns)
+        self.session = Session(self.bus, keeper_info(world.terrain.grid), clock, self._post, ahead_ns=slow_ns)
         self.swarm = Swarm(self.session)
         self.problems: list[str] = []
         self.swarm.on_problem(self.problems.append)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
-from support.target_reports import planner_status
+from support.makers import planner_status
 
 from launch_scripts.observe.counts import Counts
 from launch_scripts.web.prometheus import HELP, Figures, OneScrape, Run, families

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from support.bus_world import Box, World, answering, asked, marks, run_info
+from support.bus_world import Box, World, answering, asked, marks
+from support.makers import run_info
 
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.wire.codec import encode
@@ -23,13 +24,13 @@ def test_a_query_that_nobody_serves_ends_empty(world: World):
 
 def test_a_query_is_answered_once(world: World):
     a, b = world.bus("a"), world.bus("b")
-    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
     world.settle()
     assert asked(world, a, RUN, Nothing(), role="agent", id="b") == [
-        Replied("q", RUN, {"role": "agent", "id": "b"}, run_info("b")),
+        Replied("q", RUN, {"role": "agent", "id": "b"}, run_info(id="b")),
         AskEnded("q", RUN, 1, None),
     ]
-    question, answer = len(encode(Nothing())), len(encode(run_info("b")))
+    question, answer = len(encode(Nothing())), len(encode(run_info(id="b")))
     assert (a.counts["bytes_out"], a.counts["bytes_in"]) == (question, answer)
     assert (b.counts["bytes_out"], b.counts["bytes_in"]) == (answer, question)
 
@@ -44,7 +45,7 @@ def test_a_reply_tells_how_long_it_took_from_the_question_to_its_arrival(world: 
     world.settle()
     waited_s = asked_of[0].waited_s - waited_s
     assert waited_s > 0
-    asked_of[0].answer(run_info("b"))
+    asked_of[0].answer(run_info(id="b"))
     asked_of[0].end()
     world.until(lambda: box.of(AskEnded))
     [reply] = box.of(Replied)
@@ -54,7 +55,7 @@ def test_a_reply_tells_how_long_it_took_from_the_question_to_its_arrival(world: 
 def test_a_wildcard_query_is_answered_by_everybody_ourselves_included(world: World):
     buses = {name: world.bus(name) for name in ("a", "b", "c")}
     for name, bus in buses.items():
-        bus.serve(RUN, answering((run_info(name), {})), role="agent", id=name)
+        bus.serve(RUN, answering((run_info(id=name), {})), role="agent", id=name)
     world.settle()
     box = asked(world, buses["a"], RUN, Nothing(), role="agent")
     assert sorted(event.message.id for event in box.of(Replied)) == ["a", "b", "c"]
@@ -111,7 +112,7 @@ def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
     a, b, kept = world.bus("a"), world.bus("b"), Box()
 
     def forget(event: Any) -> None:
-        event.answer(run_info("b"))
+        event.answer(run_info(id="b"))
         kept(event)
 
     b.serve(RUN, forget, role="agent", id="b")
@@ -129,7 +130,7 @@ def test_answers_may_come_later_than_the_event(world: World):
     world.until(lambda: kept)
     world.settle()
     assert box == []
-    kept[0].answer(run_info("b"))
+    kept[0].answer(run_info(id="b"))
     kept[0].end()
     world.until(lambda: box.of(AskEnded))
     assert len(box.of(Replied)) == 1
@@ -158,7 +159,7 @@ def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
     kept[0].end()
     kept[0].end()
     with pytest.raises(RuntimeError, match="after the end"):
-        kept[0].answer(run_info("b"))
+        kept[0].answer(run_info(id="b"))
 
 
 def test_one_that_hears_a_topic_may_serve_it_too(world: World):

@@ -8,26 +8,21 @@ import pytest
 from chaos.fault_schedule import CALM, FAULTS, faults
 from chaos.hostile import KINDS, Hostile
 from chaos.results import Ended, Outcome, Recovery, Results, Sample
+from support.makers import fleet_of
 from support.message_fuzzer import MessageFuzzer
 
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
-from swarm.wire.fields import pack_column
 from swarm.wire.messages import Message
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.topics import POSE, TOPICS
 
 NAMES = ["agent-a0", "agent-a1", "keeper-0", "router-0"]
 
 
 def fleet(places: dict[str, tuple[float, VehicleState]]) -> Fleet:
-    n = len(places)
-    return Fleet(
-        author="all.a0.1", group="all", region=0, seq=1, stamp_ns=1, ids=list(places), target_ids=[],
-        cells=pack_column([0] * n, "<u4"), east_m=pack_column([east for east, _ in places.values()], "<f4"),
-        south_m=pack_column([0.0] * n, "<f4"), heading_rad=pack_column([0.0] * n, "<f4"),
-        states=bytes([state for _, state in places.values()]), targets=bytes([NO_TARGET] * n),
-    )  # fmt: skip
+    east_m = [east for east, _ in places.values()]
+    return fleet_of(list(places), east_m=east_m, states=bytes(state for _, state in places.values()))
 
 
 def test_a_seed_decides_the_faults_and_their_order() -> None:

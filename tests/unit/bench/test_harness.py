@@ -1,4 +1,4 @@
-"""The harness of benchmarks: each command runs small, fits 80 columns, and says in a sentence what is wrong."""
+"""The harness of benchmarks: each command is listed, and says in a sentence what is wrong."""
 
 from __future__ import annotations
 

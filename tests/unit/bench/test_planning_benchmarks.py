@@ -15,7 +15,7 @@ from bench.planning import peers as rivals
 from bench.planning.chase import BROKEN, FEWEST, Plan, Tally, chase
 from bench.planning.peers import tree_memory_mb
 from bench.planning.strategies import points_of
-from support.benchmarks import assert_fits, bench, run
+from support.benchmarks import bench, run
 from support.fields import FIELDS, Field, make_field
 from support.tree_lives import LAWS
 
@@ -294,24 +294,6 @@ def test_scale_has_a_row_per_point_and_strategy_and_draws_them(tmp_path: Path) -
         (row["size"], row["strategy"]): row["frame_ms_p50"] for row in report["rows"] if row["vehicles"] == 20
     }
     assert larger[128, "full"] > larger[32, "full"]
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "paper --size 48 --frames 6",
-        "scale --sizes 32 --targets 2 --vehicles 10 --frames 4",
-        "gap --dem uniform --frames 4 --runs 1",
-        "peers --size 64 --repeats 1 --no-memory",
-        "moves --size 64 --moves 2",
-        "kernels --size 64 --repeats 1",
-        "certificates --checks 100",
-        "compaction --lives 2",
-        "presence --vehicles 25 --rounds 1",
-    ],
-)
-def test_tables_fit_into_eighty_columns(words: str) -> None:
-    assert_fits(*words.split())
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from skimage.graph import MCP_Geometric
+from support.makers import planner_status
 from support.monitor_rig import Rig, little_scenario, little_terrain
-from support.target_reports import planner_status
 
 from launch_scripts.monitor.ground.ground_colours import (
     UNREACHED,

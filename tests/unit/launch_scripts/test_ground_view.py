@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from support.makers import planner_status
 from support.map_strategies import set_of
 from support.monitor_rig import Rig, little_scenario, little_terrain
-from support.target_reports import planner_status
 
 from launch_scripts.monitor.ground.ground_colours import (
     FAST_MARK,

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from support.makers import stats
 
 from launch_scripts.monitor.ground.ground_colours import GroundColours
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
@@ -23,7 +24,6 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.map_data import MarkSet
-from swarm.wire.messages.processes import Stats
 
 FLAT, STEEP = 0, 5
 """Kinds of ground: the class is unknown."""
@@ -95,10 +95,7 @@ def test_a_planner_tells_the_mean_factor_of_a_class_until_its_prior_stands_again
 def test_everybody_who_shows_a_run_says_what_was_learned_and_nothing_while_nothing_is() -> None:
     recorder = Recorder(small(), GROUND.grid)
     assert not any("learned" in line for line in facts.lines(recorder.summary(1)))
-    stats = Stats(
-        role="planner", id="t", incarnation=1, stamp_ns=1, counts={}, gauges={"learned.grass": 2.853}, histograms={}
-    )
-    recorder.heard(stats, 1)
+    recorder.heard(stats("planner", "t", gauges={"learned.grass": 2.853}), 1)
     assert "learned grass x 2.9" in facts.lines(recorder.summary(1))
     assert facts.for_report(recorder.summary(1))["learned"] == {"grass": 2.853}
 

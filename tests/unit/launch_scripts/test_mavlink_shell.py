@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 import pytest
-from support.client_rig import run_info
+from support.client_rig import keeper_info
 from support.mavlink_sender import Sender, beat, common, position
 from support.mavlink_world import FRAME, GRID, START, TO_THE_EAST
 from support.swarm_model import SwarmModel
@@ -60,7 +60,7 @@ class Rig:
         self.bodies: list[Body] = []
         self.world.bus("ear").subscribe(BODY, self._hear)
         bus = self.world.bus("adapter")
-        self.session = Session(bus, run_info(GRID), self.world.scheduler.clock)
+        self.session = Session(bus, keeper_info(GRID), self.world.scheduler.clock)
         self.link = PlayedLink()
         self.now_ns = 10**12
         self.told: list[str] = []

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
-from support.target_reports import planner_status
+from support.makers import planner_status, run_info, stats
 
 from launch_scripts import web
 from launch_scripts.observe.counts import Counts
@@ -28,26 +28,14 @@ from swarm.errors import BusError
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import RunInfo, Stats
+from swarm.wire.messages.processes import Stats
 from swarm.wire.topics import RUN, STATS, STATUS
 
 _BEGAN_NS = 1_790_000_000 * NS_PER_S
 
 
 def _stats(role: str, id: str, counters: Counters, life: int = _BEGAN_NS) -> Stats:
-    return Stats(
-        role=role,
-        id=id,
-        incarnation=life,
-        stamp_ns=life + NS_PER_S,
-        counts=counters.counts,
-        gauges=counters.gauges,
-        histograms={name: histogram.buckets for name, histogram in counters.histograms.items()},
-        counts_by=counters.counts_by,
-        histograms_by={
-            name: {id: each.buckets for id, each in by.items()} for name, by in counters.histograms_by.items()
-        },
-    )
+    return stats(role, id, counters, incarnation=life, stamp_ns=life + NS_PER_S)
 
 
 def _status(target: str) -> PlannerStatus:
@@ -210,10 +198,7 @@ def test_whoever_follows_goes_on_to_the_next_run() -> None:
     run_id = "r1"
 
     def answer(event: object) -> None:
-        info = RunInfo(
-            run_id=run_id, role="agent", id="a0", incarnation=1, scenario="demo", terrain="x",
-            rows=8, cols=8, resolution_m=1.0, started_ns=_BEGAN_NS,
-        )  # fmt: skip
+        info = run_info(run_id=run_id, scenario="demo", started_ns=_BEGAN_NS)
         event.answer(info, role="agent", id="a0")  # type: ignore[attr-defined]
 
     bus.serve(RUN, answer, role="agent", id="a0")

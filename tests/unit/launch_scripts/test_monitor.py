@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import pytest
 from support.fake_run import fake_run
+from support.makers import stats
 from support.monitor_rig import (
     LIVE,
     NOBODY,
@@ -197,10 +198,7 @@ def test_the_recording_ends_with_what_was_said_last_also_if_no_frame_was_due(
 ) -> None:
     rig = Rig(scenario, terrain, tmp_path / "run.rrd", audience=NOBODY)
     rig.run(3)
-    stats = Stats(
-        role="targets", id="0", incarnation=7, stamp_ns=1, counts={"captures": 7}, gauges={}, histograms={}
-    )
-    say(rig.speaker, terrain, stats)
+    say(rig.speaker, terrain, stats("targets", "0", incarnation=7, counts={"captures": 7}))
     rig.run(0.01)
     rig.close()
     assert components(tmp_path / "run.rrd", "/plots/captures_and_marks")["scalars"][-1][0] == 7

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 
 from rich.console import Console
+from support.makers import run_info, stats
 
 from launch_scripts.commands.status_view import table_of, top_fields
 from launch_scripts.launcher.tables import live_table
@@ -16,15 +17,13 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.wire.messages.processes import RunInfo, Stats
+from swarm.wire.messages.processes import Stats
 
 
 def told(id: str, at_s: float, cpu_s: float, late: int, life: int = 1, role: str = "agent") -> Stats:
     gauges = {"cpu_s": cpu_s, "rss_bytes": 90e6, "messages_per_s": 1234.0, "restarts": float(life - 1)}
-    return Stats(
-        role=role, id=id, incarnation=life, stamp_ns=int(at_s * NS_PER_S), counts={"ticks_late": late},
-        gauges=gauges, histograms={},
-    )  # fmt: skip
+    stamp_ns = int(at_s * NS_PER_S)
+    return stats(role, id, incarnation=life, stamp_ns=stamp_ns, counts={"ticks_late": late}, gauges=gauges)
 
 
 def test_rates_are_of_the_last_two_words_of_one_life() -> None:
@@ -104,10 +103,7 @@ def test_the_live_table_cuts_nothing_off_at_80_columns_and_24_lines() -> None:
 
 def test_top_fits_80_columns_too_and_says_the_same_to_programs() -> None:
     state, loads, up = large_run()
-    run = RunInfo(
-        run_id="20261122-181823-db5a", role="agent", id="a0", incarnation=1, scenario="a-long-name", terrain="t",
-        rows=4000, cols=4000, resolution_m=30.0, started_ns=0,
-    )  # fmt: skip
+    run = run_info(GridSpec(4000, 4000, 30.0), run_id="20261122-181823-db5a", scenario="a-long-name")
     console = Console(file=io.StringIO(), width=80, height=24)
     lines = loads.lines(up)
     for each in (False, True):

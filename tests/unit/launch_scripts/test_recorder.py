@@ -8,8 +8,9 @@ import pickle
 import msgspec
 import numpy as np
 import pytest
+from support import makers
+from support.makers import fleet_of, planner_status, target_pose
 from support.map_strategies import set_of
-from support.target_reports import planner_status
 
 from launch_scripts.launcher.tables import plain_line
 from launch_scripts.observe import facts
@@ -25,12 +26,12 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
 from swarm.wire.codec import decode, encode
-from swarm.wire.fields import ZERO_BUCKET, pack_column
+from swarm.wire.fields import ZERO_BUCKET
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet, VehicleState
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
 
@@ -67,15 +68,10 @@ def stats(
         for value in values:
             histogram.add(value)
         packed[name] = histogram.buckets
-    return Stats(
-        role=role,
-        id=id,
-        incarnation=incarnation,
-        stamp_ns=int(at_s * NS_PER_S),
-        counts=counts or {},
-        gauges=gauges or {},
+    return makers.stats(
+        role, id, incarnation=incarnation, stamp_ns=int(at_s * NS_PER_S), counts=counts or {}, gauges=gauges or {},
         histograms=packed,
-    )
+    )  # fmt: skip
 
 
 def fleet(
@@ -86,36 +82,16 @@ def fleet(
     state: VehicleState = VehicleState.FOLLOWING,
     target: str | None = "t0",
 ) -> Fleet:
-    count = len(places)
-    return Fleet(
-        author=author,
-        group="all",
-        region=region,
-        seq=int(at_s * 10),
-        stamp_ns=int(at_s * NS_PER_S),
-        ids=list(places),
-        target_ids=[] if target is None else [target],
-        cells=pack_column([0] * count, "<u4"),
-        east_m=pack_column([east for east, _ in places.values()], "<f4"),
-        south_m=pack_column([south for _, south in places.values()], "<f4"),
-        heading_rad=pack_column([0.0] * count, "<f4"),
-        states=bytes([state] * count),
-        targets=bytes([NO_TARGET if target is None else 0] * count),
-    )
+    return fleet_of(
+        list(places), author=author, region=region, state=state, target=target, seq=int(at_s * 10),
+        stamp_ns=int(at_s * NS_PER_S), east_m=[east for east, _ in places.values()],
+        south_m=[south for _, south in places.values()],
+    )  # fmt: skip
 
 
 def pose(target: str, east_m: float, south_m: float, seq: int, captures: int = 0) -> TargetPose:
-    return TargetPose(
-        target=target,
-        incarnation=1,
-        seq=seq,
-        stamp_ns=seq,
-        cell=0,
-        x_m=GRID.west_m + east_m,
-        y_m=GRID.north_m - south_m,
-        captures=captures,
-        jumps=captures,
-    )
+    x_m, y_m = GRID.west_m + east_m, GRID.north_m - south_m
+    return target_pose(target, seq=seq, stamp_ns=seq, x_m=x_m, y_m=y_m, captures=captures, jumps=captures)
 
 
 def status(target: str, gap_max: float | None, following: int = 1) -> PlannerStatus:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import msgspec
-from support.client_rig import run_info
+from support import makers
+from support.client_rig import keeper_info
 from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
@@ -15,7 +16,7 @@ from swarm.liveness import Peer
 from swarm.wire.messages.processes import Stats
 from swarm.wire.topics import FLEET, RUN, STATS
 
-INFO = run_info(GridSpec(40, 50, 10.0))
+INFO = keeper_info(GridSpec(40, 50, 10.0))
 
 
 def answered(observer: OutsideObserver, *runs: str, now_ns: int = 0) -> None:
@@ -31,7 +32,7 @@ def outside(*, follows: bool = False) -> OutsideObserver:
 
 
 def stats(id: str) -> Stats:
-    return Stats(role="agent", id=id, incarnation=1, stamp_ns=2, counts={"captures": 1}, gauges={}, histograms={})
+    return makers.stats(id=id, stamp_ns=2, counts={"captures": 1})
 
 
 def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None:

@@ -6,7 +6,7 @@ import io
 
 import msgspec
 from rich.console import Console
-from support.client_rig import run_info
+from support.client_rig import keeper_info
 from support.swarm_model import SwarmModel
 
 from launch_scripts.commands.status_view import Status, print_status, status_fields, status_of
@@ -15,7 +15,7 @@ from swarm.bus.bus import AskEnded, Replied
 from swarm.grid import GridSpec
 from swarm.wire.topics import RUN
 
-INFO = run_info(GridSpec(4, 5, 90.0))
+INFO = keeper_info(GridSpec(4, 5, 90.0))
 
 
 def told_by(**wire_versions: int) -> Status:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.makers import run_info
 
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.observe.run_observer import frame_of_members
@@ -109,10 +110,7 @@ def test_of_a_search_the_place_to_look_at_is_told_and_where_the_target_was_last(
 
 def test_the_frame_is_that_of_most_processes() -> None:
     def info(id: str, crs: str, rows: int = 60) -> RunInfo:
-        return RunInfo(
-            run_id="r", role="agent", id=id, incarnation=1, scenario="s", terrain="t", rows=rows, cols=80,
-            resolution_m=20.0, started_ns=1, west_m=500_000.0, north_m=5_200_000.0, crs=crs,
-        )  # fmt: skip
+        return run_info(GridSpec(60, 80, 20.0, 500_000.0, 5_200_000.0, crs), id=id, rows=rows)
 
     frame = frame_of_members(
         [info("a", "local"), info("b", "EPSG:32632"), info("c", "EPSG:32632"), info("d", "x", 0)]

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.makers import target_pose
 from support.swarm_model import SwarmModel
 from support.target_reports import RES, flat, fleet
 
@@ -267,10 +268,7 @@ def test_a_pose_with_the_highest_incarnation_that_there_is_leaves_a_standby_its_
     standby.world.lead(False)
     highest = (1 << 62) - 1
     most = (1 << 53) - 1
-    lie = TargetPose(
-        target="t", incarnation=highest, seq=highest, stamp_ns=0, cell=777, x_m=0.0, y_m=0.0, captures=most,
-        jumps=most,
-    )  # fmt: skip
+    lie = target_pose("t", 777, incarnation=highest, seq=highest, captures=most, jumps=most)
     standby.world.hear_pose(lie, standby.now_ns)
     standby.world.lead(True)
     standby.tick(1 + STAY_COOL_DOWN_NS // TICK)

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from support.makers import planner_status, stats
 from support.swarm_model import SwarmModel
-from support.target_reports import fleet, planner_status
+from support.target_reports import fleet
 
 from launch_scripts.launcher.options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
@@ -86,10 +87,7 @@ def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone
     watcher, _ = begun(swarm)
     bus = swarm.bus("monitor")
     for role, port in (("agent", 8080), ("monitor", 0), ("monitor", 9090)):
-        figures = Stats(
-            role=role, id="0", incarnation=7, stamp_ns=1, counts={}, gauges={}, histograms={}, web_port=port
-        )
-        bus.publish(STATS, figures, role=role, id="0")
+        bus.publish(STATS, stats(role, "0", web_port=port), role=role, id="0")
         swarm.run(3)
         watcher.listen(0.0)
         assert watcher.web_port == (port if role == "monitor" else 0)
@@ -104,10 +102,7 @@ PROCESSES = tuple(processes_of(SCENARIO))
 
 
 def figures(spec: ProcessSpec, stamp_ns: int = 1, alarms: tuple[Alarm, ...] = (), **counts: int) -> Stats:
-    return Stats(
-        role=spec.role, id=spec.id, incarnation=7, stamp_ns=stamp_ns, counts=counts, gauges={}, histograms={},
-        alarms=alarms,
-    )  # fmt: skip
+    return stats(spec.role, spec.id, incarnation=7, stamp_ns=stamp_ns, counts=counts, alarms=alarms)
 
 
 class Part:

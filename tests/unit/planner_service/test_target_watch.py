@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from support.makers import target_pose
 
 from planner_service.actions import Tell
 from planner_service.target_watch import TargetWatch
@@ -34,11 +35,8 @@ class Watch:
     def hear(self, tracker: str | None = "radar", row: int = 10, col: int = 20, **changes: Any) -> None:
         self.seq += 1
         cell = GRID.cell(row, col)
-        x_m, y_m = GRID.centre_m(cell)
-        pose = TargetPose(
-            target="t0", tracker=tracker, incarnation=START_NS, seq=self.seq, stamp_ns=self.now_ns, cell=cell,
-            x_m=x_m, y_m=y_m,
-        )  # fmt: skip
+        told = {"tracker": tracker, "incarnation": START_NS, "seq": self.seq, "stamp_ns": self.now_ns}
+        pose = target_pose("t0", cell, GRID, **told)
         self.watch.watch_pose(msgspec.structs.replace(pose, **changes), self.now_ns)
 
     def tick(self, times: int = 1) -> None:

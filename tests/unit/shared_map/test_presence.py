@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from support.agent_world import AgentWorld, pace_of
+from support.makers import fleet_of
 
 from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.fields import pack_column
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet, VehicleState
 
 GRID = GridSpec(600, 600, 10.0)
 LEASE_NS = 2 * NS_PER_S
@@ -21,21 +21,11 @@ def fleet(
     state: VehicleState = VehicleState.FOLLOWING, stamp_ns: int = 5,
 ) -> Fleet:  # fmt: skip
     cells = [int(south // 10) * GRID.cols + int(east // 10) for _, east, south in vehicles]
-    return Fleet(
-        author=author,
-        group=group,
-        region=region,
-        seq=seq,
-        stamp_ns=stamp_ns,
-        ids=[id for id, _, _ in vehicles],
-        target_ids=[],
-        cells=pack_column(cells, "<u4"),
-        east_m=pack_column([east for _, east, _ in vehicles], "<f4"),
-        south_m=pack_column([south for _, _, south in vehicles], "<f4"),
-        heading_rad=pack_column([0.0] * len(vehicles), "<f4"),
-        states=bytes([state] * len(vehicles)),
-        targets=bytes([NO_TARGET] * len(vehicles)),
-    )
+    return fleet_of(
+        [id for id, _, _ in vehicles], cells=cells, east_m=[east for _, east, _ in vehicles],
+        south_m=[south for _, _, south in vehicles], author=author, group=group, region=region, seq=seq,
+        stamp_ns=stamp_ns, state=state,
+    )  # fmt: skip
 
 
 def presence(**options: object) -> Presence:

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.bus_world import answering
-from support.client_rig import Program, run_info
+from support.client_rig import Program, keeper_info
 from support.effort import few
 from support.made_up_swarm import some_fleet
 from support.map_strategies import GRID as MAP_GRID
@@ -370,7 +370,7 @@ def test_marks_of_a_program_whose_clock_is_an_hour_off_count_and_end_as_those_of
 
 
 def test_most_processes_say_which_run_it_is_and_what_time() -> None:
-    ours, other = run_info(GRID), run_info(GRID, "other")
+    ours, other = keeper_info(GRID), keeper_info(GRID, "other")
     router = msgspec.structs.replace(ours, role="router", run_id="", rows=0, cols=0)
 
     def at(info: RunInfo, ahead_s: float) -> tuple[RunInfo, int]:
@@ -595,7 +595,7 @@ def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Sw
         world.heal(program.bus)
         world.run(20.0)
         assert program.swarm.ended is None, "nobody has answered yet"
-    world.bus("other").serve(RUN, answering((run_info(GRID, "run2"), {})), role="keeper", id="0")
+    world.bus("other").serve(RUN, answering((keeper_info(GRID, "run2"), {})), role="keeper", id="0")
     world.heal(program.bus)
     world.run(6.0)
     with pytest.raises(RunMismatchError, match="run run is over, and run run2 is in its namespace: connect again"):

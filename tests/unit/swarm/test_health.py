@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.makers import run_info
 
 from swarm.bus.bus import AskEnded, Event, LinkChanged
 from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
@@ -25,7 +26,6 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
 from swarm.runtime.stats import READY, Counters
-from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import RUN
 
 
@@ -278,11 +278,7 @@ def test_a_process_is_ready_once_its_link_is_up_its_run_is_known_and_its_needs_a
     scheduler = Scheduler(ManualClock(1))
     network = MemoryNetwork(scheduler, PerfectLinks())
     bus = network.bus("agent-a0")
-    info = RunInfo(
-        run_id="r", role="agent", id="a0", incarnation=1, scenario="s", terrain="x",
-        rows=8, cols=8, resolution_m=1.0, started_ns=1,
-    )  # fmt: skip
-    member = Member(info, bus, lambda event: None)
+    member = Member(run_info(), bus, lambda event: None)
     fed: list[bool] = []
     member.needs("food", lambda: bool(fed))
     assert member.lacks() == ["word of its run", "food"]

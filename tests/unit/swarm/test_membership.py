@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from support.makers import run_info
 from support.swarm_model import SwarmModel
 
 from swarm.bus.bus import Event, Heard, LinkChanged
 from swarm.errors import RunMismatchError
+from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.membership import NO_RUN, Member, check_same_run
-from swarm.wire.messages.processes import RunInfo
 from swarm.wire.topics import NOTE, RUN, STATS
 
-INFO = RunInfo(
-    run_id="r1", role="planner", id="t0", incarnation=7, scenario="demo", terrain="aaaa", rows=4, cols=5,
-    resolution_m=90.0, started_ns=0,
-)  # fmt: skip
+INFO = run_info(
+    GridSpec(4, 5, 90.0), run_id="r1", role="planner", id="t0", incarnation=7, scenario="demo", terrain="aaaa"
+)
 
 
 class Node:

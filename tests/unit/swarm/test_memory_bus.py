@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import pytest
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_world import Box, answering, asked, note, pose, run_info
+from support.bus_world import Box, answering, asked, note, pose
+from support.makers import run_info
 from support.query_behaviour import *  # noqa: F403
 from support.swarm_model import START_NS, SwarmModel
 from support.trusted_behaviour import *  # noqa: F403
@@ -61,7 +62,7 @@ def test_messages_overtake_each_other_where_the_link_says_so():
 def test_a_repeated_query_is_answered_twice_and_ends_once():
     world = SwarmModel(Links(1, 3))
     a, b = world.bus("a"), world.bus("b")
-    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
     box = asked(world, a, RUN, Nothing())
     world.settle()
     assert len(box.of(AskEnded)) == 1
@@ -71,7 +72,7 @@ def test_a_repeated_query_is_answered_twice_and_ends_once():
 def test_a_lost_query_times_out():
     world = SwarmModel(Links())
     a, b = world.bus("a"), world.bus("b")
-    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
     assert asked(world, a, RUN, Nothing(), timeout_s=0.5) == [AskEnded("q", RUN, 0, "timeout")]
     assert world.now_ns - START_NS == pytest.approx(500_000_000, rel=1e-2)
 
@@ -83,7 +84,7 @@ def test_replies_keep_their_order_though_the_link_does_not():
     a.ask(RUN, Nothing(), box, tag="q")
     world.settle()
     world.network.links = Links(9)
-    kept[0].answer(run_info("b"))
+    kept[0].answer(run_info(id="b"))
     world.network.links = Links(1)
     kept[0].end()
     world.settle()

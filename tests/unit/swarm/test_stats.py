@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.makers import stats
 
 from swarm.runtime.stats import Counters, Histogram, carried, merged
 from swarm.wire.messages.processes import Stats
@@ -94,10 +95,7 @@ def test_values_added_together_are_counted_as_one_by_one_the_positive_ones_first
 
 def test_a_later_life_counts_on_and_says_since_when_the_first_has_counted() -> None:
     def life(incarnation: int, marks: int) -> Stats:
-        counts = {"marks": marks}
-        return Stats(
-            role="agent", id="a0", incarnation=incarnation, stamp_ns=1, counts=counts, gauges={}, histograms={}
-        )
+        return stats(incarnation=incarnation, counts={"marks": marks})
 
     third = carried(carried(life(10, 2), life(20, 3)), life(30, 4))
     assert (third.incarnation, third.since, third.counts) == (30, 10, {"marks": 9})
