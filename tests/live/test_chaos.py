@@ -1,15 +1,13 @@
-"""`bench chaos`: a real swarm is struck, recovers, and leaves nothing behind, also where chaos itself is ended."""
+"""`bench chaos`: a real swarm is struck, recovers, and leaves nothing behind."""
 
 from __future__ import annotations
 
 import json
-import signal
 from pathlib import Path
 
 import pytest
-from support.benchmarks import begin, command
+from support.benchmarks import command
 from support.live_swarm import folders_of_runs, write_scenario
-from support.processes import eventually
 
 from launch_scripts.launcher.takeover import processes
 
@@ -37,20 +35,6 @@ def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(
     whole = json.loads((run_dir / "chaos.json").read_text())
     assert whole["samples"][0]["rss_mb"] > 100
     assert running(runs) == {}
-
-
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.thorough), signal.SIGKILL])
-def test_chaos_that_ends_takes_its_swarm_with_it(tmp_path: Path, number: signal.Signals) -> None:
-    runs = tmp_path / "runs"
-    with (tmp_path / "said").open("w") as said:
-        chaos = begin("chaos", write_scenario(tmp_path), "--seconds", 200, "--runs", runs, said=said)
-    try:
-        eventually(lambda: runs.exists() and len(running(runs)) >= 6, 90, "the start of the swarm")
-        chaos.send_signal(number)
-        assert chaos.wait(90) != 0
-        eventually(lambda: running(runs) == {}, 60, "the end of all processes")
-    finally:
-        chaos.kill()
 
 
 def test_an_unknown_blow_or_scenario_is_named(tmp_path: Path) -> None:

@@ -254,20 +254,6 @@ def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
     assert late.replica.held.fingerprint() == author.replica.held.fingerprint()
 
 
-def test_two_keepers_agree_though_each_missed_what_the_other_heard() -> None:
-    swarm = SwarmModel()
-    first = swarm.keeper("k1", KeeperStore(":memory:"))
-    author = swarm.writer("a1.1")
-    author.sync.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
-    swarm.run(1)
-    swarm.kill("a1.1")
-    second = swarm.keeper("k2", KeeperStore(":memory:"))
-    swarm.run(3)
-    assert (
-        first.replica.held.fingerprint() == second.replica.held.fingerprint() == author.replica.held.fingerprint()
-    )
-
-
 def test_an_author_that_lives_is_never_taken_for_dead() -> None:
     swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
     store = KeeperStore(":memory:")
@@ -306,10 +292,3 @@ def test_what_a_dead_author_learned_stays_as_it_was_said_while_its_marks_are_com
         assert word is not None
         assert measurements_in(word) == said
     assert [measurements_in(each) for each in store.load() if each.tile == beyond] == [said]
-
-
-def test_a_keeper_refuses_the_store_of_another_terrain() -> None:
-    store = KeeperStore(":memory:")
-    store.bind("another", GRID)
-    with pytest.raises(StoreError, match="another"):
-        SwarmModel(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)

@@ -68,24 +68,6 @@ def test_words_are_read_as_they_were_written(said: dict[int, Measurement]) -> No
     assert measurements_in(word) == said
 
 
-@FEW
-@given(st.data(), st.lists(st.lists(WORDS, min_size=1, max_size=3), min_size=1, max_size=6))
-def test_replicas_have_equal_maps_in_whatever_order_words_come(
-    data: st.DataObject, by_author: list[list[dict[int, Measurement]]]
-) -> None:
-    sets = [each for n, said in enumerate(by_author) for each in sets_of(f"all.a{n}.1", *said)]
-    maps = []
-    for _ in range(2):
-        order = data.draw(st.permutations(sets + sets[:2]))  # some of them twice
-        cut = data.draw(st.integers(0, len(order)))
-        replica, cost_map = replica_of(None, GROUND)
-        replica.merge(order[:cut])
-        replica.merge(order[cut:])
-        let_settle(replica)
-        maps.append((replica.held.fingerprint(), cost_map.factors.tobytes(), cost_map.pace_s_per_m.tobytes()))
-    assert maps[0] == maps[1]
-
-
 @given(st.lists(SAID, min_size=4, max_size=8), SAID)
 def test_one_liar_among_five_moves_a_factor_no_further_than_some_honest_author(
     honest: list[Measurement], lie: Measurement
@@ -154,21 +136,6 @@ def test_what_is_learned_changes_the_prior_but_neither_marks_nor_lethal_cells() 
     replica.write_learned({}, 4)
     let_settle(replica)
     assert (cost_map.pace_s_per_m == GROUND.pace_s_per_m).all()
-
-
-def test_marks_then_learned_equals_learned_then_marks() -> None:
-    rng = np.random.default_rng(3)
-    cells, kinds = rng.integers(0, GROUND.grid.cells, 300), rng.integers(0, 3, 300)
-    marks_of = MapReplica(GROUND.grid, author="all.b.1")
-    marks = marks_of.write(cells, kinds, 0.7, 1)
-    words = sets_of("all.a.1", {0: THRICE})
-    one, first = replica_of(None, GROUND)
-    one.merge([*marks, *words])
-    two, second = replica_of(None, GROUND)
-    two.merge(words)
-    for each in marks:
-        two.merge([each])
-    assert (first.pace_s_per_m == second.pace_s_per_m).all()
 
 
 def test_what_is_no_word_changes_nothing() -> None:
