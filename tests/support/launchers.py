@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from support.live_swarm import client, write_scenario
+from support.live_swarm import SWARM, client, write_scenario
 from support.neighbour import ROOT, environment_of
 from support.processes import eventually
 
@@ -28,7 +27,6 @@ from swarm.wire.topics import FLEET
 VEHICLES = 12
 ROUTED = (VehicleState.FOLLOWING, VehicleState.ARRIVED)
 STANDBYS = "\n[standbys]\nplanner = 1\ntargets = 1\n"
-COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class Machine:
             options += ["--connect", self._endpoint]
         if self._part.rank is not None:
             options += ["--rank", str(self._part.rank)]
-        command = [*COMMAND, "up", str(self._scenario), *options, "--runs", str(self.folder / "runs"), "--plain"]
+        command = [*SWARM, "up", str(self._scenario), *options, "--runs", str(self.folder / "runs"), "--plain"]
         with (self.folder / "output.txt").open("ab") as output:
             self.started.append(
                 subprocess.Popen(

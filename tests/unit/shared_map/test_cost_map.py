@@ -82,16 +82,6 @@ def test_any_sequence_of_marks_gives_the_composite_made_from_scratch(
     np.testing.assert_array_equal(cost_map.pace_s_per_m, from_scratch(prior, known))
 
 
-def test_a_cleared_mark_gives_back_the_prior_and_its_inflation() -> None:
-    prior = terrain(16.0)
-    cost_map = CostMap(prior)
-    cost_map.apply(*marks((20 * COLS + 35, MarkKind.LETHAL, 0.0)))
-    assert np.isinf(cost_map.pace_s_per_m).sum() > np.isinf(prior.pace_s_per_m).sum()
-    cost_map.apply(*marks((20 * COLS + 35, MarkKind.CLEAR, 0.0)))
-    np.testing.assert_array_equal(cost_map.pace_s_per_m, prior.pace_s_per_m)
-    assert cost_map.version == 2
-
-
 def test_what_changes_nothing_leaves_version_and_windows_alone() -> None:
     cost_map = CostMap(terrain())
     cost_map.apply(*marks((5, MarkKind.CLEAR, 0.0)))

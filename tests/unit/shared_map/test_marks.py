@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import GRID, mark_sets, naive_winners, set_of
+from support.map_strategies import GRID, mark_sets, set_of
 
 from shared_map.replication import merge as merge_module
 from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, supersedes, zone_author
@@ -24,30 +24,6 @@ def test_the_set_with_the_higher_epoch_and_then_seq_stays() -> None:
     assert supersedes(set_of("a", 0, 10, {}, epoch=1), old)
     assert not supersedes(set_of("a", 0, 8, {}, epoch=1), old)
     assert not supersedes(old, old)
-
-
-def test_of_two_statements_about_a_cell_the_newer_wins_and_on_a_tie_the_larger_author() -> None:
-    a = set_of("a", 0, 0, {5: (LETHAL, 0, 10), 6: (LETHAL, 0, 10)})
-    b = set_of("b", 0, 0, {5: (PACE, 2.0, 9), 6: (PACE, 2.0, 10)})
-    won = dense(winners([a, b], 0))
-    assert won.kinds[5] == LETHAL
-    assert (won.kinds[6], won.paces[6]) == (PACE, 2.0)
-    assert won.kinds[7] == CLEAR
-    assert won.stamps_ns[7] == NO_STATEMENT
-
-
-@given(st.lists(mark_sets(), max_size=12))
-def test_resolving_agrees_with_the_two_rules_taken_one_statement_at_a_time(sets: list[MarkSet]) -> None:
-    newest: dict[tuple[int, str], MarkSet] = {}
-    for each in sets:
-        held = newest.get((each.tile, each.author))
-        if held is None or supersedes(each, held):
-            newest[each.tile, each.author] = each
-    for tile in range(GRID.tiles):
-        won = dense(winners([newest[at] for at in sorted(newest) if at[0] == tile], 0))
-        said = np.flatnonzero(won.stamps_ns != NO_STATEMENT)
-        found = {(tile, int(c)): (int(won.kinds[c]), float(won.paces[c])) for c in said}
-        assert found == {at: what for at, what in naive_winners(sets).items() if at[0] == tile}
 
 
 @given(st.integers(0, GRID.cells - 1))
