@@ -94,7 +94,11 @@ def test_vehicles_are_pushed_routes_by_a_standby_as_soon_as_it_leads() -> None:
     assert followers > 0
     simulation.run_until(8.9)
     assert standby.counters.counts["pushes"] >= followers // 2
-    assert all(each.route is not None for each in standby._planner.followers.all() if not each.stale)
+    assert all(
+        each.route is not None
+        for each in (each for _, each in standby._planner.followers.all_items())
+        if not each.stale
+    )
 
 
 def test_both_sides_of_a_cut_are_planned_for_and_one_planner_leads_when_it_heals() -> None:

@@ -167,7 +167,7 @@ def test_that_there_is_no_way_is_told_once() -> None:
     followers = Followers("t", GRID, 10, 0)
     none = Route(status=RouteStatus.UNREACHABLE, start=7, cost_s=math.inf, lower_bound_s=math.inf)
     followers.given("v", none, 0, 0, 0)
-    (follower,) = followers.all()
+    ((_, follower),) = followers.all_items()
     assert not followers.is_news(follower, RouteOutline(RouteStatus.UNREACHABLE, 7, b"", 0.0))
     assert followers.is_news(follower, RouteOutline(RouteStatus.OK, 7, b"\x02", 0.0))
 
