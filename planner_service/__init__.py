@@ -7,9 +7,9 @@ proven lower bound of what any route costs. How it keeps to that, step by step:
 2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
 3. *Repair.* Costs that have risen detach what hung on them, costs that have fallen spread (`kernels.repair`).
 4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
-   costs are made exact by the parents (`kernels.mend`, or `kernels.partition*` on large maps). Where that takes too
-   long for the thread that answers, a worker grows the whole tree. `target_tree.Decision` is what was decided, by
-   the row of the strategy (`strategy`) and by what growths have taken (`growth_times`).
+   costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.partition*` on large maps). Where
+   that takes too long for the thread that answers, a worker grows the whole tree. `target_tree.Decision` is what
+   was decided, by the row of the strategy (`strategy`) and by what growths have taken (`growth_times`).
 5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered
    with the map, and the last window adds its rim (`tree.certificates`, docs/certificates.md).
 6. *Push.* Followers whose route passes a change, or begins in what was grown, are pushed another one if it is news.

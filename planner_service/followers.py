@@ -19,7 +19,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window, step_offsets, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.routes import LETHAL_START, UNREACHABLE, Route, RouteBatch, RouteOutline, RouteStatus
+from swarm.wire.route_columns import LETHAL_START, UNREACHABLE, Route, RouteBatch, RouteOutline, RouteStatus
 
 _NOWHERE_BOUNDS = (0, 0, 0, 0)
 

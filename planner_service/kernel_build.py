@@ -25,13 +25,13 @@ from typing import Any
 
 from planner_service.kernels import (
     cell_costs,
+    costs_from_parents,
     lower_bounds,
-    mend,
     parents,
     partition,
     partition_search,
     partition_totals,
-    pull,
+    pull_routes,
     queue_dial,
     queue_directed,
     queue_heap,
@@ -42,8 +42,8 @@ from planner_service.kernels import (
     stride_network,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
-from swarm.config.classes import aloft_classes
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import aloft_classes
 
 Kernel = Any
 """What `kernels.compile.kernel` makes; numba has no types."""
@@ -65,7 +65,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
 takes longest comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
-    mend.mend,
+    costs_from_parents.mend,
     repair.repair,
     stride_growth.grow_strides,
     cell_costs.cut_window,
@@ -88,7 +88,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
-PULL = pull.pull_routes
+PULL = pull_routes.pull_routes
 """Only for planners that pull their routes."""
 
 _POLL_S = 0.1

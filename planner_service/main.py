@@ -11,13 +11,13 @@ from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader, needed_kernels
 from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
-from shared_map.class_grounds import load_classes
 from shared_map.terrain.store import kept_key, load_terrain
+from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.recording.boundary import Boundary
 from swarm.recording.role_process import run_role
+from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.job_slots import JobSlots
 from swarm.runtime.process import ThreadWorker, tick_phase

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from planner_service.actions import Action, FindStrides, GrownTree, GrowTree, Refusal
 from planner_service.followers import LONGEST_WAIT_NS, Follower, Followers, MapIntake
-from planner_service.gaps import GapStatistics
+from planner_service.gap_statistics import GapStatistics
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
+from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal
 from planner_service.pulled_routes import Puller, pulls
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import Searcher
@@ -21,8 +21,8 @@ from planner_service.target_watch import TargetWatch
 from planner_service.tree.strides import StrideSearch, StrideShelf
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
-from swarm.config.classes import GROUND
 from swarm.config.scenario import PlannerConfig
+from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
@@ -36,7 +36,7 @@ from swarm.wire.messages.planning import (
     TargetPose,
 )
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from planner_service.tree import strides
 from planner_service.tree.cost_grid import CostGrid
-from shared_map import arrays
-from shared_map.arrays import Bytes, Floats, open_array, private_copy, save_array, source_digest
+from shared_map import array_files as arrays
+from shared_map.array_files import Bytes, Floats, open_array, private_copy, save_array, source_digest
 from shared_map.terrain.store import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig

@@ -14,7 +14,7 @@ from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
-from swarm.wire.routes import Route, RouteStatus, directions_of
+from swarm.wire.route_columns import Route, RouteStatus, directions_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,28 +9,28 @@ from functools import partial
 
 import msgspec
 
-from planner_service.actions import Action, FindStrides, GrownTree, GrowTree, Refusal, Tell
-from planner_service.class_planners import ClassPlanners
 from planner_service.planner import Answer, Planner
+from planner_service.planner_actions import Action, FindStrides, GrownTree, GrowTree, Refusal, Tell
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.search.target_search import TargetSearch, hidden_target
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.strides import StrideSearch
-from shared_map.class_grounds import class_terrains
-from shared_map.class_maps import ClassMaps
+from planner_service.vehicle_class_planners import ClassPlanners
 from shared_map.cost_map import CostMap
-from shared_map.learning.factors import LearnedGauges
-from shared_map.presence import Presence
-from shared_map.replication.filter import MarkFilter, readable_for_target
+from shared_map.learning.learned_factors import LearnedGauges
+from shared_map.replication.mark_filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import class_terrains
+from shared_map.vehicle_class_maps import ClassMaps
+from shared_map.vehicle_presence import Presence
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.config.classes import GROUND, class_numbers
+from swarm.config.vehicle_classes import GROUND, class_numbers
 from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
 from swarm.runtime.election import Candidacy

@@ -2,7 +2,7 @@
 
 A row says what is grown when the target moves, how wide, when the whole tree is due, and whether far cells are
 thinned out. `TargetTree` and `Planner` ask the row that is in force and compare no names: a new strategy is a row
-here, and its name in `swarm.config.values.Strategy`, or a plug-in. Sections are those of Wan et al.
+here, and its name in `swarm.config.setting_types.Strategy`, or a plug-in. Sections are those of Wan et al.
 """
 
 from __future__ import annotations

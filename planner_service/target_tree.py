@@ -15,20 +15,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.actions import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.growth_times import GrowthTimes, WindowLimit, exact_half
+from planner_service.planner_actions import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
-from planner_service.tree.changes import Changes
+from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, empty_tree, in_cells, in_pieces
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import StrideNetwork, StrideSearch, StrideShelf, StrideUpkeep
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.wire.routes import NO_TARGET, RouteBatch
+from swarm.wire.route_columns import NO_TARGET, RouteBatch
 
 _NO_WINDOW = Window(0, 0, 0, 0)
 Kind = Literal["none", "full", "exact", "window", "repair", "coarse", "forced"]

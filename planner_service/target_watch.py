@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from planner_service.actions import Tell
+from planner_service.planner_actions import Tell
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters

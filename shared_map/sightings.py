@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from shared_map.replication.filter import MarkFilter
+from shared_map.replication.mark_filter import MarkFilter
 from swarm.clock import NS_PER_S
 from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.fields import LONGEST_LEASE_S

@@ -18,7 +18,7 @@ from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply, TargetPose
 from swarm.wire.messages.vehicles import SharedCosts
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.route_columns import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import Assigner, Spread
 from vehicle_agent.bodies import Bodies

@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
-from shared_map.class_grounds import ClassGround
-from shared_map.class_maps import ClassMaps, for_class, read_marks
+from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap, merged
 from shared_map.learning.measurements import Measured, Measurement
 from shared_map.replication.marks import NO_STATEMENTS, Statements, dense, is_zone, standing
@@ -23,6 +21,8 @@ from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
 from shared_map.terrain.step_climb import Climb
+from shared_map.vehicle_class_grounds import ClassGround
+from shared_map.vehicle_class_maps import ClassMaps, for_class, read_marks
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import MarkKind

@@ -8,17 +8,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.class_grounds import class_grounds
-from shared_map.replication.filter import MarkFilter, author_of, readable_groups
-from shared_map.replication.interest import Interest
+from shared_map.replication.mark_filter import MarkFilter, author_of, readable_groups
+from shared_map.replication.regions_of_interest import Interest
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Bus, Post
 from swarm.config.agents import AgentPlan, plan_agents
-from swarm.config.classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.config.plugin_names import assignment_key
+from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.errors import ConfigError
 from swarm.grid import REGION_CELLS
 from swarm.plugins.find import named_plugin

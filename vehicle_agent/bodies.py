@@ -24,7 +24,7 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body
-from vehicle_agent.discs import Capsule
+from vehicle_agent.cells_of_discs import Capsule
 
 REACTION_S = 0.5
 """Reports come ten times a second, take up to two ticks, and one or two of them may be lost."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable
 
-from shared_map.class_grounds import load_classes
 from shared_map.terrain.store import load_terrain, load_truth
+from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
-from swarm.recording.boundary import Boundary
 from swarm.recording.role_process import run_role
+from swarm.recording.service_boundary import Boundary
 from swarm.runtime.health import LIFE_BEFORE
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import tick_phase

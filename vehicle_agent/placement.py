@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import CellsOf, private_copy
-from shared_map.class_grounds import ClassGround
+from shared_map.array_files import CellsOf, private_copy
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.vehicle_class_grounds import ClassGround
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent, plan_agents
 from swarm.config.scenario import GroupConfig, Scenario

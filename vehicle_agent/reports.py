@@ -12,7 +12,7 @@ from operator import contains
 import numpy as np
 
 from swarm.clock import NS_PER_S
-from swarm.config.classes import GROUND
+from swarm.config.vehicle_classes import GROUND
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import NO_TARGET, Chasers, Fleet
 from vehicle_agent.driving.driven_vehicle import Places

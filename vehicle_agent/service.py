@@ -34,7 +34,7 @@ from swarm.wire.messages.planning import (
     TargetPose,
 )
 from swarm.wire.messages.vehicles import Body, Followed, Removed, RemoveVehicles, SharedCosts, VehicleState
-from swarm.wire.routes import directions_of
+from swarm.wire.route_columns import directions_of
 from swarm.wire.topics import (
     BODY,
     CHASERS,

@@ -17,10 +17,10 @@ from docs.generate.method_pictures import LABEL, draw_ground, draw_named, draw_r
 from docs.generate.printed import Pace, Place
 from launch_scripts.observe.palette import BLUE, INK, ORANGE, hillshade
 from planner_service.route_finder import RouteFinder
-from shared_map.class_grounds import class_terrains
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.classes import WindConfig
+from shared_map.vehicle_class_grounds import class_terrains
 from swarm.config.load import load_scenario
+from swarm.config.vehicle_classes import WindConfig
 
 _SCENARIOS = Path(__file__).parents[2] / "launch_scripts" / "scenarios"
 

@@ -22,7 +22,7 @@ from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 from swarm.wire.versions import read_schemas, written_schema
 

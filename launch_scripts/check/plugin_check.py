@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from launch_scripts.simulation.world.walks import Budget, TrueTerrain, WalkWorld, walk_of
 from planner_service.strategy import Growths, StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.cost_layers import checked_layer, cost_world
 from swarm.config.explain import choice
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
@@ -24,7 +24,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.errors import ConfigError, SwarmError
 from swarm.grid import GridSpec, walk
 from swarm.plugins.find import Plugin, find_plugin
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.assignment import AssignmentWorld, CostTable, assigner_of
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.motion import Motion

@@ -11,18 +11,18 @@ import numpy as np
 
 from launch_scripts.check.findings import Finding, failure, warning
 from launch_scripts.process_table import ROLES, certificate_names
-from shared_map.arrays import Bools, Floats
-from shared_map.class_grounds import ClassGround, class_grounds
+from shared_map.array_files import Bools, Floats
 from shared_map.importers.sources import FILE_KINDS, is_terrain
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
-from swarm.config.classes import GROUND, flies
 from swarm.config.load import BUILT_IN_TERRAINS, is_loopback, with_files
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
+from swarm.config.vehicle_classes import GROUND, flies
 from swarm.errors import ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.places import cell_of

@@ -25,8 +25,7 @@ from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import keepers_before, write_kits
 from launch_scripts.deploy.machine_plan import Plan, ids_of, make_plan
 from launch_scripts.deploy.machine_plan import as_json as plan_fields
-from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
-from launch_scripts.deploy.size import (
+from launch_scripts.deploy.machines_needed import (
     CELLS_PER_VEHICLE,
     Estimate,
     Machine,
@@ -36,14 +35,15 @@ from launch_scripts.deploy.size import (
     reaches,
     too_much,
 )
+from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
 from launch_scripts.launcher.options import common_run_id, find_scenario, own_certificate, with_network
-from launch_scripts.launcher.tables import columns
+from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from swarm.bus.access_control import ROUTER, bearer, common_name
 from swarm.config.input_files import quoted
 from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario
-from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
+from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
 from swarm.errors import ConfigError, writing
 
 app = family_app("A plan, certificates and configurations for several machines.")

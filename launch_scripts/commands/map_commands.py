@@ -15,13 +15,13 @@ from rich.console import Console
 from launch_scripts.command_line.declaring import command, family_app
 from launch_scripts.commands.running_swarm import Where
 from launch_scripts.commands.shared_options import AsJson
-from launch_scripts.launcher.tables import columns
+from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.report.exporter import FORMATS, check_target, write_layers, write_raster
 from launch_scripts.report.run_layers import mark_layer
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.learning.factors import learned_kinds
+from shared_map.learning.learned_factors import learned_kinds
 from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame

@@ -164,7 +164,7 @@ def run_role(
     import msgspec
 
     from launch_scripts.launcher import options
-    from launch_scripts.launcher.child import load_entry
+    from launch_scripts.launcher.child_process import load_entry
     from launch_scripts.launcher.console import progress
     from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.log_file import Speaker, log_to

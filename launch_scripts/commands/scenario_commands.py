@@ -27,7 +27,7 @@ from swarm.errors import BusError, ConfigError, SwarmError, writing
 
 if TYPE_CHECKING:
     from launch_scripts.check.findings import Finding
-    from launch_scripts.check.machine import Machine, Needs
+    from launch_scripts.check.machine_check import Machine, Needs
     from shared_map.terrain.terrain import Terrain
     from swarm.config.scenario import Scenario
 
@@ -158,7 +158,7 @@ def _text(path: Path, choices: Choices) -> str:
 
 def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
     """What is written: enough to see what a scenario is, and no more."""
-    from swarm.config.values import MOST_PER_AGENT
+    from swarm.config.setting_types import MOST_PER_AGENT
 
     terrain: dict[str, Any] = {"source": _from(path, chosen.terrain)}
     if chosen.photo:
@@ -253,7 +253,8 @@ def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator
 
 
 def _of_ground(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    from launch_scripts.check import machine, scenario_check
+    from launch_scripts.check import machine_check as machine
+    from launch_scripts.check import scenario_check
     from launch_scripts.check.findings import failure
     from launch_scripts.launcher.console import progress
     from shared_map.terrain.terrain import build_terrain, build_truth
@@ -335,7 +336,7 @@ def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
     swarm doctor --json | jq .findings
     """
     from launch_scripts.check.findings import as_fields
-    from launch_scripts.check.machine import examine
+    from launch_scripts.check.machine_check import examine
 
     found = list(examine(runs))
     if as_json:

@@ -26,7 +26,7 @@ Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
 TargetId = Annotated[str | None, typer.Option(autocompletion=complete.target_ids)]
 GroupName = Annotated[str, typer.Option(autocompletion=complete.group_names)]
 VehicleClass = Annotated[str, typer.Option("--class")]
-Walk = Annotated[str | None, typer.Option(autocompletion=complete.words("swarm.config.values", "Walk"))]
+Walk = Annotated[str | None, typer.Option(autocompletion=complete.words("swarm.config.setting_types", "Walk"))]
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
@@ -50,7 +50,7 @@ PresetOption = Annotated[
     str | None,
     typer.Option(
         help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
-        autocompletion=complete.words("swarm.config.values", "Preset"),
+        autocompletion=complete.words("swarm.config.setting_types", "Preset"),
     ),
 ]
 SignalsAddress = Annotated[

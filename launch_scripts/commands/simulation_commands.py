@@ -21,7 +21,7 @@ from swarm.errors import ConfigError, StoreError, writing
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from launch_scripts.simulation.campaign import Verdict
+    from launch_scripts.simulation.many_seeds import Verdict
     from launch_scripts.simulation.study.summary import Summary
     from launch_scripts.simulation.study.sweep import Sweep
     from launch_scripts.simulation.study.trials import Result, Trial
@@ -129,7 +129,7 @@ def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: in
     import msgspec
 
     from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.simulation.campaign import MIX, SECONDS, parse_seeds, run_seeds
+    from launch_scripts.simulation.many_seeds import MIX, SECONDS, parse_seeds, run_seeds
     from launch_scripts.simulation.worlds import WORLDS
 
     some = parse_seeds(seeds)

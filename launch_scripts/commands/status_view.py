@@ -19,13 +19,13 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.console import make_output_outlive_readers
-from launch_scripts.launcher.tables import columns, fitted, loads_table, targets_table
-from launch_scripts.observe import facts
-from launch_scripts.observe.counts import gaps_to
-from launch_scripts.observe.latest_state import LatestState
+from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table
+from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.process_load import ProcessLoad, by_role
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
-from launch_scripts.observe.state import RunState, state_of
+from launch_scripts.observe.run_state import RunState, state_of
+from launch_scripts.observe.summed_counts import gaps_to
 from launch_scripts.plain_text import plain
 from launch_scripts.process_table import ROLES
 from launch_scripts.stop_requests import stop_requests

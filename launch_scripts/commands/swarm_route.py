@@ -16,7 +16,7 @@ import typer
 from launch_scripts.commands.terrain_routes import DescribedRoute, metres_along, write_route
 from launch_scripts.observe.run_observer import frame_of_run
 from shared_map.terrain.map_frame import MapFrame
-from swarm.config.classes import GROUND
+from swarm.config.vehicle_classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
@@ -24,7 +24,7 @@ from swarm.runtime.operator import replies_to
 from swarm.wire.codec import COMPASS, encode_json
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.route_columns import Route, RouteStatus
 from swarm.wire.topics import COST, ROUTE
 
 if TYPE_CHECKING:

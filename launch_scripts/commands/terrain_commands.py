@@ -32,7 +32,7 @@ from shared_map.terrain.slope_rules import (
 from swarm.config.cost_rules import PRESETS, cost_of_preset
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
-from swarm.config.values import ElevationEncoding
+from swarm.config.setting_types import ElevationEncoding
 from swarm.config.write import toml_value
 from swarm.errors import writing
 from swarm.grid import GridSpec
@@ -169,8 +169,8 @@ def cost(
     out            Write seconds per metre as GeoTIFF; lethal is -1.
     vehicle_class  For which of the scenario's classes of vehicles.
     """
-    from shared_map.class_grounds import class_terrains
     from shared_map.terrain.terrain import build_terrain
+    from shared_map.vehicle_class_grounds import class_terrains
 
     check_target(out, "--out", *_TIFF)
     check_target(picture, "--picture", ".png")

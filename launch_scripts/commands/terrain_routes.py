@@ -18,7 +18,7 @@ from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.palette import said_length
 from launch_scripts.report.exporter import COSTS, Feature, FieldKind, Layer, areas_of, write_layers, write_raster
 from planner_service.route_finder import RouteFinder
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -26,7 +26,7 @@ from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 from swarm.places import cell_of, fields_of, read_place, written
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 
 @dataclass(frozen=True, eq=False)

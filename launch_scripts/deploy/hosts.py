@@ -15,7 +15,7 @@ from msgspec import Meta
 from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import check_endpoint, is_loopback
-from swarm.config.values import Section
+from swarm.config.setting_types import Section
 from swarm.errors import ConfigError
 from swarm.liveness import HIGHEST_RANK
 

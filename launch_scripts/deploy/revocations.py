@@ -8,7 +8,7 @@ import msgspec
 
 from launch_scripts.observe.run_folder import write_file
 from swarm.config.scenario import NetworkConfig
-from swarm.config.values import CommonName
+from swarm.config.setting_types import CommonName
 from swarm.errors import ConfigError, StoreError
 
 FILE = "revoked"

@@ -14,5 +14,5 @@ What a launcher promises:
 - What operators order while the swarm runs is followed by planners that come and go (`ordered_planners`).
 - An upgrade takes a running part over (`takeover`): successors get ready beside it before it is asked to end.
 
-`up` is the order of all that, from the terrain (`fetched_terrain`) to the report; `console` and `tables` show it.
-"""
+`up` is the order of all that, from the terrain (`fetched_terrain`) to the report; `console` and `terminal_tables`
+show it. """

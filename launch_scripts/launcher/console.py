@@ -131,7 +131,7 @@ class Terminal:
         """Prints the numbers of a finished run, for people: programs find them in its report."""
         if self._lines is not None:
             return
-        from launch_scripts.observe.counts import gap_text  # not before there is a report
+        from launch_scripts.observe.summed_counts import gap_text  # not before there is a report
 
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():

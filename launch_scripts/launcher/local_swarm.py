@@ -17,7 +17,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.child import EndedAsAsked, ExitReason, Reports, run_child
+from launch_scripts.launcher.child_process import EndedAsAsked, ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec

@@ -18,7 +18,7 @@ from launch_scripts.launcher.forkserver import LOADS, ROLES_AND_KERNELS
 from launch_scripts.parent_death import end_with_parent
 
 MODULES = (
-    "launch_scripts.launcher.child",
+    "launch_scripts.launcher.child_process",
     "launch_scripts.launcher.router",
     "shared_map.keeper.main",
     "vehicle_agent.main",

@@ -17,7 +17,7 @@ from swarm.errors import BusError
 from swarm.runtime.health import Health, supervisor_of
 
 if TYPE_CHECKING:
-    from launch_scripts.observe.latest_state import LatestState
+    from launch_scripts.observe.latest_messages import LatestState
     from launch_scripts.web.prometheus import MetricsEndpoint
 
 T = TypeVar("T")

@@ -28,22 +28,22 @@ from launch_scripts.launcher.options import (
 )
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.signals import MachineSignals, StopAsked
-from launch_scripts.launcher.tables import live_table, plain_line
 from launch_scripts.launcher.takeover import TakeOver
+from launch_scripts.launcher.terminal_tables import live_table, plain_line
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
-from launch_scripts.observe import facts
-from launch_scripts.observe.latest_state import plan_of_members
+from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe.latest_messages import plan_of_members
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
-from shared_map.arrays import Floats
-from shared_map.class_grounds import prepare_classes
+from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
+from shared_map.vehicle_class_grounds import prepare_classes
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus

@@ -9,9 +9,9 @@ from typing import Any
 from rich.console import Console, Group
 from rich.text import Text
 
-from launch_scripts.launcher.tables import SHOWN_ALARMS, loads_table
-from launch_scripts.observe.facts import lines_of
-from launch_scripts.observe.latest_state import LatestState, RunPlan
+from launch_scripts.launcher.terminal_tables import SHOWN_ALARMS, loads_table
+from launch_scripts.observe.fact_table import lines_of
+from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.observe.process_load import ProcessLoad, by_role
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_alarms import Alarm, alarms_of

@@ -5,6 +5,7 @@
 - `ground` lies still: the terrain, its layers with their legends, zones.
 - `movers` moves: vehicles, targets, bodies, their routes and trails, beliefs, alarms.
 - `live_layout` has the layers, their legends, and what stands beside: plots, a summary, a log.
-- `sinks` has the pen which logs what differs from what was logged last, and where that goes: a file `run.rrd`, a
+- `view_outputs` has the pen which logs what differs from what was logged last, and where that goes: a file
+`run.rrd`, a
   port for native viewers, a page. If the file ends for want of space, another is begun once there is some.
 """

@@ -21,11 +21,12 @@ from rerun.blueprint.encodings import TextLogColumn
 from launch_scripts.monitor.ground import ground_colours as colours
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Look, level_for
-from launch_scripts.monitor.sinks import Colour, Pen, in_markdown, screen, shown
-from launch_scripts.observe import facts, palette
+from launch_scripts.monitor.view_outputs import Colour, Pen, in_markdown, screen, shown
+from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe import palette
 from launch_scripts.observe.history import Sample
 from launch_scripts.observe.run_alarms import KINDS
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.run_state import RunState
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.vehicles import VehicleState

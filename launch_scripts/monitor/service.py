@@ -21,21 +21,21 @@ from launch_scripts.monitor.live_layout import (
     summary_markdown,
 )
 from launch_scripts.monitor.movers.movers_view import MoversView
-from launch_scripts.monitor.sinks import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.view_outputs import Pen, RateLimit, RecordingWatch, Sinks, new_recording_path
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.web.server import Audience
-from shared_map.arrays import give_back_memory
-from shared_map.class_grounds import class_terrains, load_classes
+from shared_map.array_files import give_back_memory
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import class_terrains, load_classes
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.classes import aloft_classes
 from swarm.config.ground import HiddenConfig
+from swarm.config.vehicle_classes import aloft_classes
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup

@@ -3,20 +3,20 @@
     bus -> RunObserver -> LatestState -> RunState -> text of a fact
                        -> Recorder    -> report
 
-| module          | holds                                                                                     |
-|-----------------|-------------------------------------------------------------------------------------------|
-| run_observer.py | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands    |
-| latest_state.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be          |
-| counts.py       | `Counts`: what all processes counted, summed; the certified gap is made of it             |
-| state.py        | `RunState`: the run at an instant; `state_of` makes one                                   |
-| facts.py        | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                 |
-| run_alarms.py   | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over              |
-| process_load.py | what each process takes up, and how well it keeps time                                    |
-| recorder.py     | `Recorder`: figures, tracks, routes, captures, notes; it makes the numbers of the report  |
-| history.py      | what a recorder keeps over time, in bounded memory                                        |
-| results.py      | results per target, group and vehicle                                                     |
-| run_folder.py   | the folder of a run, and how files are written whole                                      |
-| palette.py      | how pictures and the live view look                                                       |
+| module             | holds                                                                                    |
+|--------------------|------------------------------------------------------------------------------------------|
+| run_observer.py    | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands   |
+| latest_messages.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be         |
+| summed_counts.py   | `Counts`: what all processes counted, summed; the certified gap is made of it            |
+| run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
+| fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                |
+| run_alarms.py      | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
+| process_load.py    | what each process takes up, and how well it keeps time                                   |
+| recorder.py        | `Recorder`: figures, tracks, routes, captures, notes; it makes the numbers of the report |
+| history.py         | what a recorder keeps over time, in bounded memory                                       |
+| run_results.py     | results per target, group and vehicle                                                    |
+| run_folder.py      | the folder of a run, and how files are written whole                                     |
+| palette.py         | how pictures and the live view look                                                      |
 
 A new fact is one row in `FACTS`, and appears everywhere. Facts are counted by whoever does what is counted, and a
 process that is started again goes on counting where it ended (`swarm.runtime.stats.carried`). So all who watch

@@ -14,7 +14,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.counts import of_excess
+from launch_scripts.observe.summed_counts import of_excess
 from swarm.runtime.stats import Histogram
 from swarm.wire.messages.vehicles import Followed
 

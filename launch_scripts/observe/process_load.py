@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from launch_scripts.observe.counts import sum_of
+from launch_scripts.observe.summed_counts import sum_of
 from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CPU_S, MESSAGES_PER_S, RESTARTS, RSS_BYTES
 from swarm.wire.messages.processes import Stats

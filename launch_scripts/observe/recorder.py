@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from launch_scripts.observe import history
-from launch_scripts.observe.counts import of_excess
-from launch_scripts.observe.facts import for_report
+from launch_scripts.observe.fact_table import for_report
 from launch_scripts.observe.history import BegunRoute, Sample, Thinned, TrackKey, Tracks
-from launch_scripts.observe.latest_state import LatestState, VehicleColumns, plan_of
-from launch_scripts.observe.results import Driven, results
+from launch_scripts.observe.latest_messages import LatestState, VehicleColumns, plan_of
 from launch_scripts.observe.run_observer import TRACK_S
-from launch_scripts.observe.state import RunState, state_of
+from launch_scripts.observe.run_results import Driven, results
+from launch_scripts.observe.run_state import RunState, state_of
+from launch_scripts.observe.summed_counts import of_excess
 from swarm.clock import NS_PER_S
-from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import flies
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import Histogram

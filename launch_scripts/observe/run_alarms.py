@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from launch_scripts.observe.latest_state import LatestState, RunPlan
+from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec

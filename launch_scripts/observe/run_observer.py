@@ -13,10 +13,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
-from launch_scripts.observe.latest_state import LatestState, plan_of_members, run_of_most
+from launch_scripts.observe.latest_messages import LatestState, plan_of_members, run_of_most
 from shared_map.terrain.map_frame import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
-from swarm.client.frame import Frame
+from swarm.client.terrain_frame import Frame
 from swarm.clock import NS_PER_S, Clock
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from launch_scripts.observe.counts import percent
+from launch_scripts.observe.summed_counts import percent
 
 _WHERE_ONLY = ("network.listen", "network.connect", "monitor.grpc_port", "monitor.web_port")
 """Keys that say where a run was met, not what ran: free ports differ each time."""

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.latest_state import MarkedCells
+from launch_scripts.observe.latest_messages import MarkedCells
 from launch_scripts.observe.recorder import Recorder
 from shared_map.terrain.pyramid import Level
 from shared_map.terrain.terrain import Terrain

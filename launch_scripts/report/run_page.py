@@ -15,11 +15,11 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from launch_scripts.observe.counts import percent
-from launch_scripts.observe.facts import count, grouped
+from launch_scripts.observe.fact_table import count, grouped
 from launch_scripts.observe.palette import STYLE, colours_of_groups
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report, write_file
+from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.run_arrays import TRACKS_FILE, read_tracks
 from launch_scripts.report.run_picture import (
     GROUND_FILE,

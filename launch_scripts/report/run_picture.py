@@ -24,14 +24,14 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
-from launch_scripts.observe.counts import percent
-from launch_scripts.observe.facts import count, duration, fact
+from launch_scripts.observe.fact_table import count, duration, fact
 from launch_scripts.observe.palette import colours_of_groups, hillshade, rgb, round_length, said_length
+from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.run_arrays import RunTracks, Track
 from launch_scripts.report.run_layers import groups_of
 from launch_scripts.report.run_plots import PLOTS, draw_plot, halo, saved
-from shared_map.arrays import Floats
-from shared_map.learning.factors import keys_of
+from shared_map.array_files import Floats
+from shared_map.learning.learned_factors import keys_of
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import zone_mask

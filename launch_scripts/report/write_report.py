@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import REPORT_FILE, ended, replacing, write_file
 from launch_scripts.report.run_arrays import GROUND_PACE_FILE, TRACKS_FILE, packed_ground, packed_tracks, tracks_in
-from shared_map.learning.factors import factors_in, learned_kinds
+from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
 from swarm.errors import StoreError

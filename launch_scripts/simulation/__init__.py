@@ -2,5 +2,5 @@
 
 A seed decides everything: worlds (`worlds`), what goes wrong (`faults`) and each event, byte for byte. `node` is a
 process: the same services as in a live run, built in one place for simulations and for the replay of recordings.
-`simulate` runs nodes, `laws` says what must hold in every run, `campaign` tries seeds, `study` sums many up.
+`simulate` runs nodes, `laws` says what must hold in every run, `many_seeds` tries seeds, `study` sums many up.
 """

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
-from swarm.config.classes import flies
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import flies
 from swarm.right_of_way.lock_regions import FEWEST_FOR_MAJORITY
 
 RELINK_S = 0.3

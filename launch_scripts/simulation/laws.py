@@ -26,12 +26,12 @@ from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from planner_service.search.target_search import LISTEN_NS
-from shared_map.class_grounds import class_grounds
 from shared_map.replication.replica import MapReplica
+from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
-from swarm.config.classes import flies
+from swarm.config.vehicle_classes import flies
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest

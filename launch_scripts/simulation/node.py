@@ -10,7 +10,7 @@ from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
 from planner_service.service import PlannerService
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.terrain.terrain import Terrain
@@ -21,8 +21,8 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
-from swarm.recording.boundary import Boundary
 from swarm.recording.recording import Recording
+from swarm.recording.service_boundary import Boundary
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED

@@ -15,10 +15,10 @@ from launch_scripts.observe.run_folder import SCENARIO_FILE
 from launch_scripts.process_table import SIMULATED_ROLES
 from launch_scripts.simulation.node import Outside, built
 from planner_service.prepared_costs import PreparedCosts
-from shared_map.arrays import Floats
-from shared_map.class_grounds import load_classes
+from shared_map.array_files import Floats
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import load_classes
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario

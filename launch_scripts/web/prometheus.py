@@ -24,8 +24,8 @@ from prometheus_client.metrics_core import HistogramMetricFamily as HistogramOf
 from prometheus_client.metrics_core import InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from launch_scripts.observe.counts import Counts
-from launch_scripts.observe.latest_state import LatestState
+from launch_scripts.observe.latest_messages import LatestState
+from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web import LOOPBACK, Reply
 from launch_scripts.web.health_verdict import Process, health_pages
 from launch_scripts.web.server import Server

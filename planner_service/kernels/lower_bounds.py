@@ -39,7 +39,7 @@ _WINDOW = f"Tuple((f4[::1], {BOX}, i8[::1], f8[::1]))"
 
 @helper
 def _rounding(cheapest, cost):
-    """float64: as `tree.changes.Rounding.at`, bit for bit, which says why."""
+    """float64: as `tree.cost_changes.Rounding.at`, bit for bit, which says why."""
     costs, counts = cheapest
     last = costs.size - 1
     if cost >= costs[last]:
@@ -108,7 +108,7 @@ def _by_heuristic(heuristic, window, cost, starts, cheapest, bound):
 def bound_costs(cost, starts, cheapest, slack, heuristic, window, share, bound):
     """bound := proven lower bounds; 0 where `cost` is inf.
 
-    cheapest   (costs, counts) as `tree.changes.Rounding.cheapest` says
+    cheapest   (costs, counts) as `tree.cost_changes.Rounding.cheapest` says
     slack      as an exact tree's `slack`; of one that is not, the first is negative
     heuristic  (heuristic, padded root, stride); not looked at where the tree is exact
     window     a `WindowBound`; as above

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 MOST_BLOCKS = 1 << 14

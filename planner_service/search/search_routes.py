@@ -14,9 +14,9 @@ from planner_service.kernels.layout import NONE, step_offsets
 from planner_service.kernels.queue_heap import arrivals
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import turned_round
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from swarm.grid import GridSpec, walk
-from swarm.wire.routes import SEARCHING, RouteBatch
+from swarm.wire.route_columns import SEARCHING, RouteBatch
 
 _MOST_CELLS = 1 << 21
 """Of a map over which arrivals are found exactly, in some tenths of a second, once each time a target is lost."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from planner_service.search.belief import Belief, Blocks, blocks_of
 from planner_service.search.search_routes import Way, Ways
-from shared_map.arrays import Bools, Floats
-from swarm.wire.routes import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, RouteBatch
+from shared_map.array_files import Bools, Floats
+from swarm.wire.route_columns import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, RouteBatch
 
 OFFSET_S = 900.0
 """Places that cost less than this differ little: near ones are preferred, but not for every scrap of belief."""

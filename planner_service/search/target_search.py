@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from planner_service.search.search_routes import Ways
 from planner_service.search.searcher import OFFSET_S, Searcher
 from planner_service.tree.cost_grid import CostGrid
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from swarm.clock import NS_PER_S
-from swarm.config.classes import least_sense_range_m
 from swarm.config.scenario import Scenario, ids_of
+from swarm.config.vehicle_classes import least_sense_range_m
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import MOST_BELIEVED, Believed, Sighted, TargetPose
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is told of twice a second: one that is not told of for so long, though a vehicle is where it

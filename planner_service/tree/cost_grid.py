@@ -23,9 +23,9 @@ from planner_service.kernels.layout import (
     PaddedGrid,
     step_offsets,
 )
-from planner_service.tree.changes import NO_CHANGES, Cells, Changes, CostRange, Rounding, joined
+from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, CostRange, Rounding, joined
 from planner_service.tree.growth import grow_tree, padded_climbs, with_scratch
-from shared_map.arrays import Bools, Floats, private_copy
+from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import route_walk, stride_growth
 from planner_service.kernels.cell_costs import find_rim, merge_window
+from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
 from planner_service.kernels.layout import NONE, Labels
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.mend import Walk, make_walk, mend
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
-from planner_service.tree.changes import Cells, Changes
+from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import FINE, KeptScratch, box_of, grow_window
 from planner_service.tree.strides import StrideNetwork
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from swarm.grid import Window
 
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))

@@ -27,7 +27,7 @@ from planner_service.kernels.partition import (
     Tiles,
     Tree,
 )
-from planner_service.tree.changes import Cells, Changes
+from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.growth import KeptScratch, grow_window

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
 from planner_service.kernels.route_walk import OK
-from planner_service.tree.changes import Changes
+from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.partitioned_tree import PieceTree
-from shared_map.arrays import Floats
-from swarm.wire.routes import RouteBatch
+from shared_map.array_files import Floats
+from swarm.wire.route_columns import RouteBatch
 
 LOWER_SHARE = 16
 """A heuristic is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import stride_network
 from planner_service.kernels.stride_growth import Network
-from planner_service.tree.changes import Cells, Changes
+from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 
 LEAST = 4
 """Doublings of the least stride that has a network: 16 cells. Shorter strides are single steps, near the target: a

@@ -9,7 +9,7 @@ known by how it begins. What each reader promises:
 4. Nothing is guessed. Where a file may mean several things, the error names the setting that answers.
 5. What was done to the data is told in `Source.notes`.
 
-A kind of file has one module: `rasters` with `encoded_heights`, `plain_grids`, `text_grids`. `raster_files` opens
+A kind of file has one module: `rasters` with `encoded_heights`, `array_grids`, `xyz_grids`. `raster_files` opens
 and guards all rasters; `georeference` says where they lie, and `onto_grid` brings them onto the grid.
 `level_ground` finds water and voids in a file's own cells, before anything is resampled. What covers the ground is
 in `cover`, what is drawn on it in `zones`; codes, colours and classes of ways are data beside their readers.

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.importers.raster_files import READ_ROWS, middle_of
 from shared_map.terrain.row_bands import bands
 from swarm.config.input_files import size

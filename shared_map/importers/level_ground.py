@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.importers.level_patches import Patches, level_patches
 from shared_map.terrain.row_bands import bands
 from swarm.config.ground import TerrainConfig

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.importers.georeference import bounds_in, crs_name, crs_of, equidistant, metres_per_degree, pixel_m
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec

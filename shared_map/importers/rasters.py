@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.importers.cover import cover_meaning
 from shared_map.importers.cover.cover_codes import TABLES, legend_of, some
 from shared_map.importers.cover.land_cover import read_cover

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.onto_grid import from_degrees, from_metres, nearest
 from shared_map.importers.raster_files import is_raster
 from shared_map.terrain.layers import TerrainClass
@@ -110,7 +110,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
-    from shared_map.importers.plain_grids import read_npz
+    from shared_map.importers.array_grids import read_npz
     from shared_map.terrain.synthetic.landscape import cover
 
     plain = read_npz(_jacksboro_path())
@@ -160,8 +160,8 @@ def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """Heights in a text or an archive of arrays."""
-    from shared_map.importers.plain_grids import read_asc, read_npz
-    from shared_map.importers.text_grids import read_text_grid
+    from shared_map.importers.array_grids import read_asc, read_npz
+    from shared_map.importers.xyz_grids import read_text_grid
 
     suffix = path.suffix.lower()
     plain = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)(path)
@@ -207,7 +207,7 @@ def _geographic(crs: str | None) -> bool:
 
 def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A map without heights: level, with the pace that the file states."""
-    from shared_map.importers.plain_grids import read_map, read_ros
+    from shared_map.importers.array_grids import read_map, read_ros
 
     plain = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
     assert plain.factor is not None

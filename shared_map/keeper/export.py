@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.learning.factors import name_of
+from shared_map.learning.learned_factors import name_of
 from shared_map.learning.measurements import Measurement, columns_of, measurements_in
 from shared_map.replication.marks import Statements, fault, is_zone, mark_set, statements
 from shared_map.replication.replica import MapReplica

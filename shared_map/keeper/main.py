@@ -9,8 +9,8 @@ from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.terrain.store import load_terrain
 from swarm.bus.bus import Bus
-from swarm.recording.boundary import Boundary
 from swarm.recording.role_process import run_role
+from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.role import RoleSetup
 

@@ -14,13 +14,13 @@ from shared_map.keeper.order_service import KeptOrders
 from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
 from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.replication.tiles import beyond_tile
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.config.classes import class_numbers
+from swarm.config.vehicle_classes import class_numbers
 from swarm.errors import StoreError
 from swarm.liveness import Roster
 from swarm.runtime.membership import Member

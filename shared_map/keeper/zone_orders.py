@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools
+from shared_map.array_files import Bools
+from shared_map.replication.author_limits import MAX_MARKS
 from shared_map.replication.digest import digest_rows
-from shared_map.replication.limits import MAX_MARKS
 from shared_map.replication.marks import (
     NO_STATEMENTS,
     Statements,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes
+from shared_map.array_files import Bytes
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 

@@ -10,7 +10,8 @@
    above.
 3. Stamps are *hybrid logical clocks*, one for each cell: an author that has seen a statement can overrule it,
    however far the clock of the other is ahead.
-4. Sets are published when they change (`sync`). Who starts asks for all that is held (*late join*). What is lost
+4. Sets are published when they change (`replica_sync`). Who starts asks for all that is held (*late join*). What is
+lost
    meanwhile is found by *anti-entropy*: each replica tells by a *digest* which numbers it holds (`digest`), and who
    misses one asks its author and the keepers for that set. A digest of late changes goes out between the whole
    ones.
@@ -18,14 +19,16 @@
    *tombstone*: an empty set with a number between two of the author's, at which replicas forget the author's set
    and remember the number for a while (`held_sets`), so that a late copy is not taken for news. An author that is
    alive after all hears of it, and states the same again under a higher epoch.
-6. *Limits* (`limits`): sets and statements held, in all and by process, are bounded, and each process has a budget
+6. *Limits* (`author_limits`): sets and statements held, in all and by process, are bounded, and each process has a
+budget
    of changed cells. What exceeds the budget waits, and what exceeds the bounds is refused and counted, whoever sent
    it.
-7. *Interest* (`interest`, `filter`): a replica may hold only regions near its vehicles and only groups that it may
+7. *Interest* (`regions_of_interest`, `mark_filter`): a replica may hold only regions near its vehicles and only
+groups that it may
    read. Then it hears only the digests that can concern it.
 
-`replica` is the core (sets, digests and time in; changed cells and sets to publish out), `sync` its shell on the
-bus.
+`replica` is the core (sets, digests and time in; changed cells and sets to publish out), `replica_sync` its shell
+on the bus.
 
 Sources: Shapiro et al., Conflict-free Replicated Data Types (2011); Kulkarni et al., Logical Physical Clocks
 (2014); Demers et al., Epidemic Algorithms for Replicated Database Maintenance (1987). Decisions 9, 18 and 21.

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from shared_map.learning.measurements import measurements_in
+from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held, Ledger, fingerprint
-from shared_map.replication.limits import Capacity
 from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
 from swarm.clock import NS_PER_S
-from swarm.config.classes import MOST_CLASSES
+from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.messages.map_data import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.config.classes import MOST_CLASSES
-from swarm.config.values import RESERVED_GROUP
+from swarm.config.setting_types import RESERVED_GROUP
+from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet, MarkSets

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared_map.learning.measurements import Measurement, columns_of
+from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held
-from shared_map.replication.filter import MarkFilter
 from shared_map.replication.held_sets import HeldSets
-from shared_map.replication.limits import Capacity
+from shared_map.replication.mark_filter import MarkFilter
 from shared_map.replication.marks import (
     NO_STATEMENT,
     NO_STATEMENTS,

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swarm.config.classes import MOST_CLASSES
+from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
 
 _TILE_BITS = TILE_CELLS.bit_length() - 1

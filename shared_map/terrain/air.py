@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.terrain.step_climb import ENTRIES, STILL, Climb, Wind, wind_of
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import paint_zones
-from swarm.config.classes import AirConfig, WindConfig
 from swarm.config.ground import CostConfig
+from swarm.config.vehicle_classes import AirConfig, WindConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -7,7 +7,7 @@ from typing import NoReturn, Protocol
 
 import numpy as np
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 from shared_map.terrain.layers import LETHAL
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario

@@ -10,7 +10,7 @@ import heapq
 
 import numpy as np
 
-from shared_map.arrays import Bools, Bytes, CellsOf, Floats
+from shared_map.array_files import Bools, Bytes, CellsOf, Floats
 from shared_map.terrain.layers import LETHAL, TerrainClass
 from shared_map.terrain.row_bands import counted
 from shared_map.terrain.synthetic.noise import fractal_noise

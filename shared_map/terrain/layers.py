@@ -30,7 +30,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands
 from shared_map.terrain.slope_rules import along_slope_factor, slope_factor
 from swarm.config.ground import CostConfig

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats, reuse_memory
+from shared_map.array_files import Bools, Floats, reuse_memory
 
 BAND_ROWS = 128
 Progress = Callable[[str, float], None]

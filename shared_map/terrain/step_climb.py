@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.slope_rules import directional_factor, step_limits_deg
 from swarm.config.ground import CostConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec

@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats, give_back_memory, open_array, save_array, source_digest
+from shared_map.array_files import Bools, Floats, give_back_memory, open_array, save_array, source_digest
 from shared_map.terrain.layers import largest_part
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.step_climb import ENTRIES, Climb, Wind

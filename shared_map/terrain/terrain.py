@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
 from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.layers import (
@@ -32,9 +32,9 @@ from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded
 from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import Climb, climb_of
 from shared_map.terrain.zones import ZoneFacts, paint_zones
-from swarm.config.classes import GROUND, of_class
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND, of_class
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST

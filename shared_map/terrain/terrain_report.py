@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from shared_map.arrays import Bools
+from shared_map.array_files import Bools
 from shared_map.terrain.layers import TerrainClass, slope_deg
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.step_climb import Climb

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.raster_files import mask_of
 from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
 from shared_map.terrain.map_frame import MapFrame

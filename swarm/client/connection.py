@@ -9,12 +9,12 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm.client.frame import Frame
 from swarm.client.observer import EVERY_S, Observer
 from swarm.client.order_calls import Orders
 from swarm.client.route import Route
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
+from swarm.client.terrain_frame import Frame
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-from swarm.client.frame import Frame, Point
+from swarm.client.terrain_frame import Frame, Point
 from swarm.grid import walk
 from swarm.wire.messages.planning import PushedRoute, RouteReply
-from swarm.wire.routes import Route as WireRoute
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import Route as WireRoute
+from swarm.wire.route_columns import RouteStatus
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
-from swarm.client.frame import Frame, number
 from swarm.client.route import Route
+from swarm.client.terrain_frame import Frame, number
 from swarm.clock import NS_PER_S, Clock
 from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
 from swarm.wire.codec import M, decode, encode

@@ -7,11 +7,11 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged
-from swarm.client.frame import checked_cells
 from swarm.client.own_marks import OwnMarks
 from swarm.client.reported import Reported
 from swarm.client.route import Route
 from swarm.client.session import Session, Stream
+from swarm.client.terrain_frame import checked_cells
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import ConfigError

@@ -15,7 +15,7 @@ import msgspec
 from swarm.config.explain import nearest
 from swarm.config.ground import CostConfig
 from swarm.config.input_files import FileKind, quoted, read_text
-from swarm.config.values import Slope, SlopeFactor
+from swarm.config.setting_types import Slope, SlopeFactor
 from swarm.errors import ConfigError
 
 

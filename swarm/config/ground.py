@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from swarm.config.values import (
+from swarm.config.setting_types import (
     ClassName,
     CoverCode,
     CoverGround,

@@ -12,14 +12,14 @@ from typing import Any
 
 import msgspec
 
-from swarm.config.classes import aloft_classes, class_faults, with_class_costs
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import choice, doubled, explain, located, nearest
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
-from swarm.config.values import MOST_TARGETS, RESERVED_GROUP
+from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUP
+from swarm.config.vehicle_classes import aloft_classes, class_faults, with_class_costs
 from swarm.errors import ConfigError
 from swarm.liveness import split_rank
 from swarm.places import read_place

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, get_args
 from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
-from swarm.config.values import Assigner, Dynamics, Sensor, Strategy, Walk
+from swarm.config.setting_types import Assigner, Dynamics, Sensor, Strategy, Walk
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -12,9 +12,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from swarm.config.classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
 from swarm.config.ground import CostConfig, TerrainConfig
-from swarm.config.values import (
+from swarm.config.setting_types import (
     MOST_PER_AGENT,
     MOST_TARGETS,
     Assigner,
@@ -35,6 +34,7 @@ from swarm.config.values import (
     Walk,
     plugin_name,
 )
+from swarm.config.vehicle_classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
 from swarm.grid import MOST_PLOT_REGIONS
 
 UNTIL_STOPPED_S = 1e9

@@ -2,7 +2,8 @@
 
 A service is deterministic but for what it reads, so a recording is enough to repeat it:
 
-1. `boundary` wraps the bus, the worker and whatever else is outside (`external_calls`). Whatever a service reads or
+1. `service_boundary` wraps the bus, the worker and whatever else is outside (`external_calls`). Whatever a service
+reads or
    lets out crosses one of these wrappers, under one name for recording and for replay.
 2. `recording` writes each call of the service with its time (start, tick, stop, or an event, by `events`), then
    what the call read, then key, length and digest of each output, as `records` of a file that can be torn anywhere.

@@ -15,7 +15,6 @@ from swarm.bus.bus import Asked, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
-from swarm.recording.boundary import Boundary, Crossing
 from swarm.recording.events import JobDone, LoopCounters, record_of
 from swarm.recording.external_calls import content_of, pack
 from swarm.recording.records import (
@@ -30,6 +29,7 @@ from swarm.recording.records import (
     Read,
     RecordWriter,
 )
+from swarm.recording.service_boundary import Boundary, Crossing
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from swarm.config.agents import AddedAgent, crew_of
-from swarm.config.classes import class_numbers
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import class_numbers
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.runtime.health import Health
 from swarm.wire.fields import MOST_IDS

@@ -6,7 +6,7 @@
 - `fields` has the types of fields, each with its bounds, and columns of numbers as little-endian bytes.
 - `codec` is the only door. `decode` raises nothing but `ProtocolError`, in bounded time and memory, and what it
   returns keeps every rule that the types state: a reader checks only what a message cannot know, such as the grid.
-- `routes` has routes one by one, as arrays and as columns.
+- `route_columns` has routes one by one, as arrays and as columns.
 
 A value is bounded where it enters and trusted inside. Whoever adds a message adds a struct and a row of the table;
 `docs/wire.md` and `docs/wire.lock` are made of both.

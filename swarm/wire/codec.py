@@ -32,7 +32,7 @@ from swarm.wire.fields import CODES, OR_INFINITE, Column, Directions, name_of, n
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet, faulty_sets
 from swarm.wire.messages.planning import RouteReply
-from swarm.wire.routes import Route
+from swarm.wire.route_columns import Route
 from swarm.wire.versions import STEPS, as_read, as_written, read_schemas, schema_of_type
 
 MAX_PAYLOAD_BYTES = 8 << 20

@@ -26,12 +26,12 @@ from launch_scripts.launcher.options import find_scenario, make_run_dir, with_po
 from launch_scripts.launcher.takeover import has_ended, processes
 from launch_scripts.process_table import processes_of
 from launch_scripts.simulation.world.referee import Collision, Referee
-from shared_map.class_grounds import class_truths
 from shared_map.terrain.terrain import build_terrain, build_truth
+from shared_map.vehicle_class_grounds import class_truths
 from swarm.bus.endpoints import listening
 from swarm.config.agents import plan_agents
-from swarm.config.classes import aloft_classes
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import aloft_classes
 from swarm.errors import BusError, ConfigError, ProtocolError, StoreError
 from swarm.wire.codec import decode
 from swarm.wire.topics import FLEET

@@ -23,7 +23,7 @@ from swarm.wire.messages.vehicles import Body
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.bodies import REACTION_S, Bodies
-from vehicle_agent.discs import Capsule
+from vehicle_agent.cells_of_discs import Capsule
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.steering import Steering

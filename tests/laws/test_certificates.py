@@ -23,7 +23,7 @@ from planner_service.tree.partitioned_tree import PieceTree
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.route_columns import Route, RouteStatus
 
 GRID = GridSpec(40, 60, 2.0)
 

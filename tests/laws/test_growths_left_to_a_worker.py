@@ -18,7 +18,7 @@ from planner_service.growth_times import WindowSchedule
 from planner_service.strategy import STAGES
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.messages.planning import RouteRequest
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ROUTE
 
 LARGE = mock.patch.object(growth_times, "INLINE_NS", 100)

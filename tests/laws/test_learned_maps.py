@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.effort import few
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
-from shared_map.learning.factors import factors_of, keys_of
+from shared_map.learning.learned_factors import factors_of, keys_of
 from shared_map.learning.measurements import MOST, ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.layers import inflate, inflation_halves

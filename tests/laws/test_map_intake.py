@@ -25,7 +25,7 @@ from swarm.grid import walk
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest, TargetPose
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.route_columns import Route, RouteStatus
 
 SIDE = 24
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, Composite, held_winners, mark_sets, merge_one, naive_winners, set_of
 
 from shared_map.replication import merge as merge_module
-from shared_map.replication.limits import Capacity
+from shared_map.replication.author_limits import Capacity
 from shared_map.replication.marks import Statements, mark_set, packed, unpacked
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError

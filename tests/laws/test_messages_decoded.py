@@ -28,7 +28,7 @@ from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.traffic import Standing, Table
-from swarm.wire.routes import Route, Routes, RouteStatus
+from swarm.wire.route_columns import Route, Routes, RouteStatus
 
 TYPES = tuple(BY_TYPE)
 ROUTE_WITHOUT_END = {"status": "ok", "start": 4, "directions": b"", "cost_s": math.inf}

@@ -12,7 +12,7 @@ from support.fields import from_file
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "movingai"
 SCENARIOS = sorted(DATA.glob("*/*.scen"))

@@ -23,10 +23,10 @@ from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.sinks import Pen
+from launch_scripts.monitor.view_outputs import Pen
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.service import PlannerService
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth, terrain_of_pace
@@ -43,7 +43,7 @@ from swarm.wire.fields import OR_INFINITE, Column, taken_apart
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import GIVE_ORDER, MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED, ZONES
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService

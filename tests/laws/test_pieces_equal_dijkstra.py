@@ -23,7 +23,7 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PieceTree
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
 
 FINE = 1e-11

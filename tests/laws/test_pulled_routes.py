@@ -17,14 +17,14 @@ from support.segments import Cell, crossed
 
 from planner_service.pulled_routes import Puller
 from planner_service.route_finder import RouteFinder
-from swarm.client.frame import Frame
 from swarm.client.route import Route as ClientRoute
+from swarm.client.terrain_frame import Frame
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ProtocolError
 from swarm.grid import GridSpec, walk
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.planning import PushedRoute
-from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, Routes, RouteStatus
+from swarm.wire.route_columns import NO_TARGET, OK, Route, RouteBatch, Routes, RouteStatus
 from vehicle_agent.driving.dynamics import PluginDynamics, Stretch
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.driving.route_follower import Follower

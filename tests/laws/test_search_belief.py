@@ -21,7 +21,7 @@ from shared_map.terrain.step_climb import climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 METRES = 10.0
 _SIDES = st.integers(1, 26)

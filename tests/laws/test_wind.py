@@ -24,10 +24,10 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.air import AirGround, air_ground
 from shared_map.terrain.step_climb import STILL, Wind, wind_of
-from swarm.config.classes import AirConfig
 from swarm.config.scenario import PlannerConfig
+from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, walk
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.driving.driver import climbing_of
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.driving.route_follower import Follower

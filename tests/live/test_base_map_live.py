@@ -15,7 +15,7 @@ from support.processes import eventually
 
 from swarm.config.load import load_scenario
 from swarm.wire.messages.planning import RouteRequest
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ROUTE
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

@@ -11,7 +11,7 @@ from support.live_swarm import Hands, ask, client, swarm
 from support.processes import eventually
 
 from swarm.wire.messages.planning import RouteRequest
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ROUTE
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

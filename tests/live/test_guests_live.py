@@ -24,7 +24,7 @@ from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import FLEET, ROUTE, RUN
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

@@ -12,7 +12,7 @@ from support.processes import eventually
 from launch_scripts.ports import free_ports
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import MapConfig, NetworkConfig

@@ -17,7 +17,7 @@ from launch_scripts.simulation.replay import replay_run
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import RouteRequest
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, ROUTE, RUN, TOPICS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

@@ -23,7 +23,7 @@ from swarm.config.load import load_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import Stats
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import BODY, MARKS, ROUTE, RUN, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

@@ -22,7 +22,7 @@ from swarm.bus.zenoh_bus import ZenohBus
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import Beat, Stats
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import LEAD, ROUTE, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

@@ -17,7 +17,7 @@ from launch_scripts.deploy.certificates import issue
 from launch_scripts.ports import free_ports
 from shared_map.replication.marks import mark_set, statements
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import MapConfig, NetworkConfig, TlsConfig

@@ -13,8 +13,8 @@ from support.simulated import OrderedSimulation, agents, cells, vehicles
 
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
-from shared_map.class_grounds import class_grounds
 from shared_map.terrain.air import clearance_floor
+from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.load import parse_scenario
 from swarm.wire.messages.orders import ZoneOrder
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from launch_scripts.commands.simulation_commands import simulate_seeds
-from launch_scripts.simulation.campaign import MIX, Verdict, parse_seeds, run_seeds, try_seed, world_of
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LONGEST_WAIT_S, BrokenLaw, LawBook
+from launch_scripts.simulation.many_seeds import MIX, Verdict, parse_seeds, run_seeds, try_seed, world_of
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
 from swarm.errors import ConfigError
@@ -99,7 +99,7 @@ def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
     assert printed["failing"] == []
     assert printed["deliveries"] > 1000
     broken = Verdict(world="small", seed=3, seconds=30.0, broken=[BrokenLaw("a law", "it broke")])
-    monkeypatch.setattr("launch_scripts.simulation.campaign.try_seed", lambda *_: (broken, {}))
+    monkeypatch.setattr("launch_scripts.simulation.many_seeds.try_seed", lambda *_: (broken, {}))
     assert not simulate_seeds("small", "3:4", None, 1, as_json=False)
     out = capsys.readouterr().out
     assert "FAILED small seed 3" in out

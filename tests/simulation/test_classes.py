@@ -15,12 +15,12 @@ from support.simulated import OrderedSimulation, agents, cells, vehicles
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.node import Node
-from shared_map.arrays import Bools
-from shared_map.class_grounds import ClassGround, class_grounds
+from shared_map.array_files import Bools
 from shared_map.keeper.zone_orders import zones_of
+from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.config.agents import added_agent
-from swarm.config.classes import ClassConfig, class_numbers
 from swarm.config.load import parse_scenario
+from swarm.config.vehicle_classes import ClassConfig, class_numbers
 from swarm.errors import ConfigError
 from swarm.wire.messages.orders import ZoneOrder
 

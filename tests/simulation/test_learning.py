@@ -9,7 +9,7 @@ from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import seeded
 from shared_map.cost_map import CostMap
-from shared_map.learning.factors import name_of
+from shared_map.learning.learned_factors import name_of
 from swarm.config.scenario import Scenario
 
 SECONDS = 20.0

@@ -14,15 +14,15 @@ from rich.console import Console
 from support.simulated import OrderedSimulation
 
 from launch_scripts.commands.status_view import print_status, status_fields, status_of
-from launch_scripts.launcher.tables import live_table
+from launch_scripts.launcher.terminal_tables import live_table
 from launch_scripts.monitor.ground.ground_view import Scene
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.vehicles_view import _DOES
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.sinks import Pen
-from launch_scripts.observe import facts
+from launch_scripts.monitor.view_outputs import Pen
+from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.run_observer import OutsideObserver
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.run_state import RunState
 from launch_scripts.simulation.node import EPOCH_NS
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event

@@ -11,7 +11,7 @@ import pytest
 from support.plugin_modules import forgotten_afterwards
 from support.plugin_pages import write_all_examples, write_example
 
-from launch_scripts.simulation.campaign import try_seed
+from launch_scripts.simulation.many_seeds import try_seed
 from launch_scripts.simulation.simulate import Simulation, simulate
 from swarm.config.load import load_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS

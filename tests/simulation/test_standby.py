@@ -16,7 +16,7 @@ from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import POSE, ROUTE
 
 STANDING_BY = msgspec.structs.replace(SMALL, standbys=StandbyConfig(planner=1, targets=1))
@@ -94,11 +94,8 @@ def test_vehicles_are_pushed_routes_by_a_standby_as_soon_as_it_leads() -> None:
     assert followers > 0
     simulation.run_until(8.9)
     assert standby.counters.counts["pushes"] >= followers // 2
-    assert all(
-        each.route is not None
-        for each in (each for _, each in standby._planner.followers.all_items())
-        if not each.stale
-    )
+    known = standby._planner.followers.all_items()
+    assert all(each.route is not None for _, each in known if not each.stale)
 
 
 def test_both_sides_of_a_cut_are_planned_for_and_one_planner_leads_when_it_heals() -> None:

@@ -31,7 +31,7 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import COST, POSE, ROUTE, SIGHTED, STATUS
 from vehicle_agent.service import AgentService
 

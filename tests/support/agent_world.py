@@ -24,7 +24,7 @@ from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.promise_store import PromiseStore

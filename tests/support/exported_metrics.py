@@ -6,7 +6,7 @@ from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from support.makers import planner_status
 
-from launch_scripts.observe.counts import Counts
+from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web.prometheus import HELP, Figures, OneScrape, Run, families
 from shared_map.keeper.service import THROTTLED
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, READY, Counters

@@ -96,7 +96,7 @@ def from_file(path: Path) -> Pace:
         case ".npy":
             pace = _read_npy(path)
         case ".map":
-            from shared_map.importers.plain_grids import read_map
+            from shared_map.importers.array_grids import read_map
 
             factor = read_map(path).factor
             assert factor is not None, "a .map has no heights"

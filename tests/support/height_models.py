@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.ground import TerrainConfig

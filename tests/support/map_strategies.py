@@ -13,7 +13,7 @@ from shared_map.replication.marks import NO_STATEMENT, Statements, mark_set, spa
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import tile_cells
 from swarm.bus.bus import Bus, Event, Heard
-from swarm.config.classes import MOST_CLASSES
+from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind, MarkSet
 from swarm.wire.topics import DIGEST

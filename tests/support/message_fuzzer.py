@@ -23,7 +23,7 @@ from shared_map.replication.marks import packed
 from shared_map.replication.tiles import beyond_tile, region_of
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.config.classes import GROUND, MOST_CLASSES
+from swarm.config.vehicle_classes import GROUND, MOST_CLASSES
 from swarm.errors import OutsideGridError, ProtocolError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
@@ -41,7 +41,7 @@ from swarm.wire.messages.map_data import (
 )
 from swarm.wire.messages.planning import PushedRoute
 from swarm.wire.messages.vehicles import NO_TARGET, Followed, SharedCosts
-from swarm.wire.routes import Route, RouteBatch, Routes
+from swarm.wire.route_columns import Route, RouteBatch, Routes
 from swarm.wire.topics import Topic
 
 NAMES = (

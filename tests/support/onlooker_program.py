@@ -27,7 +27,7 @@ from swarm.wire.messages.map_data import DIGEST_ROW, Digest
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Beat
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import DIGEST, FLEET, FOLLOWED, LEAD, PUSHED_ROUTE, ROUTE
 
 ROUTED = (VehicleState.FOLLOWING, VehicleState.ARRIVED)

@@ -11,7 +11,7 @@ from support import slow_twins as naive
 from support.kernel_oracle import inner
 from support.planner_strategies import Job, Marks, Move
 
-from planner_service.actions import GrownTree
+from planner_service.planner_actions import GrownTree
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -20,7 +20,7 @@ from planner_service.tree.strides import StrideSearch
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 
 class Play:

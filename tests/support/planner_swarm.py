@@ -18,13 +18,13 @@ from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig, Scenario, TargetConfig
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.processes import Stats
-from swarm.wire.routes import Route
+from swarm.wire.route_columns import Route
 from swarm.wire.topics import CHASERS, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
 
 ROWS, COLS, RES = 40, 50, 10.0

@@ -9,10 +9,10 @@ from support.kernel_oracle import inner
 from support.planner_strategies import random_pace
 
 from planner_service.kernels import repair as kernels
-from planner_service.tree.changes import Changes
+from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.actions import Action, GrownTree, GrowTree, Tell
 from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Planner
+from planner_service.planner_actions import Action, GrownTree, GrowTree, Tell
 from planner_service.target_tree import TargetTree, Update
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
@@ -23,7 +23,7 @@ from swarm.wire.fields import pack_column
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlannerStatus, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 ROWS, COLS = 20, 30
 GRID = GridSpec(ROWS, COLS, 10.0)

@@ -17,7 +17,7 @@ from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
-from swarm.wire.routes import RouteBatch
+from swarm.wire.route_columns import RouteBatch
 
 Cells = NDArray[np.int64]
 

@@ -12,7 +12,7 @@ from support.map_strategies import GRID, Composite
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Event, Post
 from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork, PerfectLinks

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from support.planner_strategies import RULES, random_climb, random_pace
 from support.slow_twins import Cells, Driven, cost_to_go, drive
 
-from planner_service.actions import GrownTree
 from planner_service.kernel_build import load_all
+from planner_service.planner_actions import GrownTree
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
-from swarm.wire.routes import LETHAL_START, OK, UNREACHABLE, RouteBatch
+from swarm.wire.route_columns import LETHAL_START, OK, UNREACHABLE, RouteBatch
 
 Seconds = NDArray[np.float64]
 

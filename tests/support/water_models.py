@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.terrain.synthetic.noise import fractal_noise
 
 SIDE = 384

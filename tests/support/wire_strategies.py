@@ -32,7 +32,7 @@ from swarm.wire.messages.traffic import (
     Standing,
     Table,
 )
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 _GRID = GridSpec(300, 200, 10.0)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from swarm.clock import NS_PER_S
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.driving.route_follower import Follower
 

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from swarm.config.classes import ClassConfig
+from swarm.config.vehicle_classes import ClassConfig
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 from swarm.plugins.guard import Guard, Nonsense, Tell

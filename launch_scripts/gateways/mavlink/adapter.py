@@ -18,7 +18,7 @@ from launch_scripts.gateways.mavlink.guidance import (
     guide_of,
 )
 from swarm.client import ConfigError, Frame
-from swarm.client.frame import Point
+from swarm.client.terrain_frame import Point
 from swarm.clock import NS_PER_S
 
 BEAT_NS = NS_PER_S

@@ -15,8 +15,8 @@ from typing import Literal
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, Kind
 from swarm.client import Frame
-from swarm.client.frame import Point
 from swarm.client.route import along, between
+from swarm.client.terrain_frame import Point
 from swarm.clock import NS_PER_S
 
 MOST_POINTS = 60

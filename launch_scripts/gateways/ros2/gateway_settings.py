@@ -17,7 +17,7 @@ from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import is_loopback
-from swarm.config.values import Metres, Name, Positive, Section
+from swarm.config.setting_types import Metres, Name, Positive, Section
 from swarm.errors import ConfigError
 from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_RADIUS_M

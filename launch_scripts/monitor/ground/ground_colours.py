@@ -21,7 +21,7 @@ from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMes
 from launch_scripts.monitor.movers.styles import HUES
 from launch_scripts.observe import palette
 from launch_scripts.observe.palette import hillshade, rgb
-from shared_map.arrays import Bools
+from shared_map.array_files import Bools
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.pyramid import any_in_blocks
 from shared_map.terrain.terrain import Terrain

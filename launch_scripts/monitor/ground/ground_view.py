@@ -38,16 +38,16 @@ from launch_scripts.monitor.live_layout import (
     legend_picture,
 )
 from launch_scripts.monitor.movers.styles import Look
-from launch_scripts.monitor.sinks import Pen, RateLimit, even, ragged, shown
+from launch_scripts.monitor.view_outputs import Pen, RateLimit, even, ragged, shown
 from launch_scripts.observe.palette import round_length, said_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import zone_mask
-from swarm.config.classes import class_numbers
 from swarm.config.ground import ZoneConfig
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import class_numbers
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind

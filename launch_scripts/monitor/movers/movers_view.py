@@ -16,12 +16,12 @@ from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMes
 from launch_scripts.monitor.movers import styles
 from launch_scripts.monitor.movers.styles import ALARM_COLOUR, FOLLOWED_ENTITY
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
-from launch_scripts.monitor.sinks import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
-from launch_scripts.observe.latest_state import VehicleColumns
+from launch_scripts.monitor.view_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, screen, shown
+from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.recorder import RunFigures
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.state import RunState
-from shared_map.replication.filter import MarkFilter
+from launch_scripts.observe.run_state import RunState
+from shared_map.replication.mark_filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario

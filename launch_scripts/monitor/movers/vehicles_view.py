@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.movers.styles import Level, Looks, dimmed
-from launch_scripts.monitor.sinks import Pen, RateLimit, Strips, even, ragged
-from launch_scripts.observe.counts import percent
-from launch_scripts.observe.latest_state import LatestState, VehicleColumns
+from launch_scripts.monitor.view_outputs import Pen, RateLimit, Strips, even, ragged
+from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
+from launch_scripts.observe.summed_counts import percent
 from swarm.clock import NS_PER_S
-from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.vehicles import Followed, VehicleState
 

@@ -23,14 +23,14 @@ from msgspec import Meta
 
 from launch_scripts.deploy.host_scenario import parts_of, plugin_files
 from launch_scripts.launcher.options import SCENARIOS, scenario_path
-from launch_scripts.simulation.campaign import MIX, SECONDS, parse_seeds, world_of
+from launch_scripts.simulation.many_seeds import MIX, SECONDS, parse_seeds, world_of
 from launch_scripts.simulation.study.trials import Trial, code_version
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.explain import choice, explain
 from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
 from swarm.config.load import flat, parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.values import Name, Options, Positive, Section
+from swarm.config.setting_types import Name, Options, Positive, Section
 from swarm.errors import ConfigError
 
 MOST_TRIALS = 1_000_000

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from launch_scripts.simulation.campaign import SECONDS, replay_of
+from launch_scripts.simulation.many_seeds import SECONDS, replay_of
 from launch_scripts.simulation.study.study import Case, Study
 from launch_scripts.simulation.study.trials import Result, Trial
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.simulation.campaign import raised, try_seed
 from launch_scripts.simulation.laws import BrokenLaw
+from launch_scripts.simulation.many_seeds import raised, try_seed
 from launch_scripts.simulation.simulate import Simulation
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.config.classes import GROUND
+from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Body, Fleet

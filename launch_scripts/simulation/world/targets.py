@@ -23,15 +23,15 @@ from launch_scripts.simulation.world.walks import (
     slowness_of,
     walk_of,
 )
-from shared_map.arrays import Bools, Floats, private_copy
-from shared_map.class_grounds import class_truths
+from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
+from shared_map.vehicle_class_grounds import class_truths
 from swarm.clock import NS_PER_S
-from swarm.config.classes import aloft_classes
 from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
+from swarm.config.vehicle_classes import aloft_classes
 from swarm.errors import ConfigError
 from swarm.places import cell_of, written
 from swarm.plugins.find import find_plugin

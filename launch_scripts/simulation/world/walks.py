@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, CellsOf
+from shared_map.array_files import Bools, CellsOf
 from shared_map.terrain.layers import largest_part
 from shared_map.terrain.step_climb import Climb
 from swarm.config.ground import CostConfig

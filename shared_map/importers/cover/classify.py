@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover.photo_rules import (
     CERTAIN,
     CLASS_OF_READINGS,
@@ -34,7 +34,7 @@ from shared_map.importers.cover.photo_rules import (
 from shared_map.terrain.layers import TerrainClass, polygon_mask, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
 from swarm.config.input_files import FileKind, parse_toml, read_text
-from swarm.config.values import ClassName, Point, Polygon, Section
+from swarm.config.setting_types import ClassName, Point, Polygon, Section
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

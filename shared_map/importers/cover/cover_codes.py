@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.input_files import FileKind, read_text
-from swarm.config.values import CoverGround
+from swarm.config.setting_types import CoverGround
 from swarm.errors import TerrainError
 
 Rgb = tuple[int, int, int]

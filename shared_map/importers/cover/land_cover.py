@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover.cover_codes import HIGHEST_CODE, NOTHING, CoverTable, joined, some
 from shared_map.importers.cover.cover_meaning import Meaning, meaning_of, why_unknown
 from shared_map.importers.onto_grid import place_on

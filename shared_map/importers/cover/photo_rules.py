@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.layers import READABLE, TerrainClass, grade_of_padded, spread
 from shared_map.terrain.row_bands import counted, looked_up, padded_rows
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes
+from shared_map.array_files import Bools, Bytes
 from shared_map.importers.cover.cover_codes import joined
 from shared_map.importers.onto_grid import Placed, place_on
 from shared_map.importers.raster_files import READ_ROWS, middle_of, opened, thinned

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 

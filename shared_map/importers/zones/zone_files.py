@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name
 from shared_map.importers.onto_grid import Placed, overlap
 from shared_map.importers.raster_files import is_raster, opened

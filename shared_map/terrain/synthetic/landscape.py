@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 from shared_map.terrain import layers
 from shared_map.terrain.layers import TerrainClass, grade_of_padded, gradient_of_padded
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows

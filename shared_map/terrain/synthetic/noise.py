@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import in_bands
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.terrain.row_bands import in_bands
 from shared_map.terrain.synthetic.noise import fractal_noise
 from shared_map.terrain.synthetic.ways import Ways

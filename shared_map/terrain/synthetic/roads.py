@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared_map.arrays import Bools, Floats
+from shared_map.array_files import Bools, Floats
 from shared_map.terrain.layers import largest_part
 from shared_map.terrain.synthetic.ways import Ways
 from swarm.errors import TerrainError

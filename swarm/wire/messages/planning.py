@@ -29,7 +29,7 @@ from swarm.wire.fields import (
     Word,
 )
 from swarm.wire.messages import Message, schema_of
-from swarm.wire.routes import Route, Routes
+from swarm.wire.route_columns import Route, Routes
 
 GROUND = "ground"
 """The class of vehicles that a request means which names none."""

@@ -28,7 +28,7 @@ from swarm.wire.fields import (
     check_column,
 )
 from swarm.wire.messages import Message, schema_of
-from swarm.wire.routes import check_legs
+from swarm.wire.route_columns import check_legs
 
 
 class VehicleState(enum.IntEnum):

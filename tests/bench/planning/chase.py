@@ -25,10 +25,10 @@ from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWor
 from planner_service.strategy import ROWS, STAGES, FullGrowth
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import Strategy, Walk
+from swarm.config.setting_types import Strategy, Walk
 from swarm.errors import ConfigError
 from swarm.grid import walk
-from swarm.wire.routes import OK, RouteBatch
+from swarm.wire.route_columns import OK, RouteBatch
 
 Cells = NDArray[np.int64]
 

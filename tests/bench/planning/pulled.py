@@ -14,7 +14,7 @@ from support.fields import Pace, make_field
 from bench.harness import Seed, benchmark, cpu_ms
 from planner_service.route_finder import PulledRoute, RouteFinder
 from swarm.errors import TerrainError
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 _ROUTES = 400
 """Of each tree."""

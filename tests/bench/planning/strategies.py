@@ -19,7 +19,7 @@ from bench.planning.chase import Plan, Tally, chase
 from planner_service.kernel_build import load_all
 from planner_service.strategy import ROWS
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import Strategy, Walk
+from swarm.config.setting_types import Strategy, Walk
 from swarm.errors import ConfigError
 
 PAPERS: Strategy = "variable_range+multi_resolution"

@@ -17,7 +17,7 @@ import typer
 from bench.harness import benchmark, names_of, track
 from bench.isolated import TimeLimit
 from launch_scripts.simulation import worlds as crowded
-from launch_scripts.simulation.campaign import in_processes, parse_seeds
+from launch_scripts.simulation.many_seeds import in_processes, parse_seeds
 from launch_scripts.simulation.worlds import CROWDS
 from swarm.errors import ConfigError
 from swarm.runtime.process import collected_rarely

@@ -9,7 +9,7 @@ import msgspec
 
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.values import MOST_PER_AGENT, MOST_TARGETS
+from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
 from swarm.errors import ConfigError
 from swarm.right_of_way.lock_regions import fitting_regions
 

@@ -24,7 +24,7 @@ from bench.wire.queries import positions, route_queries
 from bench.wire.remote import RAW, beside, map_holder, map_key, map_peer, replica_cost
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import NS_PER_S

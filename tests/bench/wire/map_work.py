@@ -13,8 +13,8 @@ from support.made_up_swarm import some_fleet
 from bench.harness import Seed, benchmark, cpu_ms, numbers_of, track
 from shared_map.keeper.compaction import compact
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.presence import Presence
 from shared_map.replication.replica import MapReplica
+from shared_map.vehicle_presence import Presence
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode

@@ -34,7 +34,7 @@ from launch_scripts.launcher.router import RouterService
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Bus, Event, Post
 from swarm.bus.zenoh_bus import open_bus

@@ -27,7 +27,7 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.codec import encode
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import FLEET, POSE, ROUTE
 
 _SIDE = 512

@@ -19,7 +19,7 @@ from bench.harness import cpu_ms
 from shared_map.cost_map import CostMap
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.bus.zenoh_bus import ZenohBus, open_bus

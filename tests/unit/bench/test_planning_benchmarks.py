@@ -22,7 +22,7 @@ from support.tree_lives import LAWS
 from planner_service.tree.route_bounds import LowerBounds
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import TerrainError
-from swarm.wire.routes import NO_TARGET, OK, Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import NO_TARGET, OK, Route, RouteBatch, RouteStatus
 
 STRATEGIES = (
     "auto",

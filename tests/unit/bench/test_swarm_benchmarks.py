@@ -21,7 +21,7 @@ from support.benchmarks import bench
 from support.makers import fleet_of
 
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.simulation.campaign import in_processes
+from launch_scripts.simulation.many_seeds import in_processes
 from swarm.config.agents import plan_agents
 from swarm.errors import SwarmError
 from swarm.runtime.stats import Counters

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from launch_scripts.observe.latest_state import LatestState, RunPlan
+from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.state import state_of
+from launch_scripts.observe.run_state import state_of
 from swarm.grid import GridSpec
 from swarm.wire.messages.processes import Alarm as Told
 from swarm.wire.messages.processes import Stats

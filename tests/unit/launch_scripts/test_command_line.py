@@ -15,11 +15,11 @@ import pytest
 from typer._completion_classes import BashComplete  # what a shell asks: there is no public name for it
 
 from launch_scripts import cli
-from launch_scripts.check import machine
+from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.observe.run_folder import begin_run
-from swarm.config.values import Walk
+from swarm.config.setting_types import Walk
 
 
 def offered(*words: str) -> list[str]:

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from launch_scripts.commands.deploy_commands import app
-from launch_scripts.deploy.size import Estimate, Machine, Swarm, fewest_machines, measured_runs, reaches, too_much
+from launch_scripts.deploy.machines_needed import (
+    Estimate,
+    Machine,
+    Swarm,
+    fewest_machines,
+    measured_runs,
+    reaches,
+    too_much,
+)
 from swarm.errors import ConfigError
 
 WEAK, STRONG = Machine(8, 32, 10_000), Machine(16, 64, 100_000)

@@ -55,7 +55,7 @@ from launch_scripts.monitor.live_layout import (
     summary_markdown,
 )
 from launch_scripts.monitor.movers.styles import Looks
-from launch_scripts.monitor.sinks import Pen, in_markdown, shown
+from launch_scripts.monitor.view_outputs import Pen, in_markdown, shown
 from launch_scripts.observe.recorder import Recorder
 from shared_map.cost_map import CostMap
 from shared_map.replication.marks import zone_author

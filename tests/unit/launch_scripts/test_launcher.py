@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from support.processes import eventually, session_of
 
-from launch_scripts.launcher.child import ExitReason
+from launch_scripts.launcher.child_process import ExitReason
 from launch_scripts.launcher.forkserver import WarmUp, _find_missing
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.takeover import has_ended

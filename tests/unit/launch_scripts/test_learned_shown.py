@@ -10,13 +10,13 @@ from support.makers import stats
 
 from launch_scripts.monitor.ground.ground_colours import GroundColours
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.observe import facts
+from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.run_picture import QUICKER, SLOWER, learned_pixels
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.cost_map import CostMap
-from shared_map.learning.factors import LearnedGauges
+from shared_map.learning.learned_factors import LearnedGauges
 from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace

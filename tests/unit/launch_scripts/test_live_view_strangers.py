@@ -16,7 +16,7 @@ import rerun as rr
 
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.live_layout import make_blueprint
-from launch_scripts.monitor.sinks import Sinks
+from launch_scripts.monitor.view_outputs import Sinks
 from launch_scripts.web import server as web
 from launch_scripts.web.server import MOST_CONNECTIONS, Audience
 from shared_map.terrain.terrain import terrain_of_pace

@@ -18,8 +18,8 @@ from support.exported_metrics import exported
 from support.makers import planner_status, run_info, stats
 
 from launch_scripts import web
-from launch_scripts.observe.counts import Counts
 from launch_scripts.observe.run_observer import OutsideObserver
+from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web.prometheus import HELP, Figures, MetricsEndpoint, Run, families, figures_of, named
 from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler

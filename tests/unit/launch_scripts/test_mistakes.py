@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from launch_scripts import ports
-from launch_scripts.check import machine
+from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import main
 from launch_scripts.commands import running_swarm
 from launch_scripts.deploy.certificates import issue

@@ -34,7 +34,7 @@ from support.target_reports import fleet
 from launch_scripts import parent_death
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.live_layout import make_blueprint
-from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.view_outputs import RecordingWatch, Sinks, new_recording_path
 from launch_scripts.web.server import Audience
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
@@ -379,7 +379,7 @@ import numpy
 import rerun as rr
 from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.sinks import RecordingWatch, Sinks, new_recording_path
+from launch_scripts.monitor.view_outputs import RecordingWatch, Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 
@@ -444,7 +444,7 @@ time.sleep(60)
 
 @pytest.mark.network
 def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.monitor.sinks._PORT_PATIENCE_S", 0.2)
+    monkeypatch.setattr("launch_scripts.monitor.view_outputs._PORT_PATIENCE_S", 0.2)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

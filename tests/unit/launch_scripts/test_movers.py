@@ -34,8 +34,8 @@ from launch_scripts.monitor.movers.vehicles_view import (
     cells_at,
     vehicle_details,
 )
-from launch_scripts.monitor.sinks import Pen, RateLimit, Strips
-from launch_scripts.observe.latest_state import VehicleColumns
+from launch_scripts.monitor.view_outputs import Pen, RateLimit, Strips
+from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S

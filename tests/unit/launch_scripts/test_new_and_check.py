@@ -16,17 +16,17 @@ from hypothesis import strategies as st
 from support.command import Swarm
 
 from launch_scripts import ports
-from launch_scripts.check import machine
+from launch_scripts.check import machine_check as machine
 from launch_scripts.check.scenario_check import places, plots
 from launch_scripts.commands.scenario_commands import Choices, _asked
-from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
+from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.agents import plan_agents
 from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
-from swarm.config.values import Preset, Walk
+from swarm.config.setting_types import Preset, Walk
 from swarm.config.write import commented
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec

@@ -8,10 +8,10 @@ from rich.console import Console
 from support.makers import run_info, stats
 
 from launch_scripts.commands.status_view import table_of, top_fields
-from launch_scripts.launcher.tables import live_table
+from launch_scripts.launcher.terminal_tables import live_table
 from launch_scripts.observe.process_load import ProcessLoads, by_role
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.run_state import RunState
 from launch_scripts.process_table import ROLES
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig

@@ -12,12 +12,12 @@ from support import makers
 from support.makers import fleet_of, planner_status, target_pose
 from support.map_strategies import set_of
 
-from launch_scripts.launcher.tables import plain_line
-from launch_scripts.observe import facts
-from launch_scripts.observe.counts import CertifiedGap
+from launch_scripts.launcher.terminal_tables import plain_line
+from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.history import Sample, Thinned, Tracks
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.state import RunState
+from launch_scripts.observe.run_state import RunState
+from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig

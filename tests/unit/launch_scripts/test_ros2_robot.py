@@ -14,7 +14,7 @@ from support.ros_node import FakeNode
 from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
-from launch_scripts.gateways.ros2.incoming.incoming import Incoming
+from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.incoming.place_routes import PlaceRoutes
 from launch_scripts.gateways.ros2.incoming.readings import Place
 from launch_scripts.gateways.ros2.incoming.robot import Robot
@@ -168,7 +168,7 @@ class Calls(list[tuple[str, Any]]):
 
 
 def test_areas_are_told_once_and_taken_away_where_they_are_drawn_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.incoming.WorkQueue", DoneAtOnce)
+    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.dispatch.WorkQueue", DoneAtOnce)
     orders, author, node = Calls(), Calls(), FakeNode(TYPES)
     frame = Program(SwarmModel()).swarm.frame
     swarm: Any = SimpleNamespace(frame=frame, orders=lambda: orders, vehicle=lambda name: author)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from support.fake_run import played
 
 from launch_scripts.launcher.options import SCENARIOS, find_scenario
-from launch_scripts.observe.latest_state import VehicleColumns
+from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.results import Driven
 from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
+from launch_scripts.observe.run_results import Driven
 from launch_scripts.report.write_report import TABLES, make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S

@@ -13,7 +13,7 @@ import pytest
 from support.command import Swarm
 from support.fake_run import leave, little_scenario, played
 
-from launch_scripts.observe.counts import percent
+from launch_scripts.observe.summed_counts import percent
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.write import scenario_text
 from swarm.wire.messages.processes import Note

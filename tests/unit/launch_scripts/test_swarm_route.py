@@ -19,7 +19,7 @@ from swarm.places import cell_of
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import CostReply, RouteReply
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 GRID = GridSpec(60, 80, 20.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 FRAME = MapFrame(GRID)

@@ -16,8 +16,8 @@ import pytest
 from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
-from launch_scripts.simulation.campaign import try_seed
 from launch_scripts.simulation.laws import BrokenLaw
+from launch_scripts.simulation.many_seeds import try_seed
 from launch_scripts.simulation.simulate import Simulation, simulate
 from launch_scripts.simulation.study import summary as statistics
 from launch_scripts.simulation.study.study import (

@@ -20,7 +20,7 @@ from launch_scripts.launcher.local_swarm import Running
 from launch_scripts.launcher.options import UpOptions, common_run_id
 from launch_scripts.launcher.signals import MachineSignals
 from launch_scripts.launcher.takeover import TakeOver, writing
-from launch_scripts.observe.latest_state import LatestState, RunPlan
+from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario

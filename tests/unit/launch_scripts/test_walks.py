@@ -25,7 +25,7 @@ from launch_scripts.simulation.world.walks import (
 from shared_map.terrain.step_climb import climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
-from swarm.config.values import Walk
+from swarm.config.setting_types import Walk
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -15,15 +15,15 @@ from support.map_strategies import set_of
 from support.planner_swarm import TICK, Ear
 from support.swarm_model import SwarmModel
 
-from planner_service import class_planners
+from planner_service import vehicle_class_planners as class_planners
 from planner_service.service import PlannerService
-from shared_map.class_grounds import class_terrains
-from shared_map.class_maps import ClassMaps, read_by
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import rows_of
 from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.vehicle_class_grounds import class_terrains
+from shared_map.vehicle_class_maps import ClassMaps, read_by
 from swarm.bus.bus import AskEnded, Event
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
@@ -34,7 +34,7 @@ from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import CHASERS, COST, POSE, ROUTE
 
 _TEXT = """

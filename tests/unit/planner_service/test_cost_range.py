@@ -9,7 +9,7 @@ import pytest
 
 from planner_service.kernels.cell_costs import block_ranges
 from planner_service.target_tree import TargetTree
-from planner_service.tree import changes
+from planner_service.tree import cost_changes as changes
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window

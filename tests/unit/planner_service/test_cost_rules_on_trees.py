@@ -16,7 +16,7 @@ from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 GRID = GridSpec(18, 22, 10.0)
 

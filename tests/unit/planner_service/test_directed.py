@@ -17,7 +17,7 @@ from swarm.config.agents import plan_agents
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import PlannerConfig, Scenario
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Holdings

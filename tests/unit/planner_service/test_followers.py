@@ -14,7 +14,7 @@ from planner_service.followers import Followers
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.routes import Route, RouteOutline, RouteStatus
+from swarm.wire.route_columns import Route, RouteOutline, RouteStatus
 
 GRID = GridSpec(20, 30, 10.0)
 

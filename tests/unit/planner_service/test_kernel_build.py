@@ -16,11 +16,11 @@ from planner_service import kernel_build
 from planner_service.kernel_build import KernelLoader, all_kernels, name_of, needed_kernels
 from planner_service.kernels.compile import KERNELS
 from planner_service.pulled_routes import pulls
-from shared_map.class_grounds import class_terrains
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.classes import GROUND
+from shared_map.vehicle_class_grounds import class_terrains
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND
 
 
 def test_every_kernel_of_a_planner_is_built() -> None:

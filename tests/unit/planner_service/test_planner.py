@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scripted_planner import COLS, GRID, ROWS, World, pose
 
-from planner_service.actions import Action, GrownTree, GrowTree
+from planner_service.planner_actions import Action, GrownTree, GrowTree
 from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 
 def test_nothing_is_grown_before_the_target_is_known(world: World) -> None:

@@ -7,14 +7,14 @@ import math
 import numpy as np
 from support.scripted_planner import COLS, GRID, World
 
-from planner_service.actions import Refusal
 from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP, MOST_ROUTES, Answer
+from planner_service.planner_actions import Refusal
 from planner_service.target_tree import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 
 def test_a_person_asks_by_row_and_col(ready: World) -> None:

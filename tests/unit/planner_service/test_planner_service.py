@@ -20,7 +20,7 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, walk
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import MAX_PAYLOAD_BYTES, encode
@@ -34,7 +34,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
     TargetPose,
 )
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import CHASERS, COST, POSE, ROUTE, Topic
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)

@@ -13,9 +13,9 @@ from support.planner_strategies import random_pace
 
 import planner_service
 from planner_service import RouteFinder
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.errors import OutsideGridError
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 
 
 def test_the_example_does_what_it_says() -> None:

@@ -19,7 +19,7 @@ from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest, Sighted
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.route_columns import Route, RouteStatus
 from swarm.wire.topics import BELIEVED, ROUTE, SIGHTED
 
 _TEXT = """

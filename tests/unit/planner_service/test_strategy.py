@@ -13,7 +13,7 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
-from planner_service import actions
+from planner_service import planner_actions as actions
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, GrowthTimes
 from planner_service.strategy import (
     ROWS,
@@ -31,7 +31,7 @@ from planner_service.strategy import (
 from planner_service.target_tree import TargetTree
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import PlannerConfig
-from swarm.config.values import Strategy
+from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
 from swarm.plugins.find import Plugin
 

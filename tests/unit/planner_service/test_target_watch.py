@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from support.makers import target_pose
 
-from planner_service.actions import Tell
+from planner_service.planner_actions import Tell
 from planner_service.target_watch import TargetWatch
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError

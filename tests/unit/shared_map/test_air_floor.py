@@ -16,8 +16,8 @@ from support.effort import few
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.air import air_ground, clearance_floor, lifted_floor
-from swarm.config.classes import AirConfig
 from swarm.config.scenario import PlannerConfig
+from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 STEPS = tuple(zip(STEP_ROW, STEP_COL, strict=True))

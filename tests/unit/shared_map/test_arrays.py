@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared_map.arrays import CellsOf, open_array, private_copy, save_array
+from shared_map.array_files import CellsOf, open_array, private_copy, save_array
 from shared_map.cost_map import CostMap
 from shared_map.terrain.store import load_prepared, save_prepared
 from shared_map.terrain.terrain import terrain_of_pace

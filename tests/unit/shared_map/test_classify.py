@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.draw import line
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 from shared_map.importers.cover.classify import Labels, class_readings, confusion, held_out, learnt, read_labels
 from shared_map.importers.cover.photo_rules import box_sum
 from shared_map.importers.sources import Source, load_source

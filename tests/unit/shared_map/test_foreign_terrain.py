@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.height_models import SIDE, hills, is_water, load, written
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.terrain.layers import TerrainClass
 from swarm.errors import TerrainError
 

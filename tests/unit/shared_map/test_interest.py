@@ -15,11 +15,11 @@ from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import of_file, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.config.classes import MOST_CLASSES
 from swarm.config.scenario import MapConfig
+from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import MarkKind, MarksRequest

@@ -24,7 +24,7 @@ from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
-from swarm.config.values import SlopeRule
+from swarm.config.setting_types import SlopeRule
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from support.map_strategies import retract
 
 from shared_map.cost_map import CostMap
-from shared_map.learning.factors import FACTORS, MOST_STEPS, factors_of, log_steps
+from shared_map.learning.learned_factors import FACTORS, MOST_STEPS, factors_of, log_steps
 from shared_map.learning.measurements import (
     MOST,
     MOST_CELLS,
@@ -24,7 +24,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.classes import MOST_CLASSES
+from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 
 SAID = st.builds(

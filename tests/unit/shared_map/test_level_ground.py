@@ -12,8 +12,8 @@ from scipy import ndimage
 from support.height_models import SIDE, hills, is_water, load, written
 from support.water_models import MODELS, UNKNOWABLE, counted
 
+from shared_map.importers.array_grids import read_npz
 from shared_map.importers.level_ground import level_ground, undeclared_voids
-from shared_map.importers.plain_grids import read_npz
 from shared_map.importers.sources import _jacksboro_path
 
 # --- level ground -------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import THROTTLED
-from shared_map.replication.limits import _MAX_WAITING, Capacity, Quota
+from shared_map.replication.author_limits import _MAX_WAITING, Capacity, Quota
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.cover import photo_rules
 from shared_map.importers.cover.classify import class_readings
 from shared_map.importers.cover.photo_rules import (

@@ -7,9 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared_map import class_grounds as module
-from shared_map.class_grounds import class_grounds, class_terrains, class_truths, load_classes, prepare_classes
+from shared_map import vehicle_class_grounds as module
 from shared_map.terrain.store import load_beside, prepare, scenario_key
+from shared_map.vehicle_class_grounds import (
+    class_grounds,
+    class_terrains,
+    class_truths,
+    load_classes,
+    prepare_classes,
+)
 from swarm.config.load import parse_scenario
 from swarm.errors import TerrainError
 from swarm.runtime.role import RoleSetup

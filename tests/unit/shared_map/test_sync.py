@@ -12,7 +12,7 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapSync
+from shared_map.replication.replica_sync import MapSync
 from swarm.bus.bus import Asked
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarksRequest

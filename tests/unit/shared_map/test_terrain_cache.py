@@ -79,7 +79,7 @@ def test_the_terrain_of_other_code_is_never_taken(
 
 
 def test_the_code_is_all_that_makes_terrain(tmp_path: Path) -> None:
-    from shared_map.arrays import source_digest
+    from shared_map.array_files import source_digest
 
     (tmp_path / "a.py").write_text("one")
     before = source_digest.__wrapped__(tmp_path)

@@ -13,7 +13,7 @@ from rasterio.transform import from_origin
 from support.effort import few
 from support.height_models import load, written
 
-from shared_map.importers.text_grids import read_text_grid
+from shared_map.importers.xyz_grids import read_text_grid
 from swarm.errors import TerrainError
 
 ROWS, COLS, STEP = 12, 9, 25.0
@@ -161,7 +161,7 @@ def test_what_is_no_text_or_has_no_lines_is_refused(tmp_path: Path) -> None:
 
 
 def test_points_are_read_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_map.importers.text_grids._CHUNK_BYTES", 300)
+    monkeypatch.setattr("shared_map.importers.xyz_grids._CHUNK_BYTES", 300)
     plain = read_text_grid(wrote(tmp_path / "a.csv", text_of(POINTS, ",", "x,y,z")))
     np.testing.assert_array_equal(plain.heights, GROUND)
     with pytest.raises(TerrainError, match="line 110: 'what' is no number"):

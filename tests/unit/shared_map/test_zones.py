@@ -15,7 +15,7 @@ from support.swarm_model import SwarmModel
 from shared_map.cost_map import CostMap
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.zone_orders import rows_of, zone_sets
-from shared_map.replication.filter import readable_for_target
+from shared_map.replication.mark_filter import readable_for_target
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied

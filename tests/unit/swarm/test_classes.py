@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from swarm.config.classes import of_class
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import of_class
 from swarm.config.write import scenario_text
 from swarm.errors import ConfigError
 

@@ -36,8 +36,8 @@ from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.vehicles import Body
-from swarm.wire.routes import Route as WireRoute
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import Route as WireRoute
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import BODY, FLEET, NOTE, POSE, RUN
 
 LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE

@@ -15,7 +15,7 @@ from support.wire_strategies import EXAMPLES, routes
 
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import MarkSets
-from swarm.wire.routes import RouteBatch, Routes
+from swarm.wire.route_columns import RouteBatch, Routes
 
 ROOT = Path(__file__).parents[3]
 LARGE = (

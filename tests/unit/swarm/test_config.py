@@ -12,7 +12,7 @@ from swarm.config.agents import plan_agents
 from swarm.config.explain import meanings
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.values import Section
+from swarm.config.setting_types import Section
 from swarm.errors import ConfigError
 
 

@@ -16,7 +16,7 @@ from support.effort import few
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import zone_mask
-from swarm.client.frame import Frame
+from swarm.client.terrain_frame import Frame
 from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario

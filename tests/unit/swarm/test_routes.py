@@ -15,11 +15,11 @@ from support.wire_strategies import routes
 
 from planner_service.kernels import route_walk
 from swarm.errors import ProtocolError
-from swarm.wire import routes as named
+from swarm.wire import route_columns as named
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import Bounded
 from swarm.wire.messages.planning import RouteReply
-from swarm.wire.routes import (
+from swarm.wire.route_columns import (
     OK,
     STATUSES,
     UNREACHABLE,

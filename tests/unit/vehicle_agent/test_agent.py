@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shared_map.class_grounds import class_grounds
 from shared_map.terrain.terrain import terrain_of_pace
+from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -24,7 +24,7 @@ from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply, TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.routes import RouteBatch
+from swarm.wire.route_columns import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle

@@ -8,7 +8,7 @@ import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from support.swarm_model import LossyLinks
 
-from shared_map.class_grounds import class_grounds
+from shared_map.vehicle_class_grounds import class_grounds
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.placement import spawn_cells
 

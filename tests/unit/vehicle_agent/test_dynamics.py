@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm.config.classes import ClassConfig
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.config.vehicle_classes import ClassConfig
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 from vehicle_agent.driving.dynamics import DynamicsWorld, PluginDynamics, Stretch, dynamics_of, own_dynamics

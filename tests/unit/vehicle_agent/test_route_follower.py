@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.grid import GridSpec, walk
-from swarm.wire.routes import directions_of
+from swarm.wire.route_columns import directions_of
 from vehicle_agent.driving.motion import Motion
 from vehicle_agent.driving.route_follower import Follower
 

@@ -16,7 +16,7 @@ from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle

@@ -14,7 +14,7 @@ from support.vehicle_states import record, table
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.routes import RouteStatus
+from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle
 
 GRID = GridSpec(10, 10, 10.0)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import Terrain
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSet

@@ -23,7 +23,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
-from swarm.wire.routes import RouteBatch
+from swarm.wire.route_columns import RouteBatch
 
 _EVERY_NS = NS_PER_S
 _MOST = 64

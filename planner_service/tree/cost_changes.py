@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.cell_costs import BLOCK, block_ranges, count_classes
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 
 Cells = NDArray[np.int64]
 

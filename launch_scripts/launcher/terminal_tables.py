@@ -8,9 +8,9 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.observe import facts
+from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.process_load import ProcessLoad, RoleLoad
-from launch_scripts.observe.state import RunState, TargetLine
+from launch_scripts.observe.run_state import RunState, TargetLine
 
 SHOWN_ALARMS = 5
 _FEWEST_TARGETS = 3

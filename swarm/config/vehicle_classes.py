@@ -11,7 +11,7 @@ from msgspec import Meta
 from swarm.config.cost_rules import PRESETS, check_cost
 from swarm.config.explain import choice
 from swarm.config.ground import CostConfig, ZoneConfig
-from swarm.config.values import Name, Positive, Section
+from swarm.config.setting_types import Name, Positive, Section
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:

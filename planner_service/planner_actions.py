@@ -13,7 +13,7 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import AnyTree, PieceTree, in_cells
 from planner_service.tree.strides import StrideSearch
-from shared_map.arrays import Floats
+from shared_map.array_files import Floats
 from swarm.wire.messages.planning import Believed, PlannerStatus, PushedRoute
 
 _NONE: Floats = np.empty(0, np.float32)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.counts import CertifiedGap, gap_of, gaps_of, gaps_to
-from launch_scripts.observe.latest_state import LatestState, VehicleColumns
+from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
+from launch_scripts.observe.summed_counts import CertifiedGap, gap_of, gaps_of, gaps_to
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, plan_agents
-from swarm.config.classes import GROUND
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, UNPROVEN_OF, merged
 from swarm.wire.messages.vehicles import VehicleState
 

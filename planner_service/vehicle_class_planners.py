@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Iterator
 
 from planner_service.planner import Planner
 from swarm.clock import NS_PER_S
-from swarm.config.classes import GROUND
 from swarm.config.explain import choice
+from swarm.config.vehicle_classes import GROUND
 
 UNUSED_NS = 60 * NS_PER_S
 """A tree that nobody has asked for so long is dropped."""

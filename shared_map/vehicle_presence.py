@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared_map.arrays import Floats
-from shared_map.replication.filter import MarkFilter
+from shared_map.array_files import Floats
+from shared_map.replication.mark_filter import MarkFilter
 from swarm.liveness import Leases
 from swarm.wire.messages.vehicles import Fleet
 

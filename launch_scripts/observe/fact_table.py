@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from launch_scripts.observe.counts import CertifiedGap, gap_text, percent
 from launch_scripts.observe.run_alarms import Alarm
-from launch_scripts.observe.state import RunState, TargetLine
-from swarm.config.classes import GROUND
+from launch_scripts.observe.run_state import RunState, TargetLine
+from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
+from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 
 NONE = "-"

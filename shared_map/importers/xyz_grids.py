@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
-from shared_map.importers.plain_grids import PlainGrid, check_cells
+from shared_map.array_files import Floats
+from shared_map.importers.array_grids import PlainGrid, check_cells
 from swarm.config.input_files import MAX_LINE_BYTES, FileKind, check_bytes, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS

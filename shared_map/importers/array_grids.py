@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 from shared_map.importers.raster_files import BAD_ARCHIVE
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError

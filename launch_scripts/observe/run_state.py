@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from launch_scripts.observe.counts import CertifiedGap, certified_gap, gaps_to
-from launch_scripts.observe.latest_state import LatestState, VehicleColumns
+from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_alarms import Alarm, alarms_of, starts
+from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gaps_to
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
-from swarm.config.classes import GROUND
+from swarm.config.vehicle_classes import GROUND
 from swarm.grid import GridSpec
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from shared_map.replication.tiles import beyond_tile, of_all_classes, region_tiles
 from swarm.config.scenario import Scenario
-from swarm.config.values import RESERVED_GROUP
+from swarm.config.setting_types import RESERVED_GROUP
 from swarm.grid import GridSpec
 
 

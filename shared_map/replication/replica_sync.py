@@ -9,10 +9,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Sequence
 
+from shared_map.replication.author_limits import Quota
 from shared_map.replication.digest import Held, PendingDigest, PendingDigests
-from shared_map.replication.interest import DigestInterest
-from shared_map.replication.limits import Quota
 from shared_map.replication.marks import packed, unpacked
+from shared_map.replication.regions_of_interest import DigestInterest
 from shared_map.replication.replica import MapReplica, Merged
 from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_classes, region_of, region_tiles
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied

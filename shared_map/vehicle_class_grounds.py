@@ -14,8 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
-from shared_map.class_maps import read_by
+from shared_map.array_files import Bools, Floats
 from shared_map.terrain.air import air_terrain
 from shared_map.terrain.store import (
     fetch_kept,
@@ -29,8 +28,9 @@ from shared_map.terrain.store import (
     scenario_key,
 )
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.classes import GROUND, ClassConfig, class_named, driven_classes, flies, of_class
+from shared_map.vehicle_class_maps import read_by
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import GROUND, ClassConfig, class_named, driven_classes, flies, of_class
 from swarm.errors import TerrainError
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.map_data import PACE_LEAST

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.array_files import Bytes, Floats
 from shared_map.learning.measurements import KEYS, MOST_CELLS, ONE, Measurement, measurements_in, rounded
 from shared_map.terrain.layers import TerrainClass, slope_deg
 from swarm.runtime.stats import LEARNED, Counters
