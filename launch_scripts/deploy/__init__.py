@@ -4,4 +4,4 @@
 job apart (`machine_plan`). Each machine gets an archive (`kits`) with the scenario as it runs there
 (`host_scenario`), certificates for its own processes (`certificates`, `revocations`), and a systemd service or a
 compose file (`service_files`, from `templates`). The same scenario and machines give the same plan.
-`machines_needed` says how many machines a swarm needs. """
+`machines_needed` says how many machines a swarm needs."""

@@ -15,4 +15,4 @@ What a launcher promises:
 - An upgrade takes a running part over (`takeover`): successors get ready beside it before it is asked to end.
 
 `up` is the order of all that, from the terrain (`fetched_terrain`) to the report; `console` and `terminal_tables`
-show it. """
+show it."""

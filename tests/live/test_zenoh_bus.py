@@ -99,7 +99,16 @@ class ZenohWorld:
             time.sleep(0.005)
 
     def settle(self) -> None:
+        """Waits until the router knows what all have declared, however busy the machine is: what a session declares
+        arrives in order, so a subscription of its own that hears says that all before it have arrived."""
         time.sleep(0.15)
+        buses = [bus for bus in self.buses if not bus.closed and self.router.process.poll() is None]
+        for number, bus in enumerate(buses):
+            key, until_s = f"settled/{number}/{time.monotonic_ns()}", time.monotonic() + 3.0
+            with bus.session.declare_subscriber(key) as subscriber:
+                while time.monotonic() < until_s and subscriber.try_recv() is None:
+                    buses[number - 1].session.put(key, b"")
+                    time.sleep(0.005)
 
     def cut(self, bus: ZenohBus) -> None:
         self.router.kill()
