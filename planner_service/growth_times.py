@@ -38,6 +38,7 @@ FINE_SHARE = 16
 _TICKS = 32
 """Over so many is averaged how often the target moves, and the row is chosen anew where that has changed by: """
 _NOTICED = 0.05
+"""Moves per tick, far below what makes another row the better one."""
 
 _MEDIAN_OF = 5
 """Of the last so many times the median counts: single ones take longer, as after a change of processors, or to cut

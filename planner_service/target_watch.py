@@ -20,6 +20,7 @@ _CLOCK_OFF_NS = 60 * NS_PER_S
 _REFUSED_OFTEN = 3
 """Poses of a tracker that are refused before it is named: the last of one that was replaced may come late."""
 _MOST_NAMED = 256
+"""Trackers: names cost a stranger nothing."""
 
 
 class TargetWatch:

@@ -118,6 +118,7 @@ class Leases:
 
 
 HIGHEST_RANK = 9
+"""One digit in an id. A job with nine standbys is on more machines than may fail together."""
 _RANKED = re.compile(rf"(.+)\.r([1-{HIGHEST_RANK}])")
 
 

@@ -27,6 +27,7 @@ _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _PLACE = re.compile(rf"(?:(cell|xy|latlon):)?\s*({_NUMBER})\s*,\s*({_NUMBER})\s*")
 _WHOLE = re.compile(r"[+-]?\d+")
 _MOST_DECIMALS = 12
+"""A tenth of a micrometre in degrees: a float has no more."""
 _MEANINGS: dict[Kind, str] = {
     "cell": "a row and a column",
     "xy": "metres of the map",

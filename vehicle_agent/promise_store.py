@@ -20,6 +20,7 @@ from vehicle_agent.traffic.right_of_way_core import OwnRecord
 _SIZE_BYTES = 1 << 18
 """Of each of the two files, and at least four times what still counts in them."""
 _HEAD_BYTES = 4
+"""The length of a record, far more than a file holds."""
 
 
 class _Record(msgspec.Struct, array_like=True):

@@ -23,6 +23,7 @@ _WHOLE = 1.4
 """A block at most so many times as wide as the range of a sensor is seen whole from its middle, which is seen from
 every cell of it."""
 _MOST_SAMPLES = 16
+"""A side. A range that is smaller than an eighth of a block sees too little of it to matter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +157,8 @@ _MOST_MOVED = 0.8
 _GONE = 1e-9
 """So little is left of all mass: then it was nowhere where it was believed to be."""
 _MOST_STEPS = 256
+"""Of one update, some 0.3 s: after a long silence the belief is spread so widely that larger steps change
+little."""
 
 
 class Belief:

@@ -30,6 +30,7 @@ LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for so long before it takes its target for never seen."""
 _TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
+"""Some four months, so that the age of what was never seen is a number."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ STALE_SHARE = 16
 """Networks are found anew when cells have changed in one block of the least stride in so many."""
 
 _HEADER = 32
+"""Bytes: four numbers of eight."""
 _DTYPES = (np.uint32, np.int32, np.int32, np.float32, np.uint32, np.int32, np.uint8, np.uint8)
 
 

@@ -70,6 +70,7 @@ def cost_of_preset(name: str | None) -> CostConfig:
 _SLOPES = ("slope_deg", "slope_percent")
 _VALUES = ("factor", "pace_s_per_m", "speed_m_per_s")
 _LEVEL_TOLERANCE = 1e-3
+"""A table in three decimals may say 0.999 of level ground; what is further off is a mistake."""
 
 
 def with_slope_csv(cost: CostConfig, source: str, base: Path | None) -> CostConfig:

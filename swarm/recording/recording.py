@@ -41,6 +41,7 @@ RAISED = "raise "
 """Before an error by which a service ended, as its last output."""
 _FLUSH_NS = NS_PER_S
 _LONGEST_ERROR = 500
+"""Characters. The whole error stands in the log; the record is compared with that of a replay."""
 _PACKAGES = ("terrain-swarm", "numba", "numpy", "msgspec")
 
 

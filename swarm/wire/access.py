@@ -82,6 +82,7 @@ def _grants(text: str) -> tuple[Grant, ...]:
 
 
 _CODE_BYTES = 16
+"""128 bits, which nobody guesses; half of them would do for a run of hours."""
 
 
 class Authenticator:

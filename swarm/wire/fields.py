@@ -229,6 +229,7 @@ def check_id(name: str, value: object) -> None:
 _KNOWN_IDS: set[str] = set()
 """Ids found valid: the same few hundred come thousands of times a second, in a large swarm some ten thousand."""
 _MAX_KNOWN_IDS = 1 << 16
+"""Several times the ids of the largest swarm. Then all are forgotten: a stranger may make up any number."""
 
 # --- what msgspec cannot check ------------------------------------------------------------------------------------
 

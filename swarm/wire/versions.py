@@ -49,6 +49,7 @@ class Step:
 
 
 _MOST_DIGITS = 9
+"""More would be read by int() in a time that grows with the square of the digits."""
 
 STEPS: dict[type[Message], Step] = {}
 """The steps that are under way. Empty: no message has changed so since each has a version of its own."""

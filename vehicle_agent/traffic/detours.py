@@ -27,6 +27,7 @@ _MOST_CELLS = 20_000
 """Expanded by one search: then there is no way around that is worth it."""
 _AGAIN_NS = NS_PER_S
 _RARELY_NS = 16 * NS_PER_S
+"""A vehicle without a way around is tried again after one second, then after twice as long, up to this."""
 _DIAGONAL = math.sqrt(2.0)
 
 

@@ -22,6 +22,7 @@ _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S
 """Where no host has spoken for so long, nobody needs a warden."""
 _TABLES_KEPT = 16
+"""More than may be on the way at once: an older one is never asked for."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ _OCCUPIED = 0.9
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
 _OLDEST_MS = 1 << 31
+"""Above the age of any wish, and within a column of uint32."""
 
 
 class Steering:

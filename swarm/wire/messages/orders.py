@@ -127,6 +127,7 @@ _Speed = Annotated[float, Meta(ge=0, le=1e4)]
 _Targets = Annotated[list[Id], IDS]
 _WALK: SimulatedWalk = "waypoints"
 _SPEED_M_PER_S = 4.0
+"""As targets of a scenario have it."""
 
 
 class Order(Bounded, frozen=True, kw_only=True):
