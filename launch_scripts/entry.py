@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 
 from launch_scripts.web.health_probe import fast
 
@@ -17,7 +18,8 @@ def main() -> int:
     if sys.argv[1:2] == ["health"] and (code := fast(sys.argv[1:])) is not None:
         return code
     try:
-        if sys.argv[1:2] and sys.argv[1] in _RUNS and not any(word.startswith(_SAYS_MORE) for word in sys.argv[2:]):
+        runs = sys.argv[1:2] and sys.argv[1] in _RUNS and find_spec("typer")
+        if runs and not any(word.startswith(_SAYS_MORE) for word in sys.argv[2:]):
             # It takes longest of all that a start waits for, so it begins before the command itself is loaded.
             from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, start_forkserver
 

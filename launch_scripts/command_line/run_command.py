@@ -15,9 +15,9 @@ from typer.exceptions import TyperException
 from swarm.config.input_files import quoted
 from swarm.errors import ConfigError, StoreError, SwarmError
 
-_EXTRAS = {
+EXTRAS = {
     "pyogrio": "vectors", "shapely": "vectors", "mcap": "ros2", "rosbags": "ros2", "xxhash": "ros2",
-    "distributed": "sweep", "pyarrow": "sweep",
+    "dask": "sweep", "distributed": "sweep", "pyarrow": "sweep", "rerun": "all",
 }  # fmt: skip
 """Package that a small install lacks -> the extra which brings it."""
 
@@ -51,9 +51,9 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         return error.exit_code
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package not in _EXTRAS:
+        if package not in EXTRAS:
             raise  # a fault of ours
-        needed = f"pip install 'terrain-swarm[{_EXTRAS[package]}]'"
+        needed = f"pip install 'terrain-swarm[{EXTRAS[package]}]'"
         print(f"swarm: this needs {package}, which is not installed: {needed}", file=sys.stderr)
         return ConfigError.exit_code
     except BrokenPipeError:

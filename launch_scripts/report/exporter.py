@@ -22,6 +22,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -166,7 +167,6 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
             layer, options = _gpx_points(layer), {}
     fields = {name: kind for name, (kind, _) in more.items()} | dict(layer.fields)
     columns = [_column(layer, name, kind, more.get(name, ("text", None))[1]) for name, kind in fields.items()]
-    made = {"Point": shapely.points, "LineString": shapely.linestrings, "Polygon": shapely.polygons}[layer.shape]
     shapes = np.empty(len(layer.features), object)
     for n, feature in enumerate(layer.features):
         parts = [_placed(part, frame) for part in feature.parts] if degrees else feature.parts
@@ -175,8 +175,13 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
                 f"cannot write the layer {layer.name}: a place has no longitude and latitude in "
                 f"{frame.grid.crs[:60]}; write a .gpkg, which is in metres of the map"
             )
-        border, holes = parts[0], [parts[1:]] if parts[1:] else []
-        shapes[n] = made(border[0]) if layer.shape == "Point" else made(border, *holes)
+        match layer.shape:
+            case "Point":
+                shapes[n] = shapely.Point(parts[0][0])
+            case "LineString":
+                shapes[n] = shapely.LineString(parts[0])
+            case "Polygon":
+                shapes[n] = shapely.Polygon(parts[0], parts[1:])
     high = any(part.shape[1] == 3 for feature in layer.features for part in feature.parts)
     crs = "EPSG:4326" if form.driver in ("LIBKML", "GPX") else None
     if form.driver == "GPKG" and frame.grid.crs != "local":
@@ -315,12 +320,17 @@ def iso_time(value: Any) -> Any:
 
 def in_degrees(points: Points, frame: MapFrame) -> Points:
     """Longitudes and latitudes of points of the map; without a jump where the map crosses 180 degrees."""
+    lat, lon = frame.to_degrees(points[:, 0], points[:, 1])
+    return np.stack([np.where(lon < _least_lon(frame), lon + 360.0, lon), lat], axis=1)
+
+
+@lru_cache(4)
+def _least_lon(frame: MapFrame) -> float:
+    """Smaller longitudes lie beyond 180 degrees. Kept: each of thousands of points is a feature of a GPX file."""
     from swarm.places import bounds_of
 
-    lat, lon = frame.to_degrees(points[:, 0], points[:, 1])
     box = bounds_of(frame)
-    least_lon = -360.0 if box is None or box[3] <= 180.0 else 0.0  # smaller ones lie beyond 180 degrees
-    return np.stack([np.where(lon < least_lon, lon + 360.0, lon), lat], axis=1)
+    return -360.0 if box is None or box[3] <= 180.0 else 0.0
 
 
 def _placed(points: Points, frame: MapFrame) -> Points:

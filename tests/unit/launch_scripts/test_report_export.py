@@ -15,7 +15,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+import shapely
 from numpy.typing import NDArray
+from pyogrio import raw
 from rasterio.features import rasterize
 from rasterio.transform import from_origin
 from support.command import Swarm
@@ -24,7 +26,7 @@ from support.map_strategies import set_of
 
 from launch_scripts.observe.history import BegunRoute
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.report.exporter import COSTS, in_degrees
+from launch_scripts.report.exporter import COSTS, in_degrees, write_layers
 from launch_scripts.report.run_arrays import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.mark_store import KeeperStore
@@ -126,7 +128,6 @@ def test_what_never_moved_is_a_point_and_no_line_without_a_length(run: Path) -> 
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_every_format_holds_all_layers_that_it_can(run: Path, tmp_path: Path, swarm: Swarm, ending: str) -> None:
-    raw = pytest.importorskip("pyogrio.raw", reason="the extra vectors is not installed")
     assert swarm("export", run, "--format", ending, "--out", tmp_path)[0] == 0
     tracks = read_tracks(run / TRACKS_FILE)
     if ending == "csv":
@@ -198,7 +199,6 @@ def test_nothing_is_replaced_unless_asked(run: Path, tmp_path: Path, swarm: Swar
 def test_another_program_reads_the_same_from_a_geopackage(
     run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm
 ) -> None:
-    raw = pytest.importorskip("pyogrio.raw", reason="the extra vectors is not installed")
     out = tmp_path / f"{run.name}.gpkg"
     assert swarm("export", run, "--format", "gpkg", "--out", tmp_path)[0] == 0
     tracks = read_tracks(run / TRACKS_FILE)
@@ -229,10 +229,12 @@ def test_another_program_reads_the_same_from_a_geopackage(
     assert len(raw.read(tmp_path / "marks.gpkg", layer="marks")[2]) == 3
 
 
-def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others() -> None:
+def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others(tmp_path: Path) -> None:
     chance = np.random.default_rng(5)
     kinds = chance.choice(np.array([0, 1, 2, 255], np.uint8), (40, 50), p=[0.3, 0.3, 0.1, 0.3])
     paces = chance.choice(np.array([0.1, 0.25, 3.0], np.float32), (40, 50))
+    kinds[5:25, 5:25] = MarkKind.LETHAL
+    kinds[8, 8] = kinds[12, 12:14] = kinds[13, 12] = 255  # two holes, of four corners and of six
     grid = GridSpec(40, 50, 10.0, 100.0, 900.0)
     layer = mark_layer(grid, kinds, paces)
     codes = {"lethal": 1, "0.1": 2, "0.25": 3, "3.0": 4}
@@ -251,6 +253,11 @@ def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others() -> No
         expected[(kinds == MarkKind.PACE) & (paces == np.float32(pace))] = number
     assert (drawn == expected).all()
     assert sum(int(each.values["cells"] or 0) for each in layer.features) == (expected > 0).sum()  # type: ignore[arg-type]
+    assert len({len(hole) for each in layer.features for hole in each.parts[1:]}) > 1, "holes of several lengths"
+    for file in (tmp_path / "marks.gpkg", tmp_path / "marks.geojson"):
+        write_layers(file, [layer], MapFrame(grid))
+        written = shapely.from_wkb(raw.read(file)[2])
+        assert shapely.area(written).sum() == pytest.approx(100 * (expected > 0).sum())
 
 
 def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path, swarm: Swarm) -> None:

@@ -8,6 +8,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
@@ -97,8 +98,9 @@ def test_bulk_marks_without_numpy_are_refused_in_a_sentence() -> None:
     assert python(code).stdout == "many sets at once are read with NumPy only: ask without `bulk`\n"
 
 
-def test_the_command_on_a_small_install_says_what_to_install() -> None:
-    done = python(BLOCKED + "from launch_scripts.entry import main; sys.exit(main())")
+@pytest.mark.parametrize("words", [[], ["status"], ["demo"], ["up", "demo"]])
+def test_the_command_on_a_small_install_says_what_to_install(words: list[str]) -> None:
+    done = python(BLOCKED + f"from launch_scripts.entry import main; sys.argv[1:] = {words}; sys.exit(main())")
     assert done.returncode == 1
     assert done.stdout == ""
     [sentence] = done.stderr.splitlines()
