@@ -71,21 +71,13 @@ def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: Some
         seed=chosen.seed if run.seed is None else run.seed,
         monitor=msgspec.structs.replace(chosen.monitor, live=chosen.monitor.live and not run.no_live),
     )
-    some = chosen_processes(chosen, part.only or (), part.rank)
-    roles = tuple(
-        role
-        for role in ROLES
-        if (not named or role in named) and not (role == "router" and meeting.connect is not None)
-    )
-    one_by_one = any("." in word for word in part.only or ())
+    joins = meeting.connect is not None or (bool(named) and "router" not in named)
     return run_swarm(
         UpOptions(
             chosen,
             run.runs,
-            roles=roles,
-            joins="router" not in roles,
-            rank=part.rank,
-            table=tuple(spec for spec in some if spec.role in roles) if one_by_one else None,
+            chosen_processes(chosen, part.only or ROLES, part.rank, joins=joins),
+            joins=joins,
             run_id=part.run_id,
             as_json=run.as_json,
             plain=run.plain,

@@ -161,7 +161,7 @@ class LocalSwarm:
 
     def __init__(
         self,
-        specs: list[ProcessSpec],
+        specs: Iterable[ProcessSpec],
         setup_of: Callable[[ProcessSpec], RoleSetup],
         log_dir: Path,
         log_format: LogFormat = "text",

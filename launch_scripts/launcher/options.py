@@ -250,11 +250,10 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
 class UpOptions:
     """Options of a run.
 
+    table          the processes to start here, in order of start
     joins          there is a router elsewhere: none is started here
-    rank           of planners and the targets process, start only those of this rank; if None all
     run_id         the run to take part in; if None it is made or found
     began_s        time.monotonic() at which the command was given
-    table          start these processes only; if None all of `roles`
     metrics_port   where figures are served to Prometheus, and health to probes; 0 is any
     signals_address  of this machine, on which that port is opened
     log_format     of all logs of this machine
@@ -264,19 +263,22 @@ class UpOptions:
 
     scenario: Scenario
     runs: Path
-    roles: tuple[str, ...] = ROLES
+    table: tuple[ProcessSpec, ...]
     joins: bool = False
-    rank: int | None = None
     run_id: str | None = None
     as_json: bool = False
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
-    table: tuple[ProcessSpec, ...] | None = None
     record_inputs: bool = False
     metrics_port: int | None = None
     takes_over: bool = False
     signals_address: str = LOOPBACK
     log_format: LogFormat = "text"
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Those of the processes that are started here."""
+        return tuple(dict.fromkeys(spec.role for spec in self.table))
 
     @property
     def is_new(self) -> bool:
@@ -286,13 +288,12 @@ class UpOptions:
     @property
     def is_whole(self) -> bool:
         """Whether nothing but a router may be lacking."""
-        return set(ROLES[1:]) <= set(self.roles) and self.rank is None and self.table is None
+        return set(processes_of(self.scenario, ROLES[1:])) <= set(self.table)
 
     @property
     def records(self) -> bool:
-        """Whether this launcher, alone of all of the run, records and reports it. Raises ConfigError where there is
-        no process to start."""
-        return any(spec.name == RECORDED_BESIDE for spec in table_of(self))
+        """Whether this launcher, alone of all of the run, records and reports it."""
+        return any(spec.name == RECORDED_BESIDE for spec in self.table)
 
     @property
     def asks_for_ground(self) -> bool:
@@ -303,34 +304,26 @@ class UpOptions:
     def ranks_of_added(self) -> list[int]:
         """Which planners of a target that is added while the swarm runs are started here: as those of the
         scenario's first target, so that each starts on one machine, and those of one target apart."""
-        if self.table is None:
-            ranks = range(self.scenario.standbys.planner + 1) if "planner" in self.roles else ()
-            return [rank for rank in ranks if self.rank in (None, rank)]
         ids = [split_rank(spec.id) for spec in self.table if spec.role == "planner"]
         return [rank for target, rank in ids if target == self.scenario.target_ids[0]]
 
 
-def table_of(options: UpOptions) -> list[ProcessSpec]:
-    """The processes to start here. Raises ConfigError if there are none."""
-    table = processes_of(options.scenario, options.roles, options.rank)
-    if options.table is not None:
-        table = list(options.table)
-    if not table:
-        of_rank = "" if options.rank is None else f" of rank {options.rank}"
-        raise ConfigError(
-            f"scenario {options.scenario.name} has no {' or '.join(options.roles)}{of_rank}; see standbys"
-        )
-    return table
-
-
-def chosen_processes(scenario: Scenario, words: Sequence[str], rank: int | None) -> list[ProcessSpec]:
+def chosen_processes(
+    scenario: Scenario, words: Sequence[str], rank: int | None, *, joins: bool = False
+) -> tuple[ProcessSpec, ...]:
     """The processes that `--only` names, in order of start: of a role, or `ROLE.ID` alone. Routers and keepers may
-    have any id, as there may be more of them than in the scenario. Raises ConfigError where there is none."""
+    have any id, as there may be more of them than in the scenario. Raises ConfigError where there is none.
+
+    rank   of planners and the targets process, only those of this rank; if None all
+    joins  there is a router elsewhere: none is among them
+    """
     chosen: dict[str, ProcessSpec] = {}
     for word in words:
         role, _, id = word.partition(".")
         if role not in ROLES:
             raise ConfigError(f"--only: no role {role!r}{choice(role, ROLES, ' the roles are ')}")
+        if joins and role == "router":
+            continue
         every = processes_of(scenario, (role,), rank)
         if id:
             ids = [spec.id for spec in processes_of(scenario, (role,))]
@@ -342,4 +335,7 @@ def chosen_processes(scenario: Scenario, words: Sequence[str], rank: int | None)
                 raise ConfigError(str(error)) from error
             every = [spec_of(role, id)]
         chosen |= {spec.name: spec for spec in every}
-    return sorted(chosen.values(), key=lambda spec: ROLES.index(spec.role))
+    if not chosen:
+        of_rank = "" if rank is None else f" of rank {rank}"
+        raise ConfigError(f"scenario {scenario.name} has no {' or '.join(words)}{of_rank} to start; see standbys")
+    return tuple(sorted(chosen.values(), key=lambda spec: ROLES.index(spec.role)))

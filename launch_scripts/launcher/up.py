@@ -24,7 +24,6 @@ from launch_scripts.launcher.options import (
     make_run_dir,
     new_run_id,
     next_incarnation,
-    table_of,
 )
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.signals import MachineSignals, StopAsked
@@ -79,7 +78,7 @@ class _RefusedError(SwarmError):
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
-    for spec in table_of(options):
+    for spec in options.table:
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
     if not options.joins and not options.takes_over:
@@ -134,7 +133,7 @@ class _Run:
         self._terminal = Terminal(options.as_json, options.plain, lines)
         self._stop_asked = StopAsked()
         self._preparing = "preparing the terrain"
-        self._swarm = LocalSwarm(table_of(options), self._setup_of, run_dir, options.log_format)
+        self._swarm = LocalSwarm(options.table, self._setup_of, run_dir, options.log_format)
         self._disk = DiskWatch(run_dir)
         self.begun = False
         """Whether all that can be refused before a process starts has been accepted."""
@@ -322,9 +321,9 @@ class _Run:
 
     def _ordered_planners(self) -> OrderedPlanners:
         options = self._options
-        whole = not options.joins and options.table is None and set(ROLES[1:]) <= set(options.roles)
+        whole = options.is_whole and not options.joins
         return OrderedPlanners(
-            self._scenario, self._swarm, options.ranks_of_added, table_of(options), whole, self._terminal.say
+            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, self._terminal.say
         )
 
     def _is_up(self, watcher: Watcher) -> bool:

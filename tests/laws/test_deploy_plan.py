@@ -148,9 +148,11 @@ def test_planners_of_an_added_target_start_on_one_machine_each(scenario: Scenari
     ranks = []
     for host in plan.hosts:
         words = [process.selector for process in host.processes]
-        table = tuple(chosen_processes(plan.scenario, words, None))
+        if not words:
+            continue
+        table = chosen_processes(plan.scenario, words, None)
         assert [spec.name for spec in table] == [process.name for process in host.processes]
-        own = UpOptions(plan.scenario, Path(), table=table).ranks_of_added
+        own = UpOptions(plan.scenario, Path(), table).ranks_of_added
         ranks += own
         assert len(own) <= 1 or len(plan.hosts) == 1
     assert sorted(ranks) == list(range(plan.scenario.standbys.planner + 1))
@@ -166,8 +168,9 @@ def test_one_launcher_records_the_run_on_a_machine_that_has_the_ground(
         return
     records = []
     for host in plan.hosts:
-        table = tuple(chosen_processes(plan.scenario, [process.selector for process in host.processes], None))
-        records += [host] if table and UpOptions(plan.scenario, Path(), table=table).records else []
+        words = [process.selector for process in host.processes]
+        if words and UpOptions(plan.scenario, Path(), chosen_processes(plan.scenario, words, None)).records:
+            records.append(host)
     assert [host.name for host in records] == [plan.records]
     assert records[0].has_files
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from launch_scripts.launcher.local_swarm import Backoff
-from launch_scripts.launcher.options import UpOptions, chosen_processes
-from launch_scripts.launcher.up import run_swarm
+from launch_scripts.launcher.options import chosen_processes
 from launch_scripts.process_table import ROLES, STOP_ORDER, TABLE, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
@@ -49,10 +46,11 @@ def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_ra
     assert len([spec for spec in processes_of(scenario, rank=1) if spec.role == "agent"]) == 4
 
 
-def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    options = UpOptions(Scenario(name="x"), tmp_path, roles=("planner",), rank=1)
-    with pytest.raises(ConfigError, match="scenario x has no planner of rank 1; see standbys"):
-        run_swarm(options)
+def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence() -> None:
+    with pytest.raises(ConfigError, match="scenario x has no planner of rank 1 to start; see standbys"):
+        chosen_processes(Scenario(name="x"), ["planner"], 1)
+    with pytest.raises(ConfigError, match="scenario x has no router to start"):
+        chosen_processes(Scenario(name="x"), ["router"], None, joins=True)
 
 
 def test_processes_are_chosen_by_role_and_id_and_start_in_order() -> None:

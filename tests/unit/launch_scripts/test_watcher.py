@@ -206,7 +206,7 @@ def test_its_table_has_a_line_for_each_process_or_where_room_lacks_for_each_role
 def test_of_the_launchers_of_any_plan_by_machines_one_records(tmp_path: Path) -> None:
     of_keeper = [spec for spec in PROCESSES if spec.role in ("router", "keeper")]
     others = tuple(spec for spec in PROCESSES if spec not in of_keeper)
-    assert UpOptions(SCENARIO, tmp_path).records
-    assert UpOptions(SCENARIO, tmp_path, table=tuple(of_keeper)).records
-    assert not UpOptions(SCENARIO, tmp_path, table=others).records
-    assert not UpOptions(SCENARIO, tmp_path, table=(ProcessSpec("keeper", "1", ""), *others)).records
+    assert UpOptions(SCENARIO, tmp_path, PROCESSES).records
+    assert UpOptions(SCENARIO, tmp_path, tuple(of_keeper)).records
+    assert not UpOptions(SCENARIO, tmp_path, others).records
+    assert not UpOptions(SCENARIO, tmp_path, (ProcessSpec("keeper", "1", ""), *others)).records
