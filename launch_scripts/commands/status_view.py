@@ -22,12 +22,11 @@ from launch_scripts.launcher.console import make_output_outlive_readers
 from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState
-from launch_scripts.observe.process_load import ProcessLoad, by_role
+from launch_scripts.observe.process_load import ProcessLoad
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import gaps_to
 from launch_scripts.plain_text import plain
-from launch_scripts.process_table import ROLES
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
 from swarm.clock import NS_PER_S, MonotonicClock
@@ -234,7 +233,7 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
 
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
     """The run at an instant, at most 80 columns wide."""
-    load = loads_table(processes if each else by_role(processes, ROLES), each=each)
+    load = loads_table(processes, each=each)
     title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').shown(state)}", style="bold")
     alarms = (Text(line, style="red") for line in facts.alarm_lines(state, _SHOWN_ON_TOP))
     return fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)

@@ -9,8 +9,10 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.process_load import ProcessLoad, RoleLoad
+from launch_scripts.observe.process_load import ProcessLoad
 from launch_scripts.observe.run_state import RunState, TargetLine
+from launch_scripts.observe.summed_counts import sum_of
+from launch_scripts.process_table import ROLES
 
 SHOWN_ALARMS = 5
 _FEWEST_TARGETS = 3
@@ -76,36 +78,42 @@ def _style(line: TargetLine) -> str | None:
     return "yellow" if line.lost else None
 
 
-def loads_table(lines: Sequence[ProcessLoad | RoleLoad], *, each: bool) -> Table:
-    """At most 80 columns wide.
-
-    each  whether a line is a process, else it is a role
-    """
+def loads_table(processes: Sequence[ProcessLoad], *, each: bool) -> Table:
+    """A line for each process, or else for each role, in the order of the table of processes. At most 80 columns
+    wide."""
     table = columns("process" if each else "role", "up", "CPU %", "memory", "late/s", "messages/s", "restarts")
-    if not each:
-        table.add_column("busiest", no_wrap=True, overflow="ellipsis")
-    for line in lines:
-        table.add_row(*_load_row(line), style=_load_style(line))
+    if each:
+        for line in processes:
+            up = facts.seconds(line.up_s) if line.alive else "gone"
+            table.add_row(line.name, up, *_load_row([line], [line]), style=_load_style(line.restarts, line.alive))
+        return table
+    table.add_column("busiest", no_wrap=True, overflow="ellipsis")
+    for role in dict.fromkeys([*ROLES, *(line.role for line in processes)]):
+        mine = [line for line in processes if line.role == role]
+        alive = [line for line in mine if line.alive]
+        busiest = max(alive, key=lambda line: line.cpu_percent or 0.0, default=None)
+        named = busiest is not None and busiest.cpu_percent is not None and len(mine) > 1
+        last = f"{busiest.name} {busiest.cpu_percent:.0f} %" if named else ""
+        if mine:
+            style = _load_style(sum(line.restarts for line in mine), len(alive) == len(mine))
+            table.add_row(role, f"{len(alive)} of {len(mine)}", *_load_row(alive, mine), last, style=style)
     return table
 
 
-def _load_row(line: ProcessLoad | RoleLoad) -> tuple[str, ...]:
-    told = (
-        _number(line.cpu_percent),
-        "-" if line.rss_bytes is None else f"{line.rss_bytes / (1 << 20):,.0f} MB",
-        _number(line.late_per_s),
-        facts.count(line.messages_per_s),
-        str(line.restarts),
+def _load_row(alive: Sequence[ProcessLoad], mine: Sequence[ProcessLoad]) -> tuple[str, ...]:
+    """Sums of those that are alive; of all of them the worst lateness, and how often they were started again."""
+    memory = sum_of(line.rss_bytes for line in alive)
+    return (
+        _number(sum_of(line.cpu_percent for line in alive)),
+        "-" if memory is None else f"{memory / (1 << 20):,.0f} MB",
+        _number(max((line.late_per_s for line in mine if line.late_per_s is not None), default=None)),
+        facts.count(sum_of(line.messages_per_s for line in alive)),
+        str(sum(line.restarts for line in mine)),
     )
-    if isinstance(line, ProcessLoad):
-        return line.name, facts.seconds(line.up_s) if line.alive else "gone", *told
-    busiest = f"{line.busiest.name} {line.busiest.cpu_percent:.0f} %" if line.busiest and line.known > 1 else ""
-    return line.role, f"{line.alive} of {line.known}", *told, busiest
 
 
-def _load_style(line: ProcessLoad | RoleLoad) -> str | None:
-    whole = line.alive if isinstance(line, ProcessLoad) else line.alive == line.known
-    return "yellow" if line.restarts and whole else None if whole else "red"
+def _load_style(restarts: int, whole: bool) -> str | None:
+    return ("yellow" if restarts else None) if whole else "red"
 
 
 def _number(value: float | None) -> str:

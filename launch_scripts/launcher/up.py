@@ -36,7 +36,7 @@ from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.ports import check_ports, page_of
-from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, ROLES, TABLE, ProcessSpec
+from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
@@ -343,7 +343,7 @@ class _Run:
 
     def _tell(self, watcher: Watcher) -> None:
         known = watcher.known
-        up = known.up() if isinstance(known, OwnPart) else None
+        up = known.own_up() if isinstance(known, OwnPart) else None
         self._signals.turned(known.observed, self._started_ns, self._missing(watcher), up)
         if (sentence := self._disk.check_room(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")

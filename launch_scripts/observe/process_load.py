@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 
-from launch_scripts.observe.summed_counts import sum_of
 from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CPU_S, MESSAGES_PER_S, RESTARTS, RSS_BYTES
 from swarm.wire.messages.processes import Stats
@@ -15,8 +14,8 @@ _LEAST_NS = NS_PER_S // 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Load:
-    """What is said of processes and of roles, over the last second or so; None where it is not known.
+class ProcessLoad:
+    """What one process takes up, over the last second or so; None where it is not known.
 
     cpu_percent  100 is one core
     late_per_s   ticks that came later than half a period, or not at all
@@ -28,12 +27,6 @@ class _Load:
     late_per_s: float | None
     messages_per_s: float | None
     restarts: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProcessLoad(_Load):
-    """One process."""
-
     id: str
     alive: bool
     up_s: float
@@ -41,18 +34,6 @@ class ProcessLoad(_Load):
     @property
     def name(self) -> str:
         return f"{self.role}-{self.id}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class RoleLoad(_Load):
-    """All processes of a role: sums, and the worst of lateness.
-
-    busiest  the one that takes most CPU; None if none says
-    """
-
-    alive: int
-    known: int
-    busiest: ProcessLoad | None
 
 
 class ProcessLoads:
@@ -98,30 +79,3 @@ def _rate(before: Stats | None, now: Stats, where: str, name: str, times: float 
     if before is None or earlier is None or later is None:
         return None
     return float(max(later - earlier, 0) * times * NS_PER_S / (now.stamp_ns - before.stamp_ns))
-
-
-def by_role(lines: Iterable[ProcessLoad], roles: Iterable[str]) -> list[RoleLoad]:
-    """The sums of each role, in the order of `roles`; others after them."""
-    of: dict[str, list[ProcessLoad]] = {role: [] for role in roles}
-    for line in lines:
-        of.setdefault(line.role, []).append(line)
-    return [_role_load(role, mine) for role, mine in of.items() if mine]
-
-
-def _role_load(role: str, mine: list[ProcessLoad]) -> RoleLoad:
-    alive = [line for line in mine if line.alive]
-    return RoleLoad(
-        role=role,
-        alive=len(alive),
-        known=len(mine),
-        cpu_percent=sum_of(line.cpu_percent for line in alive),
-        rss_bytes=sum_of(line.rss_bytes for line in alive),
-        late_per_s=max((line.late_per_s for line in mine if line.late_per_s is not None), default=None),
-        messages_per_s=sum_of(line.messages_per_s for line in alive),
-        restarts=sum(line.restarts for line in mine),
-        busiest=max(
-            (line for line in alive if line.cpu_percent is not None),
-            key=lambda line: line.cpu_percent or 0.0,
-            default=None,
-        ),
-    )

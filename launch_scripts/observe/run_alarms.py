@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from launch_scripts.observe.latest_messages import LatestState, RunPlan
+from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.plain_text import plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -128,20 +128,31 @@ class Alarm:
         }  # fmt: skip
 
 
-def alarms_of(latest: LatestState, plan: RunPlan, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
-    """All alarms of a run at an instant: what lasts, the serious first, then what is over, the newest first.
-
-    plan  the processes that are looked at; the launcher of a part of a run has one of its own
-    """
-    began_ns = plan.started_ns or 0
-    wanted = list(targets)
+def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
+    """All alarms of a run at an instant: what lasts, the serious first, then what is over, the newest first."""
+    began_ns, wanted = latest.plan.started_ns or 0, list(targets)
     found = [
-        *_missing(latest, plan, wanted, now_ns),
+        *_missing(latest, wanted, now_ns),
         *_silent(latest, now_ns),
         *_lost(latest, wanted, now_ns),
         *_told(latest),
     ]
-    alarms = [_in_run(each, began_ns) for each in found]
+
+    def seconds(stamp_ns: int | None) -> float | None:
+        return None if stamp_ns is None else max(stamp_ns - began_ns, 0) / NS_PER_S
+
+    alarms = [
+        Alarm(
+            plain(told.kind),
+            plain(told.about),
+            plain(told.text),
+            None if told.since_ns == _UNKNOWN_NS else seconds(told.since_ns),
+            seconds(told.over_ns),
+            told.cell,
+            told.target,
+        )
+        for told in found
+    ]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))
     return (*lasting, *over)
@@ -149,21 +160,6 @@ def alarms_of(latest: LatestState, plan: RunPlan, targets: Iterable[str], now_ns
 
 _UNKNOWN_NS = -1
 """When an alarm began whose beginning nobody knows. No message can say so."""
-
-
-def _in_run(told: Told, began_ns: int) -> Alarm:
-    def seconds(stamp_ns: int) -> float:
-        return max(stamp_ns - began_ns, 0) / NS_PER_S
-
-    return Alarm(
-        plain(told.kind),
-        plain(told.about),
-        plain(told.text),
-        None if told.since_ns == _UNKNOWN_NS else seconds(told.since_ns),
-        None if told.over_ns is None else seconds(told.over_ns),
-        told.cell,
-        told.target,
-    )
 
 
 def _told(latest: LatestState) -> Iterator[Told]:
@@ -174,32 +170,36 @@ def _told(latest: LatestState) -> Iterator[Told]:
                 yield alarm
 
 
-def starts(latest: LatestState, plan: RunPlan, role: str, id: str, now_ns: int) -> bool:
+def starts(latest: LatestState, role: str, id: str, now_ns: int) -> bool:
     """Whether a process has not been seen yet, and has not been waited for for long."""
-    began = plan.started_ns is not None and now_ns - plan.started_ns < STARTING_S * NS_PER_S
+    began_ns = latest.plan.started_ns
+    began = began_ns is not None and now_ns - began_ns < STARTING_S * NS_PER_S
     return began and not latest.knows(role, id)
 
 
-def _missing(latest: LatestState, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Told]:
-    for role, id in plan.crew_now(targets):
-        if latest.fills(role, id) or starts(latest, plan, role, id, now_ns):
+def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Told]:
+    for role, id in latest.plan.crew_now(targets):
+        if latest.fills(role, id) or starts(latest, role, id, now_ns):
             continue
-        stats = latest.newest_stats(role, id)
         leads = next((ranked for ranked in latest.ids_up(role) if job_of(ranked) == job_of(id)), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
-        text = f"{role}-{id} is gone{instead}"
-        target = job_of(id) if role == "planner" else None
-        since_ns = _UNKNOWN_NS if stats is None else stats.stamp_ns
-        yield Told(kind="down", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target)
+        yield _of_process("down", role, id, f"is gone{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
 
 
 def _silent(latest: LatestState, now_ns: int) -> Iterator[Told]:
     for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
-        text = f"{role}-{id} is there, but tells nothing"
-        target = job_of(id) if role == "planner" else None
-        stats = latest.newest_stats(role, id)
-        since_ns = heard_ns if stats is None else stats.stamp_ns
-        yield Told(kind="silent", about=f"{role}-{id}", text=text, since_ns=since_ns, target=target)
+        yield _of_process("silent", role, id, "is there, but tells nothing", _said_ns(latest, role, id, heard_ns))
+
+
+def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
+    """When a process has said last what it counts."""
+    stats = latest.newest_stats(role, id)
+    return otherwise_ns if stats is None else stats.stamp_ns
+
+
+def _of_process(kind: str, role: str, id: str, what: str, since_ns: int) -> Told:
+    name, target = f"{role}-{id}", job_of(id) if role == "planner" else None
+    return Told(kind=kind, about=name, text=f"{name} {what}", since_ns=since_ns, target=target)
 
 
 def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[Told]:

@@ -148,7 +148,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),
         certified_gap=certified_gap(latest),
         learned=_learned(latest),
-        alarms=alarms_of(latest, latest.plan, targets, now_ns),
+        alarms=alarms_of(latest, targets, now_ns),
         orders=tuple(map(plain, latest.book.standing)),
         grid=latest.grid,
         **{name: latest.total(name) for name in _TOTALS},
@@ -184,7 +184,7 @@ def _lines(
                 routes_served=latest.of_job("planner", id, "routes_served"),
                 strategy=None if status is None else status.strategy,
                 tracker=None if status is None else status.tracker,
-                starting=starts(latest, latest.plan, "planner", id, now_ns),
+                starting=starts(latest, "planner", id, now_ns),
             )
         )
     return tuple(lines)

@@ -8,11 +8,10 @@ from rich.console import Console
 from support.makers import run_info, stats
 
 from launch_scripts.commands.status_view import table_of, top_fields
-from launch_scripts.launcher.terminal_tables import live_table
-from launch_scripts.observe.process_load import ProcessLoads, by_role
+from launch_scripts.launcher.terminal_tables import live_table, loads_table
+from launch_scripts.observe.process_load import ProcessLoads
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_state import RunState
-from launch_scripts.process_table import ROLES
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.grid import GridSpec
@@ -50,11 +49,23 @@ def test_a_role_is_the_sum_of_its_living_processes_and_the_worst_of_their_latene
         loads.on_stats(told(id, 2.0, cpu_s, late))
     loads.on_stats(told("0", 1.0, 0.0, 0, role="router"))
     up = {("agent", "a0"), ("agent", "a1"), ("router", "0")}
-    router, agents = by_role(loads.lines(up), ROLES)
-    assert (router.role, router.alive, router.known) == ("router", 1, 1)
-    assert (agents.alive, agents.known, agents.cpu_percent, agents.late_per_s) == (2, 3, 75.0, 8.0)
-    assert agents.busiest is not None
-    assert agents.busiest.name == "agent-a0", "a2 is gone"
+    router, agents = drawn(loads_table(loads.lines(up), each=False), 100, 9)[1:]
+    assert router.split() == ["router", "1", "of", "1", "-", "86", "MB", "-", "1,234", "0"]
+    assert agents.split() == [
+        "agent",
+        "2",
+        "of",
+        "3",
+        "75",
+        "172",
+        "MB",
+        "8.0",
+        "2,468",
+        "0",
+        "agent-a0",
+        "50",
+        "%",
+    ]
 
 
 def large_run() -> tuple[RunState, ProcessLoads, set[tuple[str, str]]]:

@@ -174,16 +174,16 @@ def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_a
 def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machine_is_not() -> None:
     mine, other = planner_spec("t0"), planner_spec("t1")
     known = OwnPart(SwarmModel().terrain.grid, 0)
-    known.own = frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))})
+    known.look_after(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
     now_ns = 100 * NS_PER_S
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), True, now_ns)
         known.heard(figures(spec, now_ns), now_ns)
-    assert known.alarms(now_ns) == ()
+    assert known.own_alarms(now_ns) == []
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), False, now_ns)
-    assert [alarm.about for alarm in known.alarms(now_ns)] == ["planner-t0"]
-    assert known.up() == []
+    assert [line.partition(" is gone")[0] for line in known.own_alarms(now_ns)] == ["down: planner-t0"]
+    assert known.own_up() == []
     assert "0 of 3" in known.line("x", now_ns)
     assert "planner-t0 is gone" in known.line("x", now_ns)
 
@@ -191,7 +191,7 @@ def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machin
 @pytest.mark.parametrize(("height", "shown"), [(40, "planner-t2"), (8, "planner")])
 def test_its_table_has_a_line_for_each_process_or_where_room_lacks_for_each_role(height: int, shown: str) -> None:
     known = OwnPart(SwarmModel().terrain.grid, 0)
-    known.own = frozenset(processes_of(SCENARIO, ("planner",)))
+    known.look_after(frozenset(processes_of(SCENARIO, ("planner",))))
     for spec in known.own:
         known.alive(Peer(spec.role, spec.id, 7), True, 0)
         for stamp_ns in (1, NS_PER_S):
