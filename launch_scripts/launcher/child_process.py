@@ -30,17 +30,16 @@ _GRACE_S = 4.0
 
 @dataclass(frozen=True, slots=True)
 class ExitReason:
-    """Why a process ended. `refused`: by a SwarmError, not a bug, so that a restart may not help."""
+    """The last word of a process: why it ended.
+
+    exit_code  0: as asked. It has left the swarm, and all that it keeps is written; what is left to do is the
+               operating system's
+    refused    by a SwarmError, not a bug, so that a restart may not help
+    """
 
     sentence: str
     exit_code: int
-    refused: bool
-
-
-@dataclass(frozen=True, slots=True)
-class EndedAsAsked:
-    """The last word of a process that has ended in order: it has left the swarm, and all that it keeps is written.
-    What is left to do is the operating system's."""
+    refused: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,7 @@ class Reports:
     log_path     its log
     log_format   of the log
     health       memory of a `Board`, which the launcher reads
-    exit_reason  its last word: an `ExitReason` or `EndedAsAsked`
+    exit_reason  its last word, an `ExitReason`
     """
 
     log_path: Path
@@ -77,11 +76,11 @@ def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
         _leave(error.exit_code)
     except BaseException as error:
         log.critical("crashed", exc_info=True)
-        pipe.send(ExitReason(f"{type(error).__name__}: {error}", CRASHED, refused=False))
+        pipe.send(ExitReason(f"{type(error).__name__}: {error}", CRASHED))
         _leave(CRASHED)
     # Before the log, which a disk that stalls may hold up.
     with contextlib.suppress(OSError):  # the launcher is gone
-        pipe.send(EndedAsAsked())
+        pipe.send(ExitReason("ended as asked", 0))
     log.info("ended as asked")
     _leave(0)
 

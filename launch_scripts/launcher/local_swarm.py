@@ -17,7 +17,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.child_process import EndedAsAsked, ExitReason, Reports, run_child
+from launch_scripts.launcher.child_process import ExitReason, Reports, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
@@ -84,7 +84,7 @@ class Running:
     spec: ProcessSpec
     process: ForkServerProcess | None = None
     pipe: Connection | None = None
-    last_word: ExitReason | EndedAsAsked | None = None
+    last_word: ExitReason | None = None
     """What this life has said at its end; None while it has not."""
     began_s: float = 0.0
     due_s: float | None = None
@@ -100,6 +100,8 @@ class Running:
     """Since when it has been asked to end for good; None if it has not."""
     health: Any = None
     """Memory of a `Board` that its lives write and the launcher reads; None before the first."""
+    ticked: tuple[int, float] = (0, 0.0)
+    """The newest stamp on its board while its loop runs, and the launcher's time when that was new."""
     hung_s: float | None = None
     """Since when this life has been asked to say where it hangs, and to end; None if it has not."""
 
@@ -110,7 +112,8 @@ class Running:
     @property
     def ended_as_asked(self) -> bool:
         """Whether this life has said so: nothing of it can be lost any more, however it leaves."""
-        return isinstance(self.hear_last_word(), EndedAsAsked)
+        word = self.hear_last_word()
+        return word is not None and word.exit_code == 0
 
     @property
     def exitcode(self) -> int | None:
@@ -137,7 +140,7 @@ class Running:
             return f"{process.status()}, {process.num_threads()} threads"
         return "gone"
 
-    def hear_last_word(self) -> ExitReason | EndedAsAsked | None:
+    def hear_last_word(self) -> ExitReason | None:
         with contextlib.suppress(EOFError, OSError):
             if self.last_word is None and self.pipe is not None and self.pipe.poll():
                 self.last_word = self.pipe.recv()
@@ -172,7 +175,10 @@ class LocalSwarm:
         self._setup_of = setup_of
         self._log_dir = log_dir
         self._log_format = log_format
-        self._hang_watch = HangWatch()
+        self._turned_s = 0.0
+        """For how long the launcher itself has turned. One that was stopped with all of its processes, as by
+        Ctrl-Z, finds their boards old when it goes on, and none of them hangs."""
+        self._looked_s = -math.inf
         self._context = multiprocessing.get_context("forkserver")
 
     @property
@@ -255,17 +261,24 @@ class LocalSwarm:
         of their threads are, and one that does not even do that within `STOP_GRACE_S`, as it was stopped, by
         SIGKILL."""
         now_s = time.monotonic()
-        still = self._hang_watch.find_hanging(self.seen, now_s)
-        for running in self.running if still else ():
-            process = running.process
-            if running.spec.name not in still or process is None:
+        passed_s = now_s - self._looked_s
+        if passed_s < LOOK_EVERY_S:
+            return
+        self._looked_s = now_s
+        self._turned_s += min(passed_s, _MOST_PER_LOOK_S)
+        for running in self.running:
+            vitals = running.seen().vitals
+            stamp_ns = vitals.stamp_ns if vitals is not None and vitals.phase is Phase.RUNS else 0
+            if not stamp_ns or stamp_ns != running.ticked[0]:
+                running.ticked = stamp_ns, self._turned_s
+            elif self._turned_s - running.ticked[1] < STILL_S:
                 continue
-            if running.hung_s is None:
+            elif running.hung_s is None:
                 running.hung_s = now_s
                 log.error("%s hangs: its loop stands still for %.0f s", running.spec.name, STILL_S)
                 running.send(signal.SIGABRT)
             elif now_s - running.hung_s > STOP_GRACE_S:
-                process.kill()
+                running.send(signal.SIGKILL)
 
     def stop(
         self,
@@ -364,7 +377,7 @@ class LocalSwarm:
         if code == 255:
             # The forkserver is gone and reports no more ends: kill, because two processes of one id must not run.
             running.send(signal.SIGKILL)
-        if isinstance(reason := running.hear_last_word(), ExitReason):
+        if (reason := running.hear_last_word()) is not None and reason.exit_code:
             return reason
         how = "ended by itself" if code == 0 else f"ended with exit code {code}"
         if code < 0:
@@ -373,7 +386,7 @@ class LocalSwarm:
             how = "a plug-in did not come back from native code; its log says where"
         if running.hung_s is not None:
             how = "its loop stood still, so it was killed; its log says where"
-        return ExitReason(how, 1, refused=False)
+        return ExitReason(how, 1)
 
     def _failure(self, running: Running, force: bool) -> str | None:
         """What kept a process that was asked to end from doing so, in words; it is forgotten if it has ended."""
@@ -414,36 +427,3 @@ def _wait(
     deadline_s = time.monotonic() + within_s
     while not done() and time.monotonic() < deadline_s and not force():
         while_waiting()
-
-
-class HangWatch:
-    """Looks at the boards of processes.
-
-    Time counts while the watcher itself turns only: a launcher that was stopped with all of its processes, as by
-    Ctrl-Z, finds their boards old when it goes on, and none of them hangs.
-    """
-
-    def __init__(self) -> None:
-        self._looked_s = -math.inf
-        self._awake_s = 0.0
-        """The time that counts, at the last look."""
-        self._since: dict[str, tuple[int, float]] = {}
-        """Name -> the stamp that it has shown last, and `_awake_s` when that was new."""
-
-    def find_hanging(self, seen: Callable[[], Iterable[Process]], now_s: float) -> list[str]:
-        """Names of processes whose loop has stood still for `STILL_S`; none between two looks.
-
-        seen   how each process is; not asked between two looks
-        now_s  on the monotonic clock
-        """
-        passed_s = now_s - self._looked_s
-        if passed_s < LOOK_EVERY_S:
-            return []
-        self._looked_s = now_s
-        self._awake_s += min(passed_s, _MOST_PER_LOOK_S)
-        before, self._since = self._since, {}
-        for name, vitals, ended in seen():
-            if ended is None and vitals is not None and vitals.phase is Phase.RUNS:
-                stamp_ns, since_s = before.get(name, (0, 0.0))
-                self._since[name] = (vitals.stamp_ns, since_s if stamp_ns == vitals.stamp_ns else self._awake_s)
-        return [name for name, (_, since_s) in self._since.items() if self._awake_s - since_s >= STILL_S]

@@ -28,7 +28,6 @@ class Fact(Generic[Of]):
 
     name     in the report, and for programs
     label    what people call it
-    unit     of the value in the report; the text says it itself
     of       its value at an instant; None where it is not known
     text     the value in words
     meaning  what it says, in a sentence
@@ -37,7 +36,6 @@ class Fact(Generic[Of]):
 
     name: str
     label: str
-    unit: str
     of: Callable[[Of], Any]
     text: Callable[[Any], str]
     meaning: str
@@ -104,67 +102,67 @@ def _vehicles(state: RunState) -> tuple[int, int]:
 
 
 FACTS: tuple[Fact[RunState], ...] = (
-    Fact("elapsed_s", "time", "s", lambda s: s.elapsed_s, seconds, "Time since the run began, start-up included."),
-    Fact("vehicles_driven", "vehicles", "", _vehicles, of_all, "Vehicles that an agent drives, of all of the run."),
-    Fact("states", "of these", "", lambda s: s.states, each, "What the vehicles do."),
-    Fact("classes", "classes", "", lambda s: s.classes, each, "The vehicles by class."),
-    Fact("following", "assigned", "", lambda s: s.following, count, "Vehicles that have a target."),
-    Fact("captures", "captures", "", lambda s: s.captures, count, "How often targets were caught."),
-    Fact("marks", "marks", "", lambda s: s.marks, count, "Cells that vehicles found other than the map said."),
+    Fact("elapsed_s", "time", lambda s: s.elapsed_s, seconds, "Time since the run began, start-up included."),
+    Fact("vehicles_driven", "vehicles", _vehicles, of_all, "Vehicles that an agent drives, of all of the run."),
+    Fact("states", "of these", lambda s: s.states, each, "What the vehicles do."),
+    Fact("classes", "classes", lambda s: s.classes, each, "The vehicles by class."),
+    Fact("following", "assigned", lambda s: s.following, count, "Vehicles that have a target."),
+    Fact("captures", "captures", lambda s: s.captures, count, "How often targets were caught."),
+    Fact("marks", "marks", lambda s: s.marks, count, "Cells that vehicles found other than the map said."),
     Fact(
-        "reroute_requests", "re-route requests", "", lambda s: s.reroute_requests, count,
+        "reroute_requests", "re-route requests", lambda s: s.reroute_requests, count,
         "How often a vehicle's own route did not lead it on, so that it asked for another.",
     ),
-    Fact("routes_served", "routes served", "", lambda s: s.routes_served, count, "Routes that planners gave."),
+    Fact("routes_served", "routes served", lambda s: s.routes_served, count, "Routes that planners gave."),
     Fact(
-        "certified_gap", "certified gap", "", lambda s: s.certified_gap, _gap,
+        "certified_gap", "certified gap", lambda s: s.certified_gap, _gap,
         "How far above the optimum the routes that vehicles began can be at most, as planners have proven.",
     ),
     Fact(
-        "learned", "learned", "", lambda s: s.learned, factors,
+        "learned", "learned", lambda s: s.learned, factors,
         "By what the prior pace of a class of ground is multiplied, as vehicles have measured (map.learning).",
     ),
-    Fact("collisions", "collisions", "", lambda s: s.collisions, count, "Two vehicles on one cell; must be 0."),
+    Fact("collisions", "collisions", lambda s: s.collisions, count, "Two vehicles on one cell; must be 0."),
     Fact(
-        "lethal_entries", "lethal cells entered", "", lambda s: s.lethal_entries, count,
+        "lethal_entries", "lethal cells entered", lambda s: s.lethal_entries, count,
         "Vehicles on cells that are lethal in truth; must be 0.",
     ),
     Fact(
-        "driven_into", "bodies driven into", "", lambda s: s.driven_into, count,
+        "driven_into", "bodies driven into", lambda s: s.driven_into, count,
         "Vehicles that drove into a body which had said in time where it is; must be 0.",
     ),
-    Fact("hit_by_bodies", "vehicles hit by bodies", "", lambda s: s.hit_by_bodies, count, "The bodies' own fault."),
+    Fact("hit_by_bodies", "vehicles hit by bodies", lambda s: s.hit_by_bodies, count, "The bodies' own fault."),
     Fact(
-        "processes_well", "processes", "", lambda s: (s.alive, s.expected), of_all,
+        "processes_well", "processes", lambda s: (s.alive, s.expected), of_all,
         "Processes that are alive, or ended as asked, of those that the run needs.",
     ),
-    Fact("restarts", "restarts", "", lambda s: s.restarts, count, "How often a process was started again."),
+    Fact("restarts", "restarts", lambda s: s.restarts, count, "How often a process was started again."),
     Fact(
-        "messages_now_per_s", "messages/s", "1/s", lambda s: s.messages_per_s, count,
+        "messages_now_per_s", "messages/s", lambda s: s.messages_per_s, count,
         "Messages that all processes send per second, now.",
     ),
     Fact(
-        "payloads_dropped", "payloads dropped", "", lambda s: s.payloads_dropped, count,
+        "payloads_dropped", "payloads dropped", lambda s: s.payloads_dropped, count,
         "Messages that were no messages of this swarm, or came under a key that is not their sender's.",
     ),
 )  # fmt: skip
 """What is shown of a run. A new row appears everywhere."""
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
-    Fact("target", "target", "", lambda t: t.title, _word, "Its id, and what is unusual about it."),
-    Fact("chased_by", "following", "", lambda t: t.following, count, "Vehicles that go for it."),
-    Fact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
-    Fact("captures", "captures", "", lambda t: t.captures, count, "How often it was caught."),
+    Fact("target", "target", lambda t: t.title, _word, "Its id, and what is unusual about it."),
+    Fact("chased_by", "following", lambda t: t.following, count, "Vehicles that go for it."),
+    Fact("nearest_m", "nearest", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
+    Fact("captures", "captures", lambda t: t.captures, count, "How often it was caught."),
     Fact(
-        "certified_gap", "certified gap", "", lambda t: t.gap, _gap_mean,
+        "certified_gap", "certified gap", lambda t: t.gap, _gap_mean,
         "How far above the optimum the routes to it can be at most, in the mean.",
     ),
-    Fact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
-    Fact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
-    Fact("routes_served", "served", "", lambda t: t.routes_served, count, "Routes given to it.", False),
-    Fact("strategy", "strategy", "", lambda t: t.strategy, _word, "How its tree is kept.", False),
-    Fact("pose_age_s", "seen", "s", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
-    Fact("tracker", "tracker", "", lambda t: t.tracker, _word, "Who tells where it is.", False),
+    Fact("re_plans", "re-plans", lambda t: t.growths, count, "How often its tree was grown or repaired."),
+    Fact("growth_ms", "tree", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
+    Fact("routes_served", "served", lambda t: t.routes_served, count, "Routes given to it.", False),
+    Fact("strategy", "strategy", lambda t: t.strategy, _word, "How its tree is kept.", False),
+    Fact("pose_age_s", "seen", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
+    Fact("tracker", "tracker", lambda t: t.tracker, _word, "Who tells where it is.", False),
 )  # fmt: skip
 """What is shown of each target, what matters most first: a narrow panel cuts off the end."""
 

@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -24,14 +23,14 @@ from support.processes import eventually
 
 from launch_scripts.launcher import local_swarm
 from launch_scripts.launcher.forkserver import WarmUp
-from launch_scripts.launcher.local_swarm import LOOK_EVERY_S, STILL_S, Ending, HangWatch, LocalSwarm
+from launch_scripts.launcher.local_swarm import LOOK_EVERY_S, STILL_S, Ending, LocalSwarm, Running
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web.health_probe import ask, fast
 from launch_scripts.web.health_verdict import HEALTHY, READY, Process, health_pages, verdict
 from launch_scripts.web.server import MOST_CONNECTIONS, Server
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
-from swarm.runtime.health import Health, Phase, Vitals
+from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals
 from swarm.runtime.role import RoleSetup
 
 _NOW_NS = 100_000_000_000
@@ -242,51 +241,62 @@ def test_a_probe_loads_no_command_line() -> None:
     assert not heavy & set(loaded)
 
 
-looks = st.lists(st.tuples(st.floats(0.01, 100.0), st.booleans()), max_size=60)
-"""Seconds since the look before, and whether the process has ticked since then."""
+class Watched:
+    """A launcher with one process, of which there is a board and nothing else, on a clock of the test."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.now_s = 1000.0
+        self.sent: list[signal.Signals] = []
+        patch.setattr(local_swarm.time, "monotonic", lambda: self.now_s)
+        patch.setattr(Running, "send", lambda running, number: self.sent.append(number))
+        swarm = LocalSwarm([ProcessSpec("agent", "a0", "m:f")], lambda spec: None, Path())  # type: ignore[arg-type, return-value]
+        [self.running] = swarm.running
+        self.running.process, self.running.health = object(), bytearray(BOARD_BYTES)  # type: ignore[assignment]
+        self.board, self.look = Board(self.running.health), swarm._end_hung
+
+    def passes(self, seconds: float, stamp_ns: int, phase: Phase = Phase.RUNS) -> list[signal.Signals]:
+        """What the process is sent at a look some seconds later, by when it has ticked last at `stamp_ns`."""
+        self.now_s, self.sent = self.now_s + seconds, []
+        self.board.write(Vitals(stamp_ns, 0, phase, ()))
+        self.look()
+        return self.sent
 
 
-def running(stamp_ns: int) -> list[Process]:
-    """A process that has ticked then."""
-    return [Process("a", Vitals(stamp_ns, 0, Phase.RUNS, ()))]
-
-
-@given(looks)
+@given(st.lists(st.tuples(st.floats(0.01, 100.0), st.booleans()), max_size=60))
 def test_who_is_killed_stood_still_for_a_minute_in_which_the_launcher_turned(
     looks: list[tuple[float, bool]],
 ) -> None:
-    watch, now_s, stamp_ns, still_s = HangWatch(), 1000.0, 1, 0.0
-    watch.find_hanging(partial(running, stamp_ns), now_s)
-    looked_s = now_s
-    for passed_s, ticked in looks:
-        now_s += passed_s
-        stamp_ns += ticked
-        found = watch.find_hanging(partial(running, stamp_ns), now_s)
-        turned_s = 0.0 if now_s - looked_s < LOOK_EVERY_S else min(now_s - looked_s, 2.0)
-        still_s = 0.0 if ticked else still_s + turned_s
-        if turned_s:
-            looked_s = now_s
-        if found:
-            assert still_s >= STILL_S - 0.001
+    """`looks`: seconds since the look before, and whether the process has ticked since then."""
+    with pytest.MonkeyPatch.context() as patch:
+        watched, stamp_ns, still_s = Watched(patch), 1, 0.0
+        watched.passes(0.0, stamp_ns)
+        looked_s = watched.now_s
+        for passed_s, ticked in looks:
+            stamp_ns += ticked
+            sent = watched.passes(passed_s, stamp_ns)
+            since_s = watched.now_s - looked_s
+            turned_s = 0.0 if since_s < LOOK_EVERY_S else min(since_s, 2.0)
+            still_s = 0.0 if ticked else still_s + turned_s
+            if turned_s:
+                looked_s = watched.now_s
+            if sent:
+                assert still_s >= STILL_S - 0.001
 
 
-@given(st.sampled_from([Phase.STARTS, Phase.ENDS]) | st.none(), st.none() | st.just("it has ended"))
-def test_nobody_is_killed_who_starts_ends_or_says_nothing(phase: Phase | None, ended: str | None) -> None:
-    watch = HangWatch()
-    for second in range(300):
-        vitals = None if phase is None else Vitals(1, 0, phase, ())
-        assert watch.find_hanging(lambda vitals=vitals: [Process("a", vitals, ended)], float(second)) == []
+@pytest.mark.parametrize("phase", [Phase.STARTS, Phase.ENDS])
+def test_nobody_is_killed_who_starts_or_ends(phase: Phase, monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched(monkeypatch)
+    assert not any(watched.passes(1.0, 1, phase) for _ in range(300))
 
 
-def test_who_stands_still_for_a_minute_is_found_then_and_at_every_look_until_it_ticks() -> None:
-    watch = HangWatch()
-
-    def found(second: int, stamp_ns: int) -> list[str]:
-        return watch.find_hanging(partial(running, stamp_ns), float(second))
-
-    assert not any(found(second, 1) for second in range(60))
-    assert [found(second, 1) for second in range(60, 64)] == [["a"]] * 4
-    assert found(64, 2) == []
+def test_who_stands_still_for_a_minute_says_where_and_is_killed_if_it_cannot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    watched = Watched(monkeypatch)
+    sent = [watched.passes(1.0, 1) for _ in range(68)]
+    assert [n for n, numbers in enumerate(sent) if numbers] == [60, 66, 67]
+    assert sent[60:67:6] == [[signal.SIGABRT], [signal.SIGKILL]]
+    assert watched.passes(1.0, 2) == []
 
 
 def started(tmp_path: Path, function: str) -> LocalSwarm:
