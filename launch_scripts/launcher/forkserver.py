@@ -11,7 +11,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import types
 from collections.abc import Iterator
 from multiprocessing import forkserver, resource_tracker
@@ -63,8 +62,8 @@ def without_main() -> Iterator[None]:
 
 
 class WarmUp:
-    """Starts the forkserver, waits on a thread until it has loaded everything, and compiles the kernels that are
-    missing.
+    """Starts the forkserver, waits on a thread until it has loaded everything, and has the kernels compiled that
+    are missing, by builders which it forks.
 
     loads    what the forkserver loads
     scenario that of the planners that are to run; None if none are
@@ -75,21 +74,15 @@ class WarmUp:
         self._scenario = scenario
         self._context = multiprocessing.get_context("forkserver")
         self._failure: BaseException | None = None
-        self._loaded = threading.Event()
         self._ready = threading.Event()
-        self._all: set[str] = set()
-        """Names of the kernels that were missing; `_first` and `_left`: of those for a first route, and of all,
-        that still are."""
         self._first: set[str] = set()
         self._left: set[str] = set()
+        """Names of the kernels for a first route, and of all, which are not compiled yet."""
+        self._all = 0
         self._builders: list[ForkServerProcess] = []
         self._lock = threading.Lock()
         self._closed = False
         """Set for good by `close`: no builder is started any more. The lock guards both."""
-        self._began_s = time.monotonic()
-        self._took_s = 0.0
-        """How long it took to load and compile everything, once it has."""
-        self._told = False
         self._thread = threading.Thread(target=self._run, name="warm-up", daemon=True)
 
     def begin(self) -> None:
@@ -108,14 +101,7 @@ class WarmUp:
         if not self._all:
             return "loading kernels"
         first = f" ({len(self._first)} to go before the first route)" if self._first else ""
-        return f"compiling kernels, once: {len(self._all) - len(self._left)} of {len(self._all)}{first}"
-
-    def news(self) -> str | None:
-        """A sentence once the last kernel is compiled, if any had to be."""
-        if self._told or not self._all or self._left:
-            return None
-        self._told = True
-        return f"all {len(self._all)} kernels are compiled, {self._took_s:.0f} s"
+        return f"compiling kernels, once: {self._all - len(self._left)} of {self._all}{first}"
 
     def close(self) -> None:
         """End what still compiles. They hear no other signal, and at the launcher's exit Python waits for them."""
@@ -126,38 +112,22 @@ class WarmUp:
 
     def _run(self) -> None:
         try:
-            self._probe()
-            self._ready_if_first()
-            self._compile()
+            self._build()
         except BaseException as error:
             self._failure = error
         self._ready.set()
 
-    def _probe(self) -> None:
-        """The forkserver answers once it has loaded everything; its child tells what is missing."""
-        found, tell = self._context.Pipe(duplex=False)
-        self._start(_find_missing, tell, self._scenario).join()
-        tell.close()
-        first, others = found.recv()
-        self._first, self._left, self._all = set(first), {*first, *others}, {*first, *others}
-
-    def _ready_if_first(self) -> None:
-        if not self._first:
-            self._ready.set()
-
-    def _compile(self) -> None:
-        if not self._left:
-            return
-        pipes: list[Connection] = []
-        for _ in range(min(len(os.sched_getaffinity(0)), 8)):
-            compiled, tell = self._context.Pipe(duplex=False)
-            with self._lock:
-                if self._closed:
-                    return
-                self._builders.append(self._start(_build, tell, self._scenario))
-            tell.close()
-            pipes.append(compiled)
+    def _build(self) -> None:
+        """The first builder answers once the forkserver has loaded everything, and tells what is missing."""
+        pipes = [self._builder(tells=True)]
+        first, others = pipes[0].recv()
+        self._first, self._left = set(first), {*first, *others}
+        self._all = len(self._left)
+        if self._left:
+            pipes += [self._builder(tells=False) for _ in range(1, min(len(os.sched_getaffinity(0)), 8))]
         while pipes:
+            if not self._first:
+                self._ready.set()
             for pipe in wait(pipes):
                 assert isinstance(pipe, Connection)
                 try:
@@ -167,40 +137,38 @@ class WarmUp:
                     continue
                 self._first.discard(name)
                 self._left.discard(name)
-                self._took_s = time.monotonic() - self._began_s
-                self._ready_if_first()
 
-    def _start(self, target: object, *arguments: object) -> ForkServerProcess:
-        with without_main():
-            process = self._context.Process(target=target, args=arguments, daemon=True)  # type: ignore[arg-type]
-            process.start()
-        return process
-
-
-def _find_missing(tell: Connection, scenario: Scenario | None) -> None:
-    """Tell the names of kernels that are not compiled: of those for a first route, and of the others. Without a
-    scenario there are none."""
-    first: list[str] = []
-    others: list[str] = []
-    if scenario is not None:
-        from planner_service.kernel_build import can_build, missing, name_of, needed_kernels
-
-        if can_build():
-            needed = needed_kernels(scenario)
-            first = list(map(name_of, missing(needed.first)))
-            others = list(map(name_of, missing((*needed.classes, *needed.later))))
-    _say(tell, (first, others))
+    def _builder(self, *, tells: bool) -> Connection:
+        """Starts a builder. Returns the pipe on which it tells what it has compiled."""
+        listens, tell = self._context.Pipe(duplex=False)
+        with self._lock, without_main():
+            if not self._closed:
+                builder = self._context.Process(target=_build, args=(tell, self._scenario, tells), daemon=True)
+                builder.start()
+                self._builders.append(builder)
+        tell.close()
+        return listens
 
 
-def _build(tell: Connection, scenario: Scenario) -> None:
-    """Compile what is missing, together with the other builders."""
-    from planner_service.kernel_build import build, name_of, needed_kernels
+def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
+    """Compile what is missing, together with the other builders, and tell the name of each kernel.
+
+    tells  at first which are missing: those for a first route, and the others. Without a scenario there are none
+    """
+    if scenario is None:
+        _say(tell, ([], []))
+        return
+    from planner_service.kernel_build import build, can_build, missing, name_of, needed_kernels
 
     threading.Thread(target=_end_with_launcher, daemon=True).start()
     needed = needed_kernels(scenario)
-    for kernels, niceness in ((needed.first, 0), ((*needed.classes, *needed.later), _BACKGROUND)):
-        os.nice(niceness)
-        build(kernels, lambda kernel: _say(tell, name_of(kernel)))
+    first, others = (missing(needed.first), missing((*needed.classes, *needed.later))) if can_build() else ((), ())
+    if tells:
+        _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
+    for kernels, niceness in ((first, 0), (others, _BACKGROUND)):
+        if kernels:
+            os.nice(niceness)
+            build(kernels, lambda kernel: _say(tell, name_of(kernel)))
 
 
 def _say(tell: Connection, what: object) -> None:

@@ -347,8 +347,6 @@ class _Run:
         self._signals.turned(known.observed, self._started_ns, self._missing(watcher), up)
         if (sentence := self._disk.check_room(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
-        if (compiled := self._warm_up.news()) is not None:
-            self._terminal.say(compiled)
         for note in watcher.take_notes():
             self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if watcher.web_port != self._web_port:
