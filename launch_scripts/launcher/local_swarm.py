@@ -283,7 +283,6 @@ class LocalSwarm:
     def stop(
         self,
         while_waiting: Callable[[], None] = lambda: None,
-        before_role: Callable[[str], None] = lambda _: None,
         force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
         """Ends all processes, role by role: by SIGKILL what runs `STOP_GRACE_S` later. Returns a sentence for each
@@ -302,7 +301,6 @@ class LocalSwarm:
         for role in STOP_ORDER:
             of_role = [running for running in self.running if running.spec.role == role and running.alive]
             if of_role and not force():
-                before_role(role)
                 _ask(of_role, STOP_GRACE_S, while_waiting, force)
                 failures += [said for running in of_role if (said := self._failure(running, force())) is not None]
         leaving = [running for running in self.running if running.alive and running.ended_as_asked]

@@ -103,17 +103,37 @@ def test_a_process_that_crashes_is_restarted_until_it_runs(swarms: list[LocalSwa
     assert swarm.stop(lambda: time.sleep(0.02)) == []
 
 
-def test_a_process_that_loses_a_thread_ends_with_the_reason_and_is_restarted(
-    swarms: list[LocalSwarm], tmp_path: Path
+@pytest.mark.parametrize(
+    ("row", "sentence", "again_s", "logged"),
+    [
+        (
+            ("planner", "t0", "lose_a_thread"), "IndexError: list index out of range", 0.2,
+            "thread reader ended by IndexError: list index out of range",
+        ),
+        (
+            ("agent", "a0", "hang_in_native_code"),
+            "a plug-in did not come back from native code; its log says where", 0.2, "in hang_in_native_code",
+        ),
+        (("planner", "t0", "leave_early"), "SystemExit: 0", 0.2, "crashed"),
+        (("planner", "t0", "refuse"), "the scenario is not to my liking", None, "the scenario is not to my liking"),
+    ],
+)  # fmt: skip
+def test_why_a_process_ended_is_said_and_only_one_that_refuses_is_not_started_again(
+    row: tuple[str, str, str],
+    sentence: str,
+    again_s: float | None,
+    logged: str,
+    swarms: list[LocalSwarm],
+    tmp_path: Path,
 ) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "lose_a_thread"))
+    swarm = swarm_of(swarms, tmp_path, row)
     swarm.start()
-    (ending,) = endings_within(swarm)
-    assert ending.sentence == "IndexError: list index out of range"
-    assert (ending.exit_code, ending.refused, ending.restart_in_s) == (70, False, 0.2)
-    assert "thread reader ended by IndexError: list index out of range" in (tmp_path / "planner-t0.log").read_text()
-    (again,) = endings_within(swarm)
-    assert again.restart_in_s == 0.4
+    (ending,) = endings_within(swarm, 20)
+    assert (ending.sentence, ending.refused, ending.restart_in_s) == (sentence, again_s is None, again_s)
+    assert ending.exit_code == 2 or not ending.refused
+    log = (tmp_path / f"{row[0]}-{row[1]}.log").read_text()
+    assert logged in log
+    assert ("Traceback" in log) <= (again_s is not None)
 
 
 def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
@@ -128,35 +148,6 @@ def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tm
     assert ending.sentence == "killed by SIGKILL"
     eventually(lambda: swarm.poll() or swarm.running[0].alive, 5)
     assert swarm.restarts == 1
-
-
-def test_a_process_whose_plugin_hangs_in_native_code_is_named_and_restarted(
-    swarms: list[LocalSwarm], tmp_path: Path
-) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "hang_in_native_code"))
-    swarm.start()
-    (ending,) = endings_within(swarm, 20)
-    assert ending.sentence == "a plug-in did not come back from native code; its log says where"
-    assert ending.restart_in_s == 0.2
-    assert "in hang_in_native_code" in (tmp_path / "agent-a0.log").read_text()
-
-
-def test_a_process_that_leaves_without_being_asked_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "leave_early"))
-    swarm.start()
-    (ending,) = endings_within(swarm)
-    assert ending.restart_in_s == 0.2
-
-
-def test_an_error_of_the_users_comes_up_as_its_sentence_and_code(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "refuse"))
-    swarm.start()
-    (ending,) = endings_within(swarm)
-    assert ending.sentence == "the scenario is not to my liking"
-    assert (ending.refused, ending.exit_code, ending.restart_in_s) == (True, 2, None)
-    log = (tmp_path / "planner-t0.log").read_text()
-    assert "the scenario is not to my liking" in log
-    assert "Traceback" not in log
 
 
 def test_what_all_roles_wait_for_loads_nothing_slow() -> None:
@@ -189,16 +180,18 @@ def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_fai
     for role, id, _ in rows:
         wait_for_line(tmp_path / "order.txt", f"+{role}-{id}")
     pids = [running.process.pid for running in swarm.running if running.process]
-    waited_for: list[str] = []
 
-    def before(role: str) -> None:
-        waited_for.append(role)
-        if role == "router":  # all others have been waited for: now little time is left to leave
+    def meanwhile() -> None:
+        time.sleep(0.02)
+        if (
+            "-keeper-0" in (tmp_path / "order.txt").read_text()
+        ):  # all but the router have ended: little time is left
             monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 1.0)
 
     monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 60.0)
-    assert swarm.stop(lambda: time.sleep(0.02), before) == []
-    assert waited_for == ["agent", "keeper", "router"]
+    began_s = time.monotonic()
+    assert swarm.stop(meanwhile) == []
+    assert time.monotonic() - began_s < 30.0
     assert "agent-a0 has ended and does not leave: " in caplog.text
     assert "router-0 has ended" not in caplog.text
     assert swarm.by_role() == {"agent": (0, 1), "keeper": (0, 1), "router": (0, 1)}
