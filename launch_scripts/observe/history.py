@@ -133,12 +133,12 @@ class Tracks:
 
     def __init__(self, interval_ns: int, limit: int = 400_000) -> None:
         self._interval_ns = interval_ns
-        self._due_ns: int | None = None
+        self._due_ns = 0
         self._samplings: Thinned[_Sampling] = Thinned(limit, lambda sampling: len(sampling[1]))
 
     def due(self, now_ns: int) -> bool:
         """Whether it is time for a sample."""
-        return self._due_ns is None or now_ns >= self._due_ns
+        return now_ns >= self._due_ns
 
     def add(self, now_ns: int, keys: Sequence[TrackKey], places_m: NDArray[np.float32]) -> None:
         """Adds one sample per key: `places_m` has a row (east, south) for each."""

@@ -49,7 +49,7 @@ class RunFigures:
         self.grid = grid
         self.observed = LatestState(plan_of(scenario, started_ns), grid)
         self.samples: Thinned[Sample] = Thinned(_MOST_SAMPLES)
-        self._sample_due_ns: int | None = None
+        self._sample_due_ns = 0
         self._sampled: tuple[int, RunState] | None = None
         """When the last sample was taken or shown, and of which state."""
 
@@ -80,11 +80,8 @@ class RunFigures:
         return self._sampled[1]
 
     def _look(self, now_ns: int) -> None:
-        if self._sample_due(now_ns):
+        if now_ns >= self._sample_due_ns:
             self._add_sample(now_ns)
-
-    def _sample_due(self, now_ns: int) -> bool:
-        return self._sample_due_ns is None or now_ns >= self._sample_due_ns
 
     def _add_sample(self, now_ns: int) -> None:
         self._sample_due_ns = now_ns + _SAMPLE_NS
@@ -174,7 +171,7 @@ class Recorder(RunFigures):
         self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
 
     def _look(self, now_ns: int) -> None:
-        tracks_due, sample_due = self.vehicle_tracks.due(now_ns), self._sample_due(now_ns)
+        tracks_due, sample_due = self.vehicle_tracks.due(now_ns), now_ns >= self._sample_due_ns
         if tracks_due:
             self._sample_tracks(now_ns, self.observed.vehicles())
         super()._look(now_ns)
