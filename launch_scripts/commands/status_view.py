@@ -102,9 +102,8 @@ def print_status(status: Status, console: Console) -> None:
     if not first.run_id:
         say("no run yet: only routers answer")
     else:
-        time = facts.fact("elapsed_s")
         say(f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells")
-        say(f"{time.label} {time.shown(state)}")
+        say(facts.fact("elapsed_s").said(state))
         if frame is not None and frame.grid.crs != "local":
             say(f"terrain: {extent_of(frame, 'latlon')}")
         for line in facts.lines(state):

@@ -61,7 +61,7 @@ def columns(*labels: str) -> Table:
 def plain_line(state: RunState, title: str) -> str:
     """The state in one line."""
     told = ", ".join(
-        f"{facts.fact(name).label} {facts.fact(name).shown(state)}"
+        facts.fact(name).said(state)
         for name in ("captures", "reroute_requests", "marks", "messages_now_per_s", "certified_gap")
     )
     alarms = "".join(f"; {line}" for line in facts.alarm_lines(state, SHOWN_ALARMS))
@@ -91,9 +91,9 @@ def loads_table(processes: Sequence[ProcessLoad], *, each: bool) -> Table:
     for role in dict.fromkeys([*ROLES, *(line.role for line in processes)]):
         mine = [line for line in processes if line.role == role]
         alive = [line for line in mine if line.alive]
-        busiest = max(alive, key=lambda line: line.cpu_percent or 0.0, default=None)
-        named = busiest is not None and busiest.cpu_percent is not None and len(mine) > 1
-        last = f"{busiest.name} {busiest.cpu_percent:.0f} %" if named else ""
+        cpu = {line.name: line.cpu_percent for line in alive if line.cpu_percent is not None}
+        busiest = max(cpu, key=cpu.__getitem__) if cpu and len(mine) > 1 else None
+        last = "" if busiest is None else f"{busiest} {cpu[busiest]:.0f} %"
         if mine:
             style = _load_style(sum(line.restarts for line in mine), len(alive) == len(mine))
             table.add_row(role, f"{len(alive)} of {len(mine)}", *_load_row(alive, mine), last, style=style)

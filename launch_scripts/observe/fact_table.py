@@ -28,22 +28,30 @@ class Fact(Generic[Of]):
 
     name     in the report, and for programs
     label    what people call it
-    of       its value at an instant; None where it is not known
-    text     the value in words
+    text     its value in words; None where it is not known
     meaning  what it says, in a sentence
+    of       the field that holds it, where that has another name
     always   whether every table of targets has it; else `swarm status` alone
     """
 
     name: str
     label: str
-    of: Callable[[Of], Any]
     text: Callable[[Any], str]
     meaning: str
+    of: str = ""
     always: bool = True
+
+    def value(self, state: Of) -> Any:
+        """The fact at an instant; None where it is not known."""
+        return getattr(state, self.of or self.name)
 
     def shown(self, state: Of) -> str:
         """The fact in words, as people see it."""
-        return self.text(self.of(state))
+        return self.text(self.value(state))
+
+    def said(self, state: Of) -> str:
+        """The same after its label."""
+        return f"{self.label} {self.shown(state)}"
 
 
 def count(value: float | None) -> str:
@@ -97,72 +105,65 @@ def _word(value: str | None) -> str:
     return NONE if value is None else value
 
 
-def _vehicles(state: RunState) -> tuple[int, int]:
-    return state.vehicles, max(state.vehicles_planned, state.vehicles)
-
-
 FACTS: tuple[Fact[RunState], ...] = (
-    Fact("elapsed_s", "time", lambda s: s.elapsed_s, seconds, "Time since the run began, start-up included."),
-    Fact("vehicles_driven", "vehicles", _vehicles, of_all, "Vehicles that an agent drives, of all of the run."),
-    Fact("states", "of these", lambda s: s.states, each, "What the vehicles do."),
-    Fact("classes", "classes", lambda s: s.classes, each, "The vehicles by class."),
-    Fact("following", "assigned", lambda s: s.following, count, "Vehicles that have a target."),
-    Fact("captures", "captures", lambda s: s.captures, count, "How often targets were caught."),
-    Fact("marks", "marks", lambda s: s.marks, count, "Cells that vehicles found other than the map said."),
+    Fact("elapsed_s", "time", seconds, "Time since the run began, start-up included."),
+    Fact("vehicles_driven", "vehicles", of_all, "Vehicles that an agent drives, of all of the run.", of="driven"),
+    Fact("states", "of these", each, "What the vehicles do."),
+    Fact("classes", "classes", each, "The vehicles by class."),
+    Fact("following", "assigned", count, "Vehicles that have a target."),
+    Fact("captures", "captures", count, "How often targets were caught."),
+    Fact("marks", "marks", count, "Cells that vehicles found other than the map said."),
     Fact(
-        "reroute_requests", "re-route requests", lambda s: s.reroute_requests, count,
+        "reroute_requests", "re-route requests", count,
         "How often a vehicle's own route did not lead it on, so that it asked for another.",
     ),
-    Fact("routes_served", "routes served", lambda s: s.routes_served, count, "Routes that planners gave."),
+    Fact("routes_served", "routes served", count, "Routes that planners gave."),
     Fact(
-        "certified_gap", "certified gap", lambda s: s.certified_gap, _gap,
+        "certified_gap", "certified gap", _gap,
         "How far above the optimum the routes that vehicles began can be at most, as planners have proven.",
     ),
     Fact(
-        "learned", "learned", lambda s: s.learned, factors,
+        "learned", "learned", factors,
         "By what the prior pace of a class of ground is multiplied, as vehicles have measured (map.learning).",
     ),
-    Fact("collisions", "collisions", lambda s: s.collisions, count, "Two vehicles on one cell; must be 0."),
+    Fact("collisions", "collisions", count, "Two vehicles on one cell; must be 0."),
+    Fact("lethal_entries", "lethal cells entered", count, "Vehicles on cells that are lethal in truth; must be 0."),
     Fact(
-        "lethal_entries", "lethal cells entered", lambda s: s.lethal_entries, count,
-        "Vehicles on cells that are lethal in truth; must be 0.",
-    ),
-    Fact(
-        "driven_into", "bodies driven into", lambda s: s.driven_into, count,
+        "driven_into", "bodies driven into", count,
         "Vehicles that drove into a body which had said in time where it is; must be 0.",
     ),
-    Fact("hit_by_bodies", "vehicles hit by bodies", lambda s: s.hit_by_bodies, count, "The bodies' own fault."),
+    Fact("hit_by_bodies", "vehicles hit by bodies", count, "The bodies' own fault."),
     Fact(
-        "processes_well", "processes", lambda s: (s.alive, s.expected), of_all,
-        "Processes that are alive, or ended as asked, of those that the run needs.",
+        "processes_well", "processes", of_all,
+        "Processes that are alive, or ended as asked, of those that the run needs.", of="well",
     ),
-    Fact("restarts", "restarts", lambda s: s.restarts, count, "How often a process was started again."),
+    Fact("restarts", "restarts", count, "How often a process was started again."),
     Fact(
-        "messages_now_per_s", "messages/s", lambda s: s.messages_per_s, count,
-        "Messages that all processes send per second, now.",
+        "messages_now_per_s", "messages/s", count,
+        "Messages that all processes send per second, now.", of="messages_per_s",
     ),
     Fact(
-        "payloads_dropped", "payloads dropped", lambda s: s.payloads_dropped, count,
+        "payloads_dropped", "payloads dropped", count,
         "Messages that were no messages of this swarm, or came under a key that is not their sender's.",
     ),
 )  # fmt: skip
 """What is shown of a run. A new row appears everywhere."""
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
-    Fact("target", "target", lambda t: t.title, _word, "Its id, and what is unusual about it."),
-    Fact("chased_by", "following", lambda t: t.following, count, "Vehicles that go for it."),
-    Fact("nearest_m", "nearest", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
-    Fact("captures", "captures", lambda t: t.captures, count, "How often it was caught."),
+    Fact("target", "target", _word, "Its id, and what is unusual about it.", of="title"),
+    Fact("chased_by", "following", count, "Vehicles that go for it.", of="following"),
+    Fact("nearest_m", "nearest", distance, "Distance of the nearest vehicle."),
+    Fact("captures", "captures", count, "How often it was caught."),
     Fact(
-        "certified_gap", "certified gap", lambda t: t.gap, _gap_mean,
-        "How far above the optimum the routes to it can be at most, in the mean.",
+        "certified_gap", "certified gap", _gap_mean,
+        "How far above the optimum the routes to it can be at most, in the mean.", of="gap",
     ),
-    Fact("re_plans", "re-plans", lambda t: t.growths, count, "How often its tree was grown or repaired."),
-    Fact("growth_ms", "tree", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
-    Fact("routes_served", "served", lambda t: t.routes_served, count, "Routes given to it.", False),
-    Fact("strategy", "strategy", lambda t: t.strategy, _word, "How its tree is kept.", False),
-    Fact("pose_age_s", "seen", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
-    Fact("tracker", "tracker", lambda t: t.tracker, _word, "Who tells where it is.", False),
+    Fact("re_plans", "re-plans", count, "How often its tree was grown or repaired.", of="growths"),
+    Fact("growth_ms", "tree", duration, "What growing its whole tree took."),
+    Fact("routes_served", "served", count, "Routes given to it.", always=False),
+    Fact("strategy", "strategy", _word, "How its tree is kept.", always=False),
+    Fact("pose_age_s", "seen", seconds, "Time since its last pose.", always=False),
+    Fact("tracker", "tracker", _word, "Who tells where it is.", always=False),
 )  # fmt: skip
 """What is shown of each target, what matters most first: a narrow panel cuts off the end."""
 
@@ -199,13 +200,12 @@ MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_bodies", 
 
 def lines(state: RunState) -> list[str]:
     """The facts of a run but its time, in lines for people: `label text` with two spaces between facts."""
-    found = ["  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in names) for names in LINES]
+    found = ["  ".join(fact(name).said(state) for name in names) for names in LINES]
     if list(state.classes) not in ([], [GROUND]):
-        found.insert(1, f"{fact('classes').label} {fact('classes').shown(state)}")
-    found += [f"{fact(name).label} {fact(name).shown(state)}" for name in IF_ANY if fact(name).of(state)]
-    wrong = [name for name in MUST_BE_ZERO if fact(name).of(state)]
-    if wrong:
-        found.append("  ".join(f"{fact(name).label} {fact(name).shown(state)}" for name in wrong))
+        found.insert(1, fact("classes").said(state))
+    found += [fact(name).said(state) for name in IF_ANY if fact(name).value(state)]
+    if wrong := [fact(name).said(state) for name in MUST_BE_ZERO if fact(name).value(state)]:
+        found.append("  ".join(wrong))
     return found
 
 
@@ -252,7 +252,7 @@ def together(alarms: Sequence[Alarm]) -> str:
 def for_report(state: RunState) -> dict[str, Any]:
     """Every fact by its name, for a report, and every alarm."""
     return {
-        **{each.name: _plain(each.of(state)) for each in FACTS},
+        **{each.name: _plain(each.value(state)) for each in FACTS},
         "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
     }
 

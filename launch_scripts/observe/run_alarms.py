@@ -24,40 +24,22 @@ STARTING_S = 30.0
 """A process that has not been seen yet is no alarm in the first seconds of a run."""
 
 
-@dataclass(frozen=True, slots=True)
-class AlarmKind:
-    """One kind of alarm.
-
-    label    what people call it
-    serious  what must not be, or stops a part of the run; else it is worth knowing
-    meaning  what it says, and what to do
-    """
-
-    label: str
-    serious: bool
-    meaning: str
-
-
-KINDS: Mapping[str, AlarmKind] = {
-    "collision": AlarmKind("collision", True, "Two vehicles were on one cell at one time, which must not be."),
-    "lethal-entry": AlarmKind("lethal entry", True, "A vehicle entered a cell that is lethal in truth."),
-    "body-collision": AlarmKind("hit a body", True, "A vehicle and a body that reports its place met."),
-    "down": AlarmKind(
-        "down", True, "A process that the run needs is gone. Its launcher starts it again; see its log if it stays."
-    ),
-    "silent": AlarmKind("silent", True, "A process is there and has told nothing for 4 s: it hangs or is cut off."),
-    "keeper-behind": AlarmKind("keeper behind", True, "Marks wait to be stored, as on a full disk."),
-    "quota": AlarmKind("quarantined", False, "An author writes more marks than its quota; they are delayed."),
-    "target-lost": AlarmKind(
-        "target lost",
-        False,
-        "Nobody tracks the target; routes lead to where it was, and it is searched for after 30 s.",
-    ),
-    "behind": AlarmKind("behind", False, "A process skips ticks: the machine is too slow for what it does."),
-    "restarted": AlarmKind("restarted", False, "A process was started again after it had ended."),
+_SERIOUS: Mapping[str, str] = {
+    "collision": "collision",  # two vehicles were on one cell at one time
+    "lethal-entry": "lethal entry",  # a vehicle entered a cell that is lethal in truth
+    "body-collision": "hit a body",  # a vehicle and a body that reports its place met
+    "down": "down",  # a process that the run needs is gone; its launcher starts it again: see its log if it stays
+    "silent": "silent",  # a process is there and has told nothing for 4 s: it hangs or is cut off
+    "keeper-behind": "keeper behind",  # marks wait to be stored, as on a full disk
 }
-"""By the word that stands on the wire."""
-_OTHER = AlarmKind("", False, "")
+KINDS: Mapping[str, str] = {
+    **_SERIOUS,
+    "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
+    "target-lost": "target lost",  # nobody tracks it; routes lead to where it was; after 30 s it is searched for
+    "behind": "behind",  # a process skips ticks: the machine is too slow for what it does
+    "restarted": "restarted",  # a process was started again after it had ended
+}
+"""The word on the wire -> what people call it. Serious is what must not be, or stops a part of the run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +69,11 @@ class Alarm:
 
     @property
     def serious(self) -> bool:
-        return KINDS.get(self.kind, _OTHER).serious
+        return self.kind in _SERIOUS
 
     @property
     def label(self) -> str:
-        return KINDS.get(self.kind, _OTHER).label or self.kind
+        return KINDS.get(self.kind, self.kind)
 
     @property
     def when(self) -> str:

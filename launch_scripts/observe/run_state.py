@@ -104,6 +104,16 @@ class RunState:
     grid: GridSpec
 
     @property
+    def driven(self) -> tuple[int, int]:
+        """Vehicles that an agent drives, and all of the run."""
+        return self.vehicles, max(self.vehicles_planned, self.vehicles)
+
+    @property
+    def well(self) -> tuple[int, int]:
+        """Processes that are as they should be, and all that the run needs."""
+        return self.alive, self.expected
+
+    @property
     def standing_alarms(self) -> tuple[Alarm, ...]:
         """Those that last."""
         return tuple(alarm for alarm in self.alarms if alarm.lasts)
