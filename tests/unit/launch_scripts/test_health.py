@@ -326,6 +326,7 @@ def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
     swarm = started(tmp_path, function)
     endings: list[Ending] = []
     try:
+        assert verdict(READY, swarm.seen(), time.monotonic_ns()).missing == ("planner-t0: it does not run",)
         swarm.start()
         eventually(lambda: is_ready(swarm), 20, "ready")
         if function == "tick":
@@ -336,39 +337,11 @@ def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
         eventually(lambda: endings.extend(swarm.poll()) or endings, 60, "its end")
         assert endings[0].sentence == "its loop stood still, so it was killed; its log says where"
         assert endings[0].restart_in_s == 0.2
+        assert not is_ready(swarm)
+        assert verdict(HEALTHY, swarm.seen(), time.monotonic_ns()).ok, "the launcher starts it again"
         eventually(
             lambda: endings.extend(swarm.poll()) or (swarm.restarts and is_ready(swarm)), 60, "its next life"
         )
     finally:
         swarm.kill()
     assert ("stand_still" in (tmp_path / "planner-t0.log").read_text()) is (function == "stand_still")
-
-
-@pytest.mark.network
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_launcher_sees_a_process_that_is_stopped_and_one_that_is_killed(tmp_path: Path) -> None:
-    swarm = started(tmp_path, "tick")
-    try:
-        assert verdict(READY, swarm.seen(), time.monotonic_ns()).missing == ("planner-t0: it does not run",)
-        swarm.start()
-        eventually(lambda: verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "ready")
-        [running] = swarm.running
-        assert running.process is not None
-        pid = running.process.pid
-        assert pid is not None
-        os.kill(pid, signal.SIGSTOP)
-
-        def later_ns() -> int:
-            return time.monotonic_ns() + 11_000_000_000
-
-        eventually(lambda: not verdict(HEALTHY, swarm.seen(), later_ns()).ok, 20, "that it hangs")
-        os.kill(pid, signal.SIGCONT)
-        eventually(lambda: verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "ready again")
-        os.kill(pid, signal.SIGKILL)
-        eventually(lambda: swarm.poll() or not verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "its end")
-        assert verdict(HEALTHY, swarm.seen(), time.monotonic_ns()).ok, "the launcher starts it again"
-        eventually(
-            lambda: swarm.poll() or verdict(READY, swarm.seen(), time.monotonic_ns()).ok, 20, "its next life"
-        )
-    finally:
-        swarm.kill()

@@ -472,18 +472,3 @@ def test_what_is_shown_is_made_once_a_second_for_all_who_show_it_and_anew_where_
     for second in range(12, 20, 2):  # the swarm has fallen silent
         assert recorder.shown(second * NS_PER_S).elapsed_s == second
     assert len(made) == 14
-
-
-def test_who_drives_is_found_once_for_each_agent(recorder: Recorder) -> None:
-    asked: list[str] = []
-    drives = recorder.observed._drives
-
-    def counted(agent: str, of_crew: bool, now_ns: int) -> bool:
-        asked.append(agent)
-        return drives(agent, of_crew, now_ns)
-
-    recorder.observed._drives = counted  # type: ignore[method-assign]
-    hear(recorder, *(fleet(f"a{a}.1", {f"a{a}-{n:02d}": (1.0, 2.0) for n in range(10)}) for a in range(3)))
-    asked.clear()
-    assert len(recorder.observed.driven((), 1)) == 30
-    assert sorted(asked) == ["a0", "a1", "a2"]
