@@ -14,6 +14,7 @@ import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1
+"""The number of this request in Linux's <sys/prctl.h>."""
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 

@@ -31,6 +31,7 @@ _ENOUGH_FILES = 1024
 _UNSYNCHRONISED = 5
 """What `adjtimex` returns of a clock that nobody sets: TIME_ERROR."""
 _TIMEX_BYTES = 256
+"""Above the size of Linux's `struct timex`, 208 bytes on 64-bit machines: the kernel writes all of it."""
 
 # docs/scale-figures.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. That agents,
 # vehicles and trees cost in proportion to ticks and numbers is the thumb in the rule.
@@ -47,7 +48,11 @@ _FEW_AGENTS = 5
 _CELL_BYTES = 30
 """Of the terrain, which all processes share, and of its file in the folder of a run."""
 _RECORDING_BYTES_PER_MINUTE = 20 << 20
+"""A rule of thumb on the safe side: a thousand vehicles were recorded with 9 MB a minute, and with 24 before routes
+were drawn as trees (decision 53)."""
 _MOST_BYTES = 1 << 60
+"""An exbibyte, above what any time that a scenario may name (`MOST_SECONDS`) comes to: the number stays within 64
+bits."""
 
 
 class Machine(NamedTuple):

@@ -35,6 +35,8 @@ Tell = Callable[[str], None]
 SIDES = ((1, 1), (1, 9), (7, 1), (13, 17), (40, 30))
 """Rows and columns of the worlds."""
 _TARGETS, _TICK_S = 4, 0.1
+"""The most targets of a table, where 25 and 4 vehicles are more and as many; and a tick of an agent at its default
+of 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -52,6 +52,8 @@ Days = Annotated[int, typer.Option(min=1, max=3650)]
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
 _LEAST_SIDE, _MOST_SIDE = 32, 16_384
+"""Cells of a side: one tile of marks (`TILE_CELLS`), and the largest terrain that a scenario may have
+(docs/operate/limits.md)."""
 
 
 @command(app)

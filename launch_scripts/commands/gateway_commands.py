@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 _MOST_ALTITUDE_M = 10_000.0
+"""Above what multicopters and small aeroplanes reach: a higher number is a mistake of units."""
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST
 _TEXT = (".json",)
 _PIXELS = (".tif", ".tiff")
 _TIMEOUT_S = 2.0
+"""Whoever has not answered for as long counts as gone (`network.lease_s`), and a keeper answers from memory."""
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:

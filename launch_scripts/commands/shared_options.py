@@ -20,6 +20,7 @@ MOST_SECONDS = 1e12
 MOST_SEED = 2**53
 """Bound of a seed, as in a scenario."""
 HIGHEST_PORT = 65535
+"""Ports of TCP are numbers of 16 bits."""
 
 Seconds = Annotated[float | None, typer.Option(min=0.1, max=MOST_SECONDS)]
 Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]

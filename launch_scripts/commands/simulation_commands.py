@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 _SCHEDULER = r"(?:tcp|tls|wss?)://[^\s/:]+:[0-9]{1,5}"
 _SHOWN_FAILURES = 20
+"""Commands that replay a failure. A terminal of 24 lines shows so many and the last sentence; results.parquet has
+every trial."""
 
 
 @command(app, RUN)

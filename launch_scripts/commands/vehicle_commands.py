@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 _WITHIN_S = 5.0
 """Longest wait until cells are free: wardens answer within a lease, which is shorter."""
 _AGAIN_S, _ANSWERS_S = 0.2, 1.0
+"""Waits between two questions, and for the answer to one. An agent takes several ticks of 0.1 s to give cells back,
+and one that is silent for a second is asked five times within `_WITHIN_S`."""
 app = family_app("Let vehicles join a running swarm and leave it; stop vehicles, and let them go again.")
 command(app)(stop)
 command(app)(go)

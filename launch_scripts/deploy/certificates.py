@@ -26,6 +26,8 @@ CA = "ca"
 THIS_MACHINE = ("localhost", "127.0.0.1")
 """Hosts in every router's certificate, for the processes beside it."""
 _CA_DAYS = 3650
+"""Ten years, the longest that a certificate may be asked for (`Days`): an authority that ends sooner would end what
+it has signed."""
 _NEW_AUTHORITY = "make an authority and all certificates anew, in another folder"
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 

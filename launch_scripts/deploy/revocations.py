@@ -13,6 +13,8 @@ from swarm.errors import ConfigError, StoreError
 
 FILE = "revoked"
 _MOST_BYTES = 1 << 20
+"""Room for some 16,000 of the longest names, more than a swarm has certificates; a larger file is some other
+file."""
 
 
 def revoked_in(folder: Path) -> tuple[str, ...]:

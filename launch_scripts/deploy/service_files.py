@@ -37,6 +37,8 @@ HEALTH_PORT = 9464
 """Where a launcher, or a container, answers probes and Prometheus."""
 _LABEL = re.compile(r"[a-z0-9]+([.-][a-z0-9]+)*")
 _LONGEST_LABEL = 50
+"""A label has 63 characters at most (RFC 1123). The other 13 are left for what is added to it: Compose adds a
+number, Kubernetes up to 11 characters."""
 _SCENARIO = "scenario.toml"
 
 

@@ -26,6 +26,8 @@ CRASHED = 70
 """Exit code of a process that crashed by a bug."""
 
 _GRACE_S = 4.0
+"""Seconds from SIGTERM to the end of what does not stop by itself, as it hangs in its start: a second less than a
+launcher waits (`STOP_GRACE_S`)."""
 
 
 @dataclass(frozen=True, slots=True)

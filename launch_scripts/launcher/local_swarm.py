@@ -47,7 +47,11 @@ STILL_S = 60.0
 """A loop that has not ticked for so long does not come back. Much longer than `HUNG_S`, from which on probes are
 told: a machine that is far too busy is not helped by starts."""
 LOOK_EVERY_S = 1.0
+"""A sixtieth of `STILL_S`, so what hangs is found in time; the launcher's loop turns ten to twenty times as
+often."""
 _MOST_PER_LOOK_S = 2.0
+"""Two looks. More between two of them was no time in which the launcher turned: it was stopped, and so were its
+processes."""
 
 
 @dataclass(slots=True)

@@ -15,7 +15,9 @@ from launch_scripts.observe.summed_counts import sum_of
 from launch_scripts.process_table import ROLES
 
 SHOWN_ALARMS = 5
+"""More would leave too few lines of a terminal of 24 for figures and targets."""
 _FEWEST_TARGETS = 3
+"""Lines of targets where the terminal has no room for any: two targets and how many more there are."""
 
 
 def live_table(state: RunState, title: str, console: Console) -> Group:

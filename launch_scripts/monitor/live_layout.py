@@ -48,7 +48,10 @@ ZONE_COLOURS: dict[str, Colour] = {
 }
 _WARNINGS = ("restart", "crash", "lost", "stranded", "mismatch", "gone", "refused", "outside", "teleported")
 _SHOWN_TARGETS = 12
+"""Lines of the table beside the view, chosen by eye: more would have to be scrolled to. A line below tells how many
+more there are."""
 _SHOWN_ALARMS = 8
+"""Lines at the head of the same panel, chosen by eye: more of them would push the table out of it."""
 
 
 _CLOSED = (Look("hatch", colours.HATCH, "known to be lethal"), Look("hatch", colours.NO_GO, "no-go zone"))

@@ -59,6 +59,8 @@ _UNSEEN = 2
 _EVERY_S = {"anew": 10.0, "figures": 1.0}
 """How often for viewers that come what is drawn on change only is drawn anew at most, and figures are drawn."""
 _ANSWER_S = 5.0
+"""Longest wait for a planner's costs. A planner answers within 1 s, or says that it has no tree; what is more is
+for a busy machine."""
 
 
 class MonitorService:

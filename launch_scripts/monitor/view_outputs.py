@@ -53,9 +53,12 @@ _SPACE_BYTES = 8 << 20
 T = TypeVar("T")
 Colour = tuple[int, int, int]
 LABEL_COLOUR: Colour = (240, 243, 246)
+"""Nearly white, on the dark ground of the view."""
 _UNSHOWN = re.compile(r"[^ -~]+")
 _MARKDOWN = re.compile(r"([\\`*_\[\]<>|#!~&$])")
 _LONGEST = 300
+"""Characters of a log line or a heading. Names and texts come from the network, and none of them is to fill a
+panel."""
 
 
 def shown(text: str, most: int = _LONGEST) -> str:

@@ -212,6 +212,8 @@ def lines(state: RunState) -> list[str]:
 _SAID_SINGLY = 2
 """Of more alarms of one kind there is one line for all: on a slow machine every process is behind."""
 _NAMED = 3
+"""Names in the line for many alarms: so many ids fit a terminal's line of 80 columns beside label, count and
+time."""
 
 
 def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:

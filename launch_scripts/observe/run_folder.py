@@ -193,8 +193,12 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 LOOK_EVERY_S = 5.0
+"""A full disk is told of within seconds, and a try is 64 kB, which no disk feels at this rate."""
 SAY_EVERY_S = 60.0
+"""A full disk is named once a minute (docs/operate/failures.md): often enough to be seen, and the log stays
+readable."""
 _PROBE_BYTES = 1 << 16
+"""A whole block of any usual file system, whose blocks have 64 KiB at most: less may find room on a full disk."""
 
 
 class DiskWatch:

@@ -179,6 +179,8 @@ _LONG_SIDE_PX = 1600
 _MOST_CELLS = 1 << 20
 """Cells of the ground that are drawn at most: about as many as the picture has pixels."""
 _HATCH_PX, _EDGE_PX = 11, 2
+"""Pixels between lines of a hatch, and of an outline. The page draws these 1,600 pixels on some 1,060: lines stay 7
+apart, which tells a hatch from a grey, and an outline stays wider than a pixel."""
 Bools = NDArray[np.bool_]
 
 
@@ -273,6 +275,8 @@ SLOWER, QUICKER = palette.ORANGE, palette.BLUE
 _FULL = math.log(4)
 """|ln(factor)| that is drawn as strongly as can be: no factor is beyond 4 or a quarter."""
 _WEAKEST, _STRONGEST = 60, 210
+"""Opacities of 255, chosen by eye. The weakest factor is still seen on any ground, and the ground is still seen
+through the strongest."""
 
 
 def learned_pixels(terrain: Terrain, factors: Floats) -> NDArray[np.uint8]:
@@ -297,6 +301,7 @@ def learned_pixels(terrain: Terrain, factors: Floats) -> NDArray[np.uint8]:
 # --- the picture --------------------------------------------------------------------------------------------------
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
+"""1920 x 1440 pixels: as wide as a usual screen."""
 
 _MAP = (0.046, 0.058, 0.552, 0.776)
 """Left, bottom, width and height of the map at most, as shares of the page."""

@@ -24,6 +24,7 @@ MOST_WRONG_S = 11.5 * 3600
 """No clock is further off, whatever steps come together: marks of a process whose clock is a day ahead of the
 reader's are refused, so of two that are half a day off to either side one would never hold what the other says."""
 _NS_PER_MS = 1_000_000
+"""A unit: plans of faults are written in milliseconds, the simulated clock counts nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True)

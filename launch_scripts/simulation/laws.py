@@ -56,6 +56,7 @@ _UNDER_WAY = (VehicleState.FOLLOWING, VehicleState.SEARCHING, VehicleState.WAITI
 Sets = dict[tuple[str, int], tuple[int, int]]
 """(author, tile) -> (epoch, seq)."""
 _NEVER = (-1, -1)
+"""A stamp below that of any set, whose epoch and number are 0 or more."""
 
 
 class BrokenLaw(msgspec.Struct, frozen=True):

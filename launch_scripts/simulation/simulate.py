@@ -79,6 +79,8 @@ BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5
 """Seconds from a crash to the next start; each further crash of the same process doubles them."""
 _STOP_S = 0.1
+"""Seconds from the stop to the end. The recorder hears everything after 1 ms, and whoever talks on is not ticked
+any more: a longer wait would bring nothing but time on the run's clock."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,9 +21,13 @@ from swarm.errors import BusError, ConfigError, SwarmError
 NOT_READY = 1
 """Exit code of a probe that was told so."""
 _TIMEOUT_S = 5.0
+"""Half of what a container's health check grants (10 s, Containerfile), so that the probe itself says why there is
+no answer."""
 _MOST_BYTES = 1 << 20
+"""A page of health has a line for each thing that is missing, some hundred bytes: room for ten thousand of them."""
 _READY, _HEALTHY = "/readyz", "/healthz"
 _LONGEST = 300
+"""Characters of a line, or of an address in an error: a few lines of a terminal. The text came from the network."""
 
 
 class Answer(NamedTuple):

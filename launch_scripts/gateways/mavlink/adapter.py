@@ -29,7 +29,10 @@ _SAY_AGAIN_NS = 60 * NS_PER_S
 _MOST_SAID = 64
 """Sentences a minute; a vehicle's own take up a quarter at most."""
 _WARN_NS = 4 * NS_PER_S
+"""Texts of the vehicle are passed on this often at most: 15 a minute, a quarter of `_MOST_SAID`."""
 _MOST_M_PER_S = 340.0
+"""The speed of sound, as `MOST_M_PER_S` of bodies: the report of one that is told to be quicker is refused by all
+hosts."""
 
 
 class Report(Struct, frozen=True):

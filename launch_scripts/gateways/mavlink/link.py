@@ -22,6 +22,7 @@ _OPEN_AGAIN_S = 1.0
 _PATIENCE_S = 0.3
 """A TCP peer which has not answered by then is tried again later: nothing else is done meanwhile."""
 _BAUD = 57600
+"""The default of SiK telemetry radios, and so of the autopilots' ports for telemetry."""
 _EXAMPLES = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 

@@ -25,6 +25,8 @@ from swarm.wire.messages.vehicles import LONGEST_BODY_LEASE_S, MOST_RADIUS_M
 ROS_ENDPOINT = "tcp/127.0.0.1:7447"
 """Where rmw_zenohd listens unless it is told otherwise: the same as a swarm's router."""
 MOST_HZ, MOST_ROBOT_HZ = 100.0, 50.0
+"""Bounds of rates. A robot's topic is read once a turn of the gateway, which takes `TICK_S`, 0.02 s: more than 50
+times a second the swarm cannot hear of it. Bounds of topics to ROS are twice that and are never reached."""
 
 DistributionName = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
 NodeName = Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}\Z")]

@@ -22,6 +22,7 @@ _ATTACHMENT = struct.Struct("<qqB")
 _TOKEN_PARTS = 13
 """Parts of an endpoint's token that every version has. Newer ones append, which is left unread."""
 _NODE_PARTS = 9
+"""Parts of a node's token: space, domain, session, node, entity, NN, enclave, namespace and name."""
 
 
 class Kind(StrEnum):

@@ -25,6 +25,8 @@ from swarm.errors import BusError, ProtocolError
 log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 0.5
+"""A latched message that was lost is missed by its subscribers this long after it was put. Nothing is sent while
+nothing new is put."""
 
 
 class Publisher:

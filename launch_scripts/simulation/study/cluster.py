@@ -21,6 +21,8 @@ AHEAD = 3
 MOST_DEATHS = 3
 """A trial whose worker has died more often than this is given up: it kills them itself."""
 _CONNECT_S = 10.0
+"""Longest wait for the scheduler, as long as a process of a swarm waits for a router by default
+(`network.connect_timeout_s`)."""
 _SETTINGS: dict[str, Any] = {
     # A profiler, clocks that tick 50 times a second in each of five event loops, and watches on memory and the
     # interpreter take it from the simulation: together 7 % of a core with two workers, without them 1 %.

@@ -28,7 +28,11 @@ On = TypeVar("On")
 _SKEW_NS = NS_PER_S // 200
 """Shorter overlaps are no collision: the clocks of two processes may differ by as much."""
 _REMEMBER_NS = 5 * NS_PER_S
+"""Stays and bodies that ended longer ago are forgotten, which bounds memory and the time of a look. It is more than
+twice the 2 s after which a silent link counts as gone, so late reports find what they are compared with."""
 _APART_NS = 2 * NS_PER_S
+"""Two who meet again within this time are counted once: a vehicle takes about a second to cross a cell, and one
+encounter is told of by several reports."""
 
 
 @dataclass(frozen=True, slots=True)

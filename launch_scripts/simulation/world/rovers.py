@@ -19,10 +19,20 @@ LEASE_S = 2.0
 TURN_S = 0.6
 """It turns for so long, and has told its new heading meanwhile."""
 _LONGEST_REST_S = 8.0
+"""Rests are drawn from half a second up to this. Vehicles wait for a body at rest for a second and then drive
+around it (decision 39): both are to happen, the second more often."""
 _TOLD_AGAIN_NS = NS_PER_S // 2
+"""A rover at rest is told of this often. Hosts that have just begun listen for a second for every body (decision
+39), and a report that is lost must not end the lease."""
 _LONGEST_TICK_S = 1.0
+"""After a longer pause of its process a rover does not make up for the rest: a leap keeps the old place closed
+until the lease ends."""
 _LEGS_PER_S = 0.25
+"""Chance per second that a leg ends: it takes 4 s in the mean, so within seconds a rover drives, stands and
+turns."""
 _TRIES = 12
+"""Headings that are tried before it stands. Where a quarter of all directions is free, 97 of 100 rovers find
+one."""
 
 
 @dataclass(slots=True, eq=False)

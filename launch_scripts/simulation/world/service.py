@@ -25,7 +25,9 @@ from swarm.wire.messages.vehicles import Body, Fleet
 from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
 _MOVED_CELLS = 0.25
+"""A share of a cell, which trackers of others are asked for, too (decision 37, docs/operate/trackers.md)."""
 _AGAIN_NS = NS_PER_S // 2
+"""A target at rest is told of this often (decision 37): four times within the lease of a pose, 2 s."""
 
 
 class PoseThrottle:
@@ -54,7 +56,11 @@ class PoseThrottle:
 
 
 TICK_HZ = 10.0
+"""Ten poses a second are enough for any planner (docs/operate/trackers.md). Most of them are not told, as a target
+takes seconds for a cell."""
 _ASK_NS = NS_PER_S // 2
+"""Planners are asked this often where the targets were: twice within `targets.LISTEN_NS`, so one lost question is
+no lost target."""
 _ASK = "where"
 
 

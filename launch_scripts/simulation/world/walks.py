@@ -31,8 +31,14 @@ if TYPE_CHECKING:
 WAY_HALF_CELLS = 96
 """Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
 _TURN_SHARE = 1 / 20
+"""Chance of a new heading at each step: 20 cells straight on in the mean, so that a walk leaves the place where it
+began."""
 _FEAR_CELLS = 40
+"""An evader wanders while no vehicle is this near. One at this distance counts a 1,300th of one on a neighbouring
+cell, so a wider look would decide nothing else but when it begins to flee."""
 _STEPS_PER_TICK = 1000
+"""Bounds the time of a tick for a quick target on small cells, or after a long pause. What is left of the tick is
+lost."""
 
 
 class TrueTerrain:

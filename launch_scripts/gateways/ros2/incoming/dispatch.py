@@ -27,8 +27,13 @@ MOST_ROBOTS = 256
 _LOOK_NS = NS_PER_S // 2
 """The swarm's own vehicles are looked at so often."""
 _MOST_ASKED = 16
+"""All who asked are answered at the next tick, 0.02 s later: more than a few that wait come from a peer that
+floods, and each of them is a copy of the map on the network."""
 _MOST_NEWS = 1 << 14
+"""Endpoints that come or go between two ticks: 64 of each of `MOST_ROBOTS`, when all robots start together."""
 _MOST_ORDERS = 8
+"""Orders of which one is being obeyed, which takes seconds, while the rest wait; more are refused at once (decision
+80)."""
 _TRIGGER = "std_srvs/srv/Trigger"
 
 
