@@ -22,6 +22,7 @@ from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import LETHAL_START, UNREACHABLE, Route, RouteBatch, RouteOutline, RouteStatus
 
 _NOWHERE_BOUNDS = (0, 0, 0, 0)
+"""An empty window, which no change of the map touches."""
 
 
 @dataclass(slots=True, eq=False)

@@ -51,7 +51,7 @@ _AHEAD = np.uint64(24)
 _PART = np.uint64(64)
 """Cells of a row that are looked through at once."""
 _TURNS = 12
-"""How often a tree is improved before a growth costs less: half as often is rare."""
+"""How often a tree is improved before a growth costs less: half as often is rare (decision 60)."""
 
 Walk = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]
 """(children, steps, lengths, ways, many)."""

@@ -42,7 +42,8 @@ _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
 AHEAD = 8
-"""Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
+"""Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048
+(decision 24)."""
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 

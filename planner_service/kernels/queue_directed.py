@@ -43,7 +43,7 @@ _WAYS = 4, 2, 6, 0, 3, 5, 1, 7
 """Directions of the steps into a cell from its neighbours, in the order in which these are offered something."""
 _ZERO32 = np.float32(0.0)
 _AHEAD = 8
-"""Cells of a batch between asking for one's memory and using it."""
+"""Cells of a batch between asking for one's memory and using it (decision 24)."""
 _PIECE = np.uint64(1 << 6)
 """Cells that make their offers before what these touched is put into the queue."""
 WIDTH = 0.9

@@ -23,11 +23,12 @@ from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is told of twice a second: one that is not told of for so long, though a vehicle is where it
-was, is not there."""
+was, is not there (decision 66)."""
 LOST_NS = 30 * NS_PER_S
-"""A target whose tracker is lost is searched for after so long: most trackers are back by then."""
+"""A target whose tracker is lost is searched for after so long: most trackers are back by then
+(decision 66)."""
 LISTEN_NS = 5 * NS_PER_S
-"""A planner that has just begun listens for so long before it takes its target for never seen."""
+"""A planner that has just begun listens for so long before it takes its target for never seen (decision 66)."""
 _TELL_NS = NS_PER_S
 _LONGEST_S = 1e7
 """Some four months, so that the age of what was never seen is a number."""

@@ -33,7 +33,7 @@ NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.
 
 MOST_SPREAD_SHARE = 48
 """While a tree is mended, what costs fall to spreads over one cell in so many at once, ten times as dear as
-evaluating it: beyond, whole branches have moved, and their trees are evaluated first."""
+evaluating it: beyond, whole branches have moved, and their trees are evaluated first (decision 60)."""
 
 
 class CostToGoTree:

@@ -35,11 +35,11 @@ from swarm.grid import Window
 
 MOST_LOOKS = 3.0
 """A move or a repair gives way to a growth once it has looked at so many times as many tiles as the map has; to
-mend one counts double."""
+mend one counts double (decision 61)."""
 
 MOST_KEPT = 1 << 9
 """Of so many tiles is kept what cells cost inside: 17 MB. Of 4096 x 4096 cells, a repair looks at 200 tiles in the
-mean, and a move at 170 to 260."""
+mean, and a move at 170 to 260 (decision 94)."""
 
 
 class PieceTree:

@@ -16,7 +16,8 @@ from shared_map.array_files import Floats
 from swarm.wire.route_columns import RouteBatch
 
 LOWER_SHARE = 16
-"""A heuristic is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
+"""A heuristic is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth
+(decision 64)."""
 
 
 class LowerBounds:
@@ -72,6 +73,7 @@ class LowerBounds:
 
 
 _NOT_EXACT = (-1.0, 0.0, 0.0)
+"""In place of a tree's slack, which is 0 or more."""
 _NONE: Floats = np.empty(0, np.float32)
 _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)
 

@@ -21,9 +21,9 @@ network as dense as they would need holds about as many cells as there are."""
 FINE = 8
 """Strides below the least one are for so many times the narrowest window: there all cells are grown."""
 MOST_SHARE = 8
-"""The largest stride is at most such a share of the map's side."""
+"""The largest stride is at most such a share of the map's side (decision 62)."""
 STALE_SHARE = 16
-"""Networks are found anew when cells have changed in one block of the least stride in so many."""
+"""Networks are found anew when cells have changed in one block of the least stride in so many (decision 62)."""
 
 _HEADER = 32
 """Bytes: four numbers of eight."""

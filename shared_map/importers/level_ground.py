@@ -52,6 +52,7 @@ _NOISY = 0.28
 """Water that a laser measured is rough by a decimetre or two, and level in the mean of 4 x 4 cells. From cell to
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
 _TOLD_SHARE = 0.001
+"""The note has one decimal of a percent: less than this would be told as 0.0 or 0.1 %."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,6 +68,8 @@ _MAX_PIXELS = 16 * MAX_CELLS
 _MAX_BLOCK_BYTES = 512 << 20
 """A block is what has to be unpacked at once."""
 _MAX_BANDS = 256
+"""Hyperspectral cameras have some 240, and four are needed at most. A header may claim 65,535, each of which GDAL
+describes in memory."""
 
 
 def is_raster(path: Path) -> bool:

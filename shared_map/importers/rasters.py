@@ -47,8 +47,13 @@ _METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
 _HALF_WORLD_M = math.pi * 6_378_137.0
 """Half of the side of the web's map, EPSG:3857."""
 _DEEPEST_ZOOM = 24
+"""A tile of this zoom is 2.4 m wide, and a pixel of it 9 mm: no map is finer, so a larger number is none of a
+tile."""
 _MOST_CODES, _LEAST_CODES = 256, 3
+"""Different values of a map of codes: as many as a byte has; and with fewer than three a height model in whole
+metres holds codes of a table by chance (decision 45)."""
 _LOOK_CELLS = 128
+"""A side of what is looked at first: most height models are ruled out by 16,384 heights."""
 
 
 def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:

@@ -27,8 +27,12 @@ _MOST_STEPS = 1 << 20
 _SAME = 1e-6
 """Coordinates nearer to each other than this share of the whole extent are one."""
 _FURTHEST = 1e9
+"""Metres or degrees: 25 times around the Earth. Beyond it no system has coordinates, and float64 still tells a
+micrometre."""
 _OFF_STEP = 0.05
+"""Of a step: printed coordinates are rounded. Points further off would be put into cells whose middle they miss."""
 _LEAST_FILLED = 0.1
+"""Of a grid's cells: points with fewer lie scattered, and a small file would ask for the memory of a large grid."""
 _X = ("x", "lon", "long", "lng", "longitude", "easting", "east", "e")
 _Y = ("y", "lat", "latitude", "northing", "north", "n")
 _Z = ("z", "h", "height", "elevation", "elev", "alt", "altitude", "dem", "value")

@@ -16,7 +16,8 @@ _PART = 4
 """No process may fill more than one part in this many of any of these."""
 
 _MAX_WAITING = 1 << 14
-"""Sets of throttled processes that wait, in all. What finds no place is asked for again once a digest names it."""
+"""Sets of throttled processes that wait, in all. What finds no place is asked for again once a digest names it
+(decision 18)."""
 
 _BURST_S = 10
 """A full bucket lasts so long at its rate: a vehicle that finds a burnt forest may tell of it at once."""
@@ -26,6 +27,7 @@ _SPEAKS_NS = _BURST_S * NS_PER_S
 
 
 _NOTHING = (0, 0)
+"""Sets and statements of a process that holds none."""
 
 
 class Capacity:

@@ -427,4 +427,4 @@ class MapReplica:
 _LEARN_EVERY_NS = 5 * NS_PER_S
 """Words of what is learned change the cost map at most this often, whoever says them: each change is one of the
 whole map, and grows every tree anew. What is held alone decides what they change it to, so replicas that hold the
-same are equal after this time at the latest."""
+same are equal after this time at the latest (decision 68)."""

@@ -50,6 +50,7 @@ _MANY = "-"
 _MAX_NAMES = 4096
 """Authors of whom is remembered when they spoke or were warned of: names cost a sender nothing."""
 _WARN_AGAIN_NS = 60 * NS_PER_S
+"""An author is named once a minute (decision 18): whoever floods must not fill the log as well."""
 
 
 class MapSync:

@@ -12,6 +12,7 @@ from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
 
 _TILE_BITS = TILE_CELLS.bit_length() - 1
 _TILE_MASK = TILE_CELLS - 1
+"""A tile's side is a power of two: row and column in it are the high and the low bits of a cell's index."""
 
 
 def beyond_tile(grid: GridSpec) -> int:

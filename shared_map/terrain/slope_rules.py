@@ -171,7 +171,9 @@ def _tobler(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
 
 
 _CLIMB = 5000 / 600
+"""Metres on level ground that take as long as one of ascent: 5 km/h, and an hour for 600 m (Naismith 1892)."""
 _DESCENT = 5000 / 300 / 6
+"""Metres on level ground that take as long as one of descent: ten minutes for 300 m (Langmuir 1984)."""
 
 
 def _naismith_langmuir(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:

@@ -47,6 +47,7 @@ MOST_BYTES = 2 << 30
 """Of all kept terrains together; the ones used longest ago go first."""
 _SUMS = "sums.json"
 _ABANDONED_S = 3600.0
+"""A folder that is still being written is younger: to write `MOST_BYTES` takes minutes on a slow disk."""
 _META = "terrain.json"
 
 

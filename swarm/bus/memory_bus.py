@@ -282,6 +282,7 @@ class PerfectLinks:
 TOKEN_NS = 1_000_000
 """Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""
 _AT_ONCE = (0,)
+"""Delays of the one copy of a message to oneself."""
 
 
 Trace = Callable[[int, str, str, str, bytes], None]

@@ -23,10 +23,11 @@ from vehicle_agent.traffic.steering import Steering
 
 _TURN_NS = 4 * NS_PER_S
 """For a vehicle's wish time stands still for so long: then its age grows, by a step in which wardens compare ages.
-Each vehicle's turns begin at another time, so that no tick has all wishes to make."""
+Each vehicle's turns begin at another time, so that no tick has all wishes to make (decision 37)."""
 _WAITING_TURN_NS = NS_PER_S
 """The same for one that waits on its way: ties between cells fall another way more often."""
 _MS = NS_PER_S // 1000
+"""A unit: ages are told in milliseconds, clocks count nanoseconds."""
 _STAYS = Wish()
 
 

@@ -25,15 +25,15 @@ SILENT_NS = NS_PER_S
 """Vehicles of a host that has not spoken for so long are obstacles: nobody waits for them or pushes them."""
 _AGE_BITS = 12
 """Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
-the older most of the time, or each lets its own wait for the other."""
+the older most of the time, or each lets its own wait for the other (decision 25)."""
 _TOLD_AGAIN_NS = 3 * BEAT_NS // 4
 """A host is told the same again after so long: somewhat less than a beat, so that a beat tells it."""
 MOST_GUESTS = 256
-"""Guests that one plot has ever known: their lives stay in its table, as those of all hosts."""
+"""Guests that one plot has ever known: their lives stay in its table, as those of all hosts (decision 40)."""
 MOST_CELLS_OF_GUEST = 1024
-"""Cells of one plot that one guest holds."""
+"""Cells of one plot that one guest holds (decision 40)."""
 MOST_CELLS_OF_GUESTS = 1 << 14
-"""Cells of one plot that all guests together hold: a quarter of one as large as a region."""
+"""Cells of one plot that all guests together hold: a quarter of one as large as a region (decision 40)."""
 _NO_CELLS: Sequence[int] = []
 _NO_GRANTS: Mapping[str, list[int]] = {}
 _MOST_CELLS = 64

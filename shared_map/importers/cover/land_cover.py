@@ -26,7 +26,10 @@ from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
 _TOLD_CODES = 6
+"""Codes that the note names, the most frequent first: a sentence of some 300 characters. It is told how many more
+there are."""
 _NO_CODE = -1
+"""Below every code: cells that the file does not reach."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +126,7 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
 
 
 _STRANGE, _EMPTY = HIGHEST_CODE + 1, HIGHEST_CODE + 2
+"""Rows of the look-up after those of all codes."""
 
 
 def _entries(codes: NDArray[Any]) -> NDArray[np.intp]:

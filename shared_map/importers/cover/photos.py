@@ -19,9 +19,17 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 MOST_SIDE = 1024
+"""The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
 _DARK = 30
+"""Of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
+channels say nothing."""
 _LEGEND_COLOURS, _LEGEND_SAME = 64, 0.6
+"""A drawn map has few colours, though CORINE's legend has 44, and most of its pixels are as those to the left and
+above. A photo has noise, and thousands of colours."""
 _RED_OVER_GREEN, _LIKE_BLUE, _FALSE_SHARE = 1.4, 0.15, 0.25
+"""A pixel is as red as plants are in near infrared where red exceeds green by so many times, and green differs from
+blue by less than this share of red; red ground and roofs have more green than blue. An image is in false colour
+where more than this share of it is so."""
 
 
 @dataclass(frozen=True, eq=False)

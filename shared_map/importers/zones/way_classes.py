@@ -14,6 +14,7 @@ from swarm.config.ground import WayConfig
 
 Kind = Literal["road", "water"]
 MOST_WIDTH_M = 10_000.0
+"""The bound of widths in settings, too (`width_m` in `swarm.config.ground`): a wider line is a mistake of units."""
 
 
 @dataclass(frozen=True, slots=True)

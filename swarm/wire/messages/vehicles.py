@@ -50,6 +50,7 @@ class VehicleState(enum.IntEnum):
 
 
 NO_TARGET = 255
+"""The highest of a byte: indices of targets are below it."""
 _Place = Annotated[bytes, Column("<f4", per="ids", least=-1e9, most=1e9)]
 
 
