@@ -1,1 +1,2 @@
-"""What all processes agree on: grid, wire, bus, settings, clock and loop. Imports none of the other packages."""
+"""Definitions shared by all processes: grid, wire, bus, settings, clock and loop. Imports none of the other
+packages."""

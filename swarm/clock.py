@@ -9,7 +9,7 @@ NS_PER_S = 1_000_000_000
 
 
 class Clock(Protocol):
-    """What tells the time."""
+    """Source of time."""
 
     def now_ns(self) -> int:
         """Nanoseconds since 1970, never running backwards."""

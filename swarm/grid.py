@@ -48,7 +48,7 @@ class Window:
 
     @property
     def cells(self) -> int:
-        """How many cells it holds."""
+        """Number of its cells."""
         return 0 if self.empty else (self.row1 - self.row0) * (self.col1 - self.col0)
 
     def union(self, other: Window) -> Window:
@@ -68,7 +68,7 @@ class Window:
         return self.row0 <= row < self.row1 and self.col0 <= col < self.col1
 
     def touches(self, other: Window) -> bool:
-        """Whether the two overlap or share a border or corner."""
+        """Returns True if the two overlap or share a border or corner."""
         return (
             self.row0 <= other.row1
             and other.row0 <= self.row1
@@ -106,12 +106,12 @@ class GridSpec:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of an array with an entry per cell."""
+        """Shape of an array with an entry per cell."""
         return self.rows, self.cols
 
     @property
     def cells(self) -> int:
-        """How many cells there are; valid cells are 0 to one less."""
+        """Number of cells; valid cells are 0 to one less."""
         return self.rows * self.cols
 
     @property
@@ -189,8 +189,8 @@ class GridSpec:
         return self.region_of_tile(self.tile_of(cell))
 
     def tile_for(self, tile: int, class_number: int) -> int:
-        """The tile as one class of vehicles has it, for marks which hold for that class alone: each class has its
-        tiles behind those of the one before, with one between, about which is what is learned.
+        """Returns the tile of one class of vehicles, for marks which hold for that class alone. Each class has its
+        tiles behind those of the previous one, with one tile between, which holds the learned factors.
 
         class_number  0 for all vehicles; 1 is the first of the scenario's `[[classes]]`
         """
@@ -238,12 +238,12 @@ _CODES = bytes(range(8))
 
 @lru_cache(maxsize=16)
 def step_offsets(cols: int) -> tuple[int, ...]:
-    """What a step in each direction adds to a cell of a grid of so many columns."""
+    """Returns the offset that a step in each direction adds to a cell of a grid with `columns` columns."""
     return tuple(south * cols + east for south, east in zip(STEP_ROW, STEP_COL, strict=True))
 
 
 def bounds_of(cells: Sequence[int], cols: int) -> tuple[int, int, int, int]:
-    """The smallest (row, col) and the greatest of some cells, one at least, of a grid of so many columns."""
+    """Returns the smallest and the greatest (row, col) of at least one cell, in a grid with `columns` columns."""
     within = [cell % cols for cell in cells]
     return min(cells) // cols, min(within), max(cells) // cols, max(within)
 

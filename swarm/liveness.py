@@ -21,7 +21,7 @@ class Peer:
 
 
 _MOST_LIVES = 64
-"""Tokens of one process: whoever holds its certificate may raise any number."""
+"""Largest number of tokens of one process: the holder of its certificate may raise any number."""
 
 
 class Roster:
@@ -29,7 +29,7 @@ class Roster:
 
     A token of a new incarnation may appear before that of the old one falls, so all incarnations of a process are
     kept, and the order in which tokens come and go does not matter. Repeated and unknown ones change nothing. Of a
-    process with more than 64 tokens only the newest are.
+    process with more than 64 tokens only the newest count.
     """
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Roster:
         return {id: incarnations[-1] for (r, id), incarnations in sorted(self._alive.items()) if r == role}
 
     def is_alive(self, role: str, id: str) -> bool:
-        """Whether any incarnation of the process is alive."""
+        """Returns True if any incarnation of the process is alive."""
         return (role, id) in self._alive
 
 
@@ -82,12 +82,12 @@ class Newest:
     def __init__(self, most: int = 4096, silence_ns: int = SILENCE_NS) -> None:
         self._silence_ns = silence_ns
         self._most = most
-        """Streams remembered: whatever comes of others is news."""
+        """Number of remembered streams: any message of another stream counts as new."""
         self._newest: dict[Hashable, tuple[tuple[int, int], int]] = {}
         """Stream -> the number of its last news, and when that was heard."""
 
     def is_news(self, stream: Hashable, number: tuple[int, int], now_ns: int) -> bool:
-        """Whether a message is news, which it is once."""
+        """Returns True if a message is new, which it is once."""
         known = self._newest.get(stream)
         if known is not None:
             last, heard_ns = known
@@ -134,5 +134,5 @@ def split_rank(id: str) -> tuple[str, int]:
 
 
 def job_of(id: str) -> str:
-    """What a process serves, whatever its rank."""
+    """Returns the task of a process, independent of its rank."""
     return split_rank(id)[0]

@@ -4,8 +4,8 @@
     xy:779610,190390     metres of the map: the terrain's coordinate system
     cell:40,200          row and column from the north-west corner; cell:40.5,200.5 is the middle of that cell
 
-Two bare whole numbers may be a row and a column as well: they are what lies in the terrain. Where both would, the
-place is refused. Without a coordinate system two bare numbers are metres of the map.
+Two bare whole numbers may be a row and a column as well: they are what lies in the terrain. A text that fits both
+is refused. Without a coordinate system two bare numbers are metres of the map.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Frame(Protocol):
 
 
 class Place(NamedTuple):
-    """A place as somebody wrote it.
+    """A location as the user wrote it.
 
     kind   None of two bare numbers
     whole  whether both numbers were written without a point
@@ -67,7 +67,7 @@ Given = str | Sequence[float] | Place
 
 
 def read_place(given: Given, what: str) -> Place:
-    """What a place says, before it is known on which terrain.
+    """Parses a location before its terrain is known.
 
     Parameters
     ----------
@@ -97,7 +97,8 @@ def read_place(given: Given, what: str) -> Place:
 
 
 def cell_of(given: Given, frame: Frame, what: str) -> int:
-    """The cell that somebody names. Raises ConfigError as `read_place`, and if the place is outside the terrain."""
+    """Returns the cell that a user names. Raises ConfigError as `read_place`, and if the place is outside the
+    terrain."""
     place, grid = read_place(given, what), frame.grid
     kinds = _kinds_of(place, grid)
     cells = {kind: cell for kind in kinds if (cell := _cell_at(_corner(place, kind, frame, what), grid)) >= 0}
@@ -110,7 +111,8 @@ def cell_of(given: Given, frame: Frame, what: str) -> int:
 
 
 def corners_of(given: Sequence[Given], frame: Frame, what: str) -> list[Corner]:
-    """The corners of an area, which may lie outside the terrain. All that are bare are written in one way."""
+    """The corners of an area, which may lie outside the terrain. Corners without a prefix must all have the same
+    form."""
     places, grid = [read_place(each, what) for each in given], frame.grid
     bare = [place for place in places if place.kind is None]
     kinds = _kinds_of(bare[0]._replace(whole=all(place.whole for place in bare)), grid) if bare else ()
@@ -149,7 +151,7 @@ def fields_of(frame: Frame, cell: int) -> dict[str, Any]:
 
 
 def extent_of(frame: Frame, kind: Kind | None = None) -> str:
-    """Where a terrain lies, for sentences: in one kind of coordinates, or in all that it has."""
+    """Returns the extent of a terrain, for sentences: in one kind of coordinates, or in all that it has."""
     grid = frame.grid
     east_m, south_m = grid.west_m + grid.cols * grid.resolution_m, grid.north_m - grid.rows * grid.resolution_m
     parts: dict[Kind, str] = {
@@ -189,7 +191,7 @@ def bounds_of(frame: Frame) -> tuple[float, float, float, float] | None:
 
 
 def _kinds_of(place: Place, grid: GridSpec) -> tuple[Kind, ...]:
-    """What the numbers of a place may be."""
+    """Returns the possible meanings of a location's numbers."""
     if place.kind is not None:
         return (place.kind,)
     usual: Kind = "xy" if grid.crs == "local" else "latlon"
@@ -197,7 +199,7 @@ def _kinds_of(place: Place, grid: GridSpec) -> tuple[Kind, ...]:
 
 
 def _corner(place: Place, kind: Kind, frame: Frame, what: str) -> Corner:
-    """Where a place is by one meaning of its numbers; not finite if it is nowhere."""
+    """Returns the location by one meaning of its numbers; not finite if it is nowhere."""
     grid = frame.grid
     if kind == "cell":
         return place.first, place.second

@@ -1,8 +1,7 @@
 """Zenoh's access control for a router, from the table of topics.
 
-Zenoh allows a message where a rule's key expression includes the whole of the message's, and knows whoever is at
-the other end of a link by the common name of its certificate, which it compares as a whole: so there are rules for
-each name.
+Zenoh allows a message if a rule's key expression includes the whole key expression of the message. It identifies a
+peer by the whole common name of its certificate. Each name therefore has its own rules.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _LOOPBACK = "loopback"
 
 @dataclass(frozen=True, slots=True)
 class Bearer:
-    """Who a certificate was issued to.
+    """The name to which a certificate was issued.
 
     name    `ROLE.ID`, for an agent `agent.GROUP.ID`, for a rover that marks `rover.GROUP.ID`
     author  what its ids as an author begin with: the group and id of an agent or rover, else the id
@@ -39,7 +38,7 @@ class Bearer:
     author: str
 
     def own(self, field: str) -> str:
-        """What a field of a key must be where it must be the bearer's own. A standby serves its job's."""
+        """Required value of a key's field where it must be the bearer's own. A standby serves its job's."""
         own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
         return own.get(field, self.id)
 
@@ -66,8 +65,8 @@ def bearer(name: str) -> Bearer:
 
 
 def common_name(name: str, revoked: Collection[str]) -> str:
-    """What stands in the certificate of a name: itself, or if that was revoked `NAME~2`, and so on. So a process
-    whose certificate is lost gets another one under the same name."""
+    """Returns the common name in the certificate of a name: the name itself, or `NAME~2` if that was revoked, and
+    so on. A process whose certificate is lost therefore gets another one under the same name."""
     candidate, issue = name, 1
     while candidate in revoked:
         issue += 1
@@ -76,9 +75,9 @@ def common_name(name: str, revoked: Collection[str]) -> str:
 
 
 def access_control(namespace: str, names: Iterable[str], revoked: Collection[str] = ()) -> dict[str, Any]:
-    """What a router's `access_control` is set to: each name may do what the table of topics grants its role, and
-    whoever has another name may do nothing. Links over tcp/ have no names; they stay open, as `check_endpoint` lets
-    them be on loopback only. Raises ConfigError on a name that no process can have.
+    """Returns the value of a router's `access_control`: each name may do what the table of topics grants to its
+    role, and any other name is denied everything. Links over tcp/ have no names; they stay open, as
+    `check_endpoint` lets them be on loopback only. Raises ConfigError on a name that no process can have.
 
     revoked  common names that are denied everything from now on
     """
@@ -102,8 +101,8 @@ def access_control(namespace: str, names: Iterable[str], revoked: Collection[str
 
 
 def _rules(namespace: str, who: Bearer) -> list[dict[str, Any]]:
-    """What comes from a bearer is limited to its own keys. Queries that go to it are limited to topics: one may
-    name many keys, and reaches a process only where that was allowed to serve one of them."""
+    """Messages from a bearer are limited to its own keys. Queries that go to it are limited to topics: one may name
+    many keys, and reaches a process only where that was allowed to serve one of them."""
     token = f"{namespace}/{ALIVE_KEY.format(role=who.role, id=who.id, incarnation='*')}"
     tokens = f"{namespace}/{ALIVE_KEY.format(role='*', id='*', incarnation='*')}"
     table = {name: list(_keys(namespace, who, name)) for name in ("put", "serve", "ask", "hear")}

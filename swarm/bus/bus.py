@@ -1,8 +1,8 @@
-"""What processes may do with the network, and what the network tells them.
+"""Interface between processes and the network.
 
 `ZenohBus` and `MemoryBus` implement `Bus`; `tests/support/bus_behaviour.py` holds both to the rules below.
 
-Threads     No method but `close` waits for the network: what comes back is posted as an event. A `Post` is called
+Threads     No method but `close` waits for the network: results are posted as events. A `Post` is called
             on the bus's threads, on several at once, and blocks what its thread reads: a service posts to an
             `Inbox` and handles events on its own thread.
 Order       Samples of one publisher on one topic come in the order of their publishing, as do replies to one query
@@ -14,8 +14,8 @@ Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is
 Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
-            logged once per key and minute, and never posted. So is what comes without the run's code on a
-            trusted topic, where the bus has an `Authenticator`; such a query is refused.
+            logged once per key and minute, and never posted. A message on a trusted topic without the run's code is
+            rejected, too, if the bus has an `Authenticator`; such a query is refused.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
             caller.
 """
@@ -33,7 +33,7 @@ from swarm.wire.topics import Topic
 TIMEOUT_PARAMETER = "timeout_s"
 """Parameter of a query on the wire: how many seconds its asker waits."""
 USUAL_TIMEOUT_S = 10.0
-"""Of a query without that parameter: what Zenoh's own `get` waits by default."""
+"""Timeout (s) of a query without that parameter: the default of Zenoh's own `get`."""
 LONGEST_TIMEOUT_S = 60.0
 """A query is taken to wait no longer, whatever it says."""
 
@@ -67,7 +67,8 @@ class Question:
 
     @property
     def timeout_s(self) -> float:
-        """How long the asker waits. It travels with the query, as a duration: no clock is compared with another."""
+        """Time for which the asker waits (s). It travels with the query, as a duration: no clock is compared with
+        another."""
         return self.answerer.timeout_s
 
     @property
@@ -77,7 +78,7 @@ class Question:
 
     @property
     def expired(self) -> bool:
-        """Whether the asker has left: it began to wait before the query arrived."""
+        """True if the asker has left: it began to wait before the query arrived."""
         return self.waited_s >= self.timeout_s
 
     def refuse(self, reason: str) -> None:
@@ -222,7 +223,7 @@ def newest_of(topic: Topic, waiting: Iterable[tuple[str, S]], hear: Callable[[S]
 
 
 def new_counts() -> dict[str, int]:
-    """What a bus counts: messages and the bytes of their payloads, and payloads which it dropped. Keys, codes and
+    """Returns the counters of a bus: messages, the bytes of their payloads, and dropped payloads. Keys, codes and
     what the network adds are not in the bytes."""
     return {"messages_out": 0, "messages_in": 0, "bytes_out": 0, "bytes_in": 0, "payloads_dropped": 0}
 
@@ -237,7 +238,7 @@ class Bus(Protocol):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """As `new_counts`, since the bus was opened."""
+        """Counters since the bus was opened, as in `new_counts`."""
         ...
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
@@ -252,23 +253,24 @@ class Bus(Protocol):
 
         together  post `HeardMany` of all samples that wait, for a topic of many small messages; the reader
                   compares each key with its message
-        every_s   post the newest sample of each key only, once in so many seconds: for a reader that is slower than
-                  the topic. What it does not read is not decoded. Only for topics of which the newest counts
+        every_s   post the newest sample of each key only, once per this interval (s): for a reader that is slower
+                  than the topic. Samples that it does not read are not decoded. Only for topics of which the newest
+                  counts
         """
         ...
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        """Keep samples from now on until `collected`, the newest `Topic.buffer`. For what is acted on at ticks: a
-        sample that wakes no thread costs a fifth."""
+        """Keep samples from now on until `collected`, the newest `Topic.buffer`. For samples that are used at ticks
+        only: a sample that wakes no thread costs a fifth."""
         ...
 
     def collected(self, topic: Topic) -> list[Heard]:
-        """What has been kept on a topic since the last call, as `newest_of` says."""
+        """Returns the samples kept on a topic since the last call, merged as in `newest_of`."""
         ...
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        """All that has been kept on a topic since the last call, in order, with keys as in a `HeardMany`: for a
-        topic of many small messages. The reader compares each key with its message."""
+        """Returns all samples kept on a topic since the last call, in order, with keys as in a `HeardMany`: for a
+        topic with many small messages. The reader compares each key with its message."""
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
@@ -284,7 +286,7 @@ class Bus(Protocol):
         ...
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
-        """End what was served with exactly these fields. Queries under way may be posted after it; others whom a
+        """Ends the queryable with exactly these fields. Queries under way may be posted after it; others whom a
         query reaches answer it."""
         ...
 

@@ -1,4 +1,4 @@
-"""Endpoints of routers: their parts, whether anybody listens there, and if nobody does, why.
+"""Endpoints of routers: their parts, whether a process listens there, and if none does, the reason.
 
 The reasons are in words of our own: the network library names its own source files instead.
 """
@@ -34,7 +34,7 @@ def host_port(endpoint: str) -> tuple[str, int]:
 
 
 def listening(endpoint: str) -> bool:
-    """Whether something accepts connections there."""
+    """Returns True if a process accepts connections there."""
     try:
         with socket.create_connection(host_port(endpoint), timeout=0.5):
             return True
@@ -58,13 +58,13 @@ def wait_for_router(endpoints: Sequence[str]) -> None:
 
 
 def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
-    """Why no router is reached at any of these endpoints: what its port does when somebody knocks."""
+    """Returns the reason why no router is reached at these endpoints, from a connection attempt to each port."""
     reasons = dict.fromkeys(_why_silent(endpoint, encrypted) for endpoint in endpoints)
     return "; ".join(reasons)
 
 
 def why_not_listening(error: Exception) -> str:
-    """Why nobody can listen, from what the library says."""
+    """Returns the reason why no process can listen there, from the library's message."""
     found = _OS_ERROR.search(str(error))
     if found is None:
         return "the network library refuses; its own words are in the log (is the port taken?)"

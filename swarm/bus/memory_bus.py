@@ -2,7 +2,7 @@
 
 Everything is encoded and decoded as on the wire, once per message; all subscribers share the frozen result. A
 `LinkModel` decides what a link does to a message (delay, loss, repetition, partition), so that a seed replays a
-run. Nothing is buffered but what is collected: a handler takes no simulated time, so no reader falls behind.
+run. Only collected samples are buffered: a handler takes no simulated time, and no reader falls behind.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Asking:
     replies   how many were posted
     failure   the last refusal, or "timeout"
     asked     the question's payload
-    over      whether `AskEnded` was posted: what comes later is dropped
+    over      whether `AskEnded` was posted: later replies are dropped
     began_ns  when it was asked
     """
 
@@ -155,7 +155,7 @@ class MemoryAnswerer:
         self._send(b"", arrive)
 
     def _send(self, payload: bytes, arrive: Callable[[], None]) -> None:
-        """What answers one query stays in order; it may be lost or repeated."""
+        """Replies to one query stay in order; each may be lost or repeated."""
         source, to, what = self.queryable.bus, self.asking.bus, self.asking.topic.name
         if source.closed:
             return
@@ -170,7 +170,7 @@ class MemoryAnswerer:
             source.network.scheduler.at(self.last_arrival_ns, deliver)
 
 
-# What nodes of the simulated network hear: their subscriptions and queryables, by topic and key.
+# Subscriptions and queryables of simulated nodes, by topic and key.
 
 
 @dataclass(eq=False, slots=True)
@@ -188,7 +188,7 @@ class Declaration:
     together: bool = False
 
     def meets(self, fields: Mapping[str, str]) -> bool:
-        """Whether this and another key of the topic, either with wildcards, can name the same value."""
+        """Returns True if this and another key of the topic, with or without wildcards, can name the same value."""
         for name, chunk in self.narrow.items():  # noqa: SIM110 (`all` with a generator costs a simulation time)
             if fields[name] not in (chunk, "*"):
                 return False
@@ -220,8 +220,9 @@ class Subscriptions:
         ]
 
     def find(self, fields: Mapping[str, str]) -> list[Declaration]:
-        """Those that a value with these fields reaches: first the ones with wildcards, each kind in the order of
-        its declaration. A replayed run depends on this order. The list is kept: nobody may change it."""
+        """Returns the subscribers that a value with these fields reaches: those with wildcards first, then the
+        others, each in order of declaration. A replayed run depends on this order. The list is cached: callers must
+        not change it."""
         key = tuple(fields.values())
         found = self._found.get(key)
         if found is None:
@@ -250,19 +251,19 @@ def sampled(bus: MemoryBus, post: Post, every_ns: int) -> Post:
     return arrive
 
 
-# What becomes of messages between the nodes of a `MemoryNetwork`.
+# Faults of messages between the nodes of a `MemoryNetwork`.
 
 
 class LinkModel(Protocol):
-    """What happens to a message between two nodes."""
+    """Fate of a message between two nodes."""
 
     def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
         """One delay per copy that arrives; none where it is lost."""
         ...
 
     def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        """Whether the network holds the two for connected, in the direction of the message. Tokens and queries
-        depend on it. It may lag behind `delays_ns`: a cut is noticed when the lease runs out."""
+        """Returns True if the network considers the two connected, in the direction of the message. Tokens and
+        queries depend on it. It may lag behind `delays_ns`: a cut is noticed when the lease runs out."""
         ...
 
 
@@ -290,7 +291,7 @@ Trace = Callable[[int, str, str, str, bytes], None]
 
 
 class MemoryNetwork:
-    """What a Zenoh router is for real processes: connects the buses of all nodes.
+    """Simulated counterpart of a Zenoh router: connects the buses of all nodes.
 
     links  may be replaced at any time; messages under way arrive as the earlier model decided
     """
@@ -311,7 +312,7 @@ class MemoryNetwork:
         return bus
 
     def connected(self, source: MemoryBus, to: MemoryBus) -> bool:
-        """Whether queries and tokens of `source` reach `to` now."""
+        """Returns True if queries and tokens of `source` reach `to` now."""
         return source is to or self.links.connected(source.node, to.node, self.scheduler.clock.now_ns())
 
     def relink(self, nodes: Sequence[str], up: bool) -> None:
@@ -349,11 +350,11 @@ class MemoryBus:
         """Once true, nothing is sent or posted any more."""
         self.counts = new_counts()
         self.queryables: dict[str, list[Declaration]] = {}
-        """Topic -> what is served, in order; subscriptions are the network's."""
+        """Topic -> its queryables, in order; subscriptions belong to the network."""
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self._kept: dict[str, deque[_Sample]] = {}
-        """Topic -> what waits for `collected`."""
+        """Topic -> samples that wait for `collected`."""
         self.tokens: list[Peer] = []
         """Raised with `declare_alive`; visible to others while the bus is open and connected."""
 
@@ -570,7 +571,7 @@ class _Watcher:
 class _Sample:
     """One put, parsed and checked once: when the first subscription is reached. All share the result.
 
-    checked_by  who has found its code right; None before, and for a bus that checks none
+    checked_by  the authenticator that accepted its code; None before, and for a bus without codes
     parsed      whether it was parsed
     parses      its event; None if the payload is no message of the topic
     fits        the same; None if the message says that it is of another sender than the key, too

@@ -10,7 +10,7 @@ from swarm.clock import ManualClock
 
 
 class Scheduler:
-    """Runs actions at their times, in order. Of two that are due at once the one scheduled first runs first.
+    """Runs actions at their times, in order. Of two actions at the same time, the one scheduled first runs first.
 
     All nodes of a simulation share one. An action runs to its end before the next: it may schedule others, and time
     stands still meanwhile. An error in an action ends the simulation.
@@ -22,10 +22,11 @@ class Scheduler:
         self._due: list[tuple[int, int, Callable[[], None]]] = []
         """Heap of (time in ns, number, action)."""
         self._count = 0
-        """How many actions were scheduled so far: their numbers, which decide between equal times."""
+        """Number of actions scheduled up to now, which orders actions of equal times."""
 
     def at(self, when_ns: int, action: Callable[[], None]) -> None:
-        """Run an action at a time; at once, after what is due already, if that has passed."""
+        """Runs an action at a time. If that time has passed, the action runs after all actions that are already
+        due."""
         self._count += 1
         heapq.heappush(self._due, (max(when_ns, self.clock.now_ns()), self._count, action))
 

@@ -1,11 +1,11 @@
 """The bus of real processes, on one Zenoh session.
 
-Each subscription and queryable has a thread that reads what comes in, but for a queryable whose questions an inbox
-decodes: those are posted on Zenoh's own thread (decision 99). Three other choices rest on measurements:
-subscriptions have channels that drop their oldest sample when full, because with a FIFO a stalled reader holds up
-queries on the same link; replies are posted on Zenoh's own thread, because a thread per query is ten times slower;
-questions, tokens and links come seldom and have no channel of Zenoh's, because a thread that waits on one wakes
-ten times a second for nothing (`Arrivals`).
+Each subscription and queryable has a thread that reads its channel. The exception is a queryable whose queries are
+decoded by an inbox: those are posted on Zenoh's own thread (decision 99). Three other choices rest on measurements.
+Subscriptions have channels that drop their oldest sample when full: with a FIFO a stalled reader holds up queries
+on the same link. Replies are posted on Zenoh's own thread: a thread per query is ten times slower. Queries, tokens
+and links are rare and have no channel of Zenoh's: a thread that waits on one wakes ten times a second for nothing
+(`Arrivals`).
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class ZenohAnswerer:
             self._fault = error
 
     def decoded(self) -> Asked | None:
-        """What is asked; None if that is rejected, which ends the query."""
+        """Returns the query, decoded; None if it is rejected, which ends the query."""
         intake, topic, query = self._bus.intake, self._topic, self._query
         assert query is not None
         assert topic.request is not None
@@ -139,7 +139,7 @@ _QUERY_BUFFER = 4096
 _TOKEN_BUFFER = 65_536
 """Changes of tokens, or of links, that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
-"""How long `close` waits for a router that does not answer."""
+"""Time for which `close` waits for an unresponsive router (s)."""
 
 
 def open_bus(
@@ -153,8 +153,8 @@ def open_bus(
 
     mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
                    messages on
-    patient        wait for as long as nobody listens there: a process may be started before its router
-    authenticator  for who speaks on trusted topics
+    patient        wait until a process listens: a process may be started before its router
+    authenticator  signs messages on trusted topics
     """
     endpoints = network.listen if mode == "router" else network.connect
     if patient:
@@ -188,11 +188,11 @@ class ZenohBus:
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
-        """All that was declared and not yet undeclared, in order; `close` undeclares it backwards."""
+        """Entities that are declared and not yet undeclared, in order; `close` undeclares them in reverse."""
         self._subscribers: dict[str, list[Any]] = {}
         """Key expression -> its subscribers, for `unsubscribe`."""
         self._collecting: dict[str, list[Any]] = {}
-        """Topic -> its subscribers that nobody reads before `collected`."""
+        """Topic -> its subscribers, which are read by `collected` only."""
         self._queryables: dict[str, list[Any]] = {}
         """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
@@ -445,5 +445,5 @@ class ZenohBus:
 
 
 def _into(arrivals: Arrivals) -> Any:
-    """What an entity is declared with to leave what comes in there."""
+    """Returns the handler with which an entity is declared, which leaves its items there."""
     return zenoh.handlers.Callback(arrivals.put, arrivals.end, indirect=False)

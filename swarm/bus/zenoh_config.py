@@ -13,9 +13,10 @@ from swarm.wire.codec import MAX_PAYLOAD_BYTES
 
 
 def session_config(network: NetworkConfig, mode: str) -> zenoh.Config:
-    """What `zenoh.open` is given. Nothing is discovered: sessions meet at the endpoints of the scenario only.
+    """Returns the configuration for `zenoh.open`. Nothing is discovered: sessions meet at the endpoints of the
+    scenario only.
 
-    mode  "client" or "router"; a router with certificates lets `network.admit` take part, and nobody else
+    mode  "client" or "router"; a router with certificates admits only the processes in `network.admit`
     Raises ConfigError on a name that no process can have.
     """
     settings: dict[str, Any] = {

@@ -27,19 +27,19 @@ MOST_TOGETHER = 1024
 
 
 class Arrivals:
-    """What comes in on one entity, in its order.
+    """Items received on one entity, in order.
 
     `recv` of a channel of Zenoh's wakes its thread ten times a second, to look for signals, and asks for the
     interpreter's lock each time (decision 95). A thread that waits here sleeps until something comes.
-    Zenoh's own thread needs the interpreter's lock to leave an item here, so this is for what comes seldom: a flood
-    of samples belongs into a channel.
+    Zenoh's own thread needs the interpreter's lock to leave an item here, which suits rare items only: frequent
+    samples belong into a channel.
 
     most  items that wait; those that come then are dropped
     """
 
     def __init__(self, most: int) -> None:
         self._items: SimpleQueue[Any] = SimpleQueue()
-        """What has come; None ends it."""
+        """Received items; None ends the queue."""
         self._most = most
 
     def put(self, item: Any) -> None:
@@ -65,7 +65,7 @@ def waiting_in(channel: Any) -> list[Any]:
 
 
 def taken_from(channel: Any, most: int) -> list[Any]:
-    """The items that wait in a channel, at most so many; none if none does."""
+    """Returns the items that wait in a channel, up to a limit; empty if there are none."""
     items: list[Any] = []
     while len(items) < most and (item := channel.try_recv()) is not None:
         items.append(item)
@@ -109,18 +109,19 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
 
 
 def attached(carrier: Any) -> bytes | None:
-    """What was sent beside the payload of a sample or a query."""
+    """Returns the attachment of a sample or a query."""
     attachment: bytes | None = None if carrier.attachment is None else carrier.attachment.to_bytes()
     return attachment
 
 
 def says_json(carrier: Any, payload: bytes) -> bool:
-    """Whether a sample or query carries JSON, by its encoding: that costs more to look up than the first byte."""
+    """Returns True if the encoding of a sample or query is JSON. The lookup costs more than reading the first
+    byte."""
     return may_be_json(payload) and str(carrier.encoding).partition(";")[0] == JSON_ENCODING
 
 
 def timeout_of(said: str) -> float:
-    """The timeout that a query states, within bounds. Raises ProtocolError on what is no positive number."""
+    """The timeout that a query states, within bounds. Raises ProtocolError if it is not a positive number."""
     if not said:
         return USUAL_TIMEOUT_S
     try:
@@ -208,7 +209,7 @@ class Intake:
     def request(
         self, wanted: type[Message], query: zenoh.Query, asked: bytes, parameters: dict[str, str]
     ) -> Message:
-        """What a query asks, whose payload is `asked`. Raises ProtocolError."""
+        """Decodes a query with the payload `asked`. Raises ProtocolError."""
         if query.payload is None:
             return decode_parameters(parameters, wanted)
         return decode(packed_json(asked, wanted) if says_json(query, asked) else asked, wanted)
@@ -219,7 +220,7 @@ class Intake:
             check_code(self._authenticator, attached(carrier), topic, key, payload, asked)
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
-        """What a key names. Raises ProtocolError where it is none of the topic's."""
+        """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""
         fields = topic.parse(self._namespace, key)
         if fields is None:
             raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")

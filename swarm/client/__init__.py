@@ -1,4 +1,4 @@
-"""What a vehicle, a tracker or a tool outside of the swarm imports. It needs Zenoh, msgspec and msgpack only.
+"""Imports for an external vehicle, tracker or tool. It needs Zenoh, msgspec and msgpack only.
 
 from swarm.client import connect
 

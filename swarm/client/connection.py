@@ -38,8 +38,9 @@ class Swarm:
     It may be used from any thread. Callbacks come on a thread of its own, one after the other.
 
     A lost link comes back by itself, and everything that vehicles and targets said last is said again at once.
-    Meanwhile nothing raises: what is said is lost, `connected` is false, and leases run out. If another run is in
-    the namespace when the link is back, every call raises RunMismatchError, as cells may mean other places there.
+    Meanwhile nothing raises: published messages are lost, `connected` is false, and leases expire. If another run
+    is in the namespace when the link is back, every call raises RunMismatchError, as cells may mean other places
+    there.
     """
 
     def __init__(
@@ -76,12 +77,12 @@ class Swarm:
 
     @property
     def connected(self) -> bool:
-        """Whether the link to the router is up, as far as is known."""
+        """True if the link to the router is up, as far as is known."""
         return self._session.connected
 
     @property
     def run(self) -> RunInfo:
-        """What a process of the run said of it when the connection began."""
+        """Description of the run, from the reply of one of its processes when the connection began."""
         return self._session.run
 
     @property
@@ -96,7 +97,8 @@ class Swarm:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was refused, missed and reported since the connection began, and what the bus counts."""
+        """Counters since the connection began: rejected and missed messages, reported problems, and those of the
+        bus."""
         return {**self._session.bus.counts, **self._session.counts}
 
     def vehicle(
@@ -115,9 +117,10 @@ class Swarm:
         group     whose it is
         radius_m  around its place, which others keep clear
         lease_s   others avoid its last place for so long after they hear nothing more
-        right_of_way  it may reserve cells, which nobody else enters then (`Vehicle.reserve`). Needs the user of the
-                      swarm, or with certificates the name `rover.GROUP.ID`. What its next life needs is kept in the
-                      file of this path; if True, in one of this user's own for each run and id
+        right_of_way  it may reserve cells, which no other vehicle enters then (`Vehicle.reserve`). Needs the user
+                      of the swarm, or with certificates the name `rover.GROUP.ID`. The state for its next
+                      generation is kept in the file of this path; if True, in a file of this user for each run and
+                      id
         vehicle_class  whose routes it asks for: one of the scenario's classes of vehicles
         """
         vehicle = Vehicle(self._session, id, group, radius_m, lease_s, vehicle_class)
@@ -168,15 +171,16 @@ class Swarm:
         return Orders(self._session)
 
     def observer(self, *, every_s: float = EVERY_S) -> Observer:
-        """What happens in the swarm, from now on.
+        """Subscribes to events of the swarm from now on.
 
-        every_s  positions of the swarm's vehicles are read once in so many seconds
+        every_s  interval at which positions of the swarm's vehicles are read (s)
         """
         return Observer(self._session, self._session.number("every_s", every_s, 0, 1e6, more=True))
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
         """Call with a sentence when something goes wrong that no call can raise: another process uses one of our
-        ids, a planner does not answer. Each is told once a minute, logged, and counted in `counts`."""
+        ids, a planner does not answer. Each problem is reported at most once a minute, logged, and counted in
+        `counts`."""
         self._session.on_problem(callback)
 
     def close(self) -> None:
@@ -204,7 +208,7 @@ def connect(
     certificate, key  of this program, whose name says what it may do: rover.GROUP.ID, tracker.TARGET, operator.NAME
     timeout_s  how long to wait for a router, and for a process that belongs to a run
 
-    Raises ConfigError on an argument that is not what it must be, BusError if nobody answers.
+    Raises ConfigError on an invalid argument, BusError if no process replies.
     """
     import msgspec
 
@@ -270,8 +274,8 @@ def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tu
 
 
 def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo, int] | None:
-    """What most processes say: the run to which they belong, and how far their clocks are ahead. So a stranger
-    among them decides nothing. None without any that has a grid.
+    """Returns the majority answer: the run to which most processes belong, and the offset of their clocks. A single
+    foreign process therefore decides nothing. None without any that has a grid.
 
     answers  with the time at which each came, by our clock
 

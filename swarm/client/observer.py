@@ -1,4 +1,4 @@
-"""What happens in a swarm, for programs that only watch: positions, targets, routes, marks and notes."""
+"""Read-only view of a swarm for programs: positions, targets, routes, marks and events."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class SeenVehicle:
     """A vehicle, where it was said to be last.
 
     state   idle, waiting, following, arrived, stranded, lost; "outside" of one that is not the swarm's own
-    target  whom it chases, None for nobody
+    target  the target that it chases, None if there is none
     """
 
     id: str
@@ -53,7 +53,7 @@ class SeenTarget:
 
     captures  how often it was captured
     tracker   name of the owner, if it has one
-    lost      nobody tracks it now: it was there, and may be anywhere
+    lost      no tracker publishes it now: this is its last known position
     """
 
     id: str
@@ -66,7 +66,7 @@ class SeenTarget:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What the map says of a cell since it was marked: nobody may enter it, or how long a metre takes."""
+    """Current state of a marked cell: lethal, or the time that a metre takes."""
 
     lethal: bool
     pace_s_per_m: float | None
@@ -94,7 +94,7 @@ class Observer:
         """(tile, author) -> its newest set."""
         self._new_routes: dict[str, None] = {}
         self._new_sets: dict[tuple[int, str], None] = {}
-        """What has changed since `take_routes` and `take_mark_sets`."""
+        """Changes since `take_routes` and `take_mark_sets`."""
         session.add(self)
         bus, post = session.bus, session.post
         for topic in _HEARD:  # of fleets only the newest: they come at every tick, of every vehicle
@@ -125,7 +125,7 @@ class Observer:
 
     @property
     def targets(self) -> Mapping[str, SeenTarget]:
-        """All that were heard of, by id."""
+        """All known targets, by id."""
         with self._session.lock:
             now_ns = self._session.now_ns()
             tracked = ((id, self._trackings.of(id)) for id in self._targets)
@@ -160,11 +160,11 @@ class Observer:
 
     @property
     def marks(self) -> Mapping[int, Mark]:
-        """What is marked now for all vehicles, by cell: of several statements about a cell the newest."""
+        """Current marks for all vehicles, by cell: the newest of several marks of a cell."""
         return self._marks_of(0)
 
     def marks_for(self, vehicle_class: str) -> Mapping[int, Mark]:
-        """What is marked now for one class of vehicles alone, as `marks`. Raises ConfigError if there is no such
+        """Current marks for one class of vehicles alone, as `marks`. Raises ConfigError if there is no such
         class."""
         return self._marks_of(self._session.class_number(vehicle_class, "vehicle_class"))
 

@@ -19,8 +19,8 @@ M = TypeVar("M", bound=Message)
 
 
 class Orders:
-    """Gives orders. Made by `Swarm.orders`. Each call waits until a keeper has the order on its disk and those whom
-    it concerns obey, and returns who does and who has not said so.
+    """Gives orders. Made by `Swarm.orders`. Each call waits until a keeper has stored the order and the processes
+    concerned obey it. It returns the processes that obey and those that have not replied.
 
     Each raises ConfigError where the order is not possible, in the keeper's words, and BusError without a keeper.
     """
@@ -61,7 +61,7 @@ class Orders:
         return self._give(subject="target", name=id, cell=self._session.frame.cell(x_m, y_m))
 
     def remove_target(self, id: str) -> Acknowledged:
-        """Nobody chases it any more."""
+        """No vehicle chases it any more."""
         return self._give(subject="target", name=id, off=True)
 
     def set(self, key: str, value: float | None) -> Acknowledged:

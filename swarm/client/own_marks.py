@@ -1,4 +1,4 @@
-"""What one author has marked, as sets of marks: stated, answered for and digested. Pure; needs no NumPy.
+"""Marks of one author as mark sets: published, served and digested. Pure; needs no NumPy.
 
 A process of the swarm keeps a whole replica (`shared_map`); this keeps only what its own author says.
 """
@@ -21,23 +21,23 @@ class _Statement(NamedTuple):
 
 
 class OwnMarks:
-    """The sets of one author, who is of one group."""
+    """The mark sets of one author, which belongs to one group."""
 
     def __init__(self, author: str, group: str, grid: GridSpec) -> None:
         self.author = author
         self._group = group
         self._grid = grid
         self._tiles: dict[int, dict[int, _Statement]] = {}
-        """Tile -> cell in it -> what was stated last."""
+        """Tile -> cell in it -> its last mark."""
         self._sets: dict[int, MarkSet] = {}
         """Tile -> its newest set."""
         self._stamp_ns = 0
-        """Of the newest statement: none is older than the one before, whatever the clock does."""
+        """Timestamp of the newest mark: no later mark is older, even if the clock is set back."""
         self._digests = 0
 
     @property
     def any(self) -> bool:
-        """Whether anything was stated."""
+        """True if there are any marks."""
         return bool(self._sets)
 
     def state(
@@ -71,7 +71,7 @@ class OwnMarks:
         return [self._set(other.tile, now_ns, epoch=other.epoch + 1)]
 
     def answer(self, request: MarksRequest) -> list[MarkSet]:
-        """The sets that somebody asks for."""
+        """Returns the requested mark sets."""
         if request.authors and self.author not in request.authors:
             return []
         return [each for tile, each in self._sets.items() if not request.tiles or tile in request.tiles]

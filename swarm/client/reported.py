@@ -58,7 +58,8 @@ class Reported:
         raise NotImplementedError
 
     def _cell_at(self, x_m: float, y_m: float) -> int:
-        """The cell of a place. Raises ConfigError, counted, on one outside the terrain and on what is no number."""
+        """The cell of a place. Raises ConfigError, counted, on a cell outside the terrain and on a value that is
+        not a number."""
         try:
             return self._session.frame.cell(x_m, y_m)
         except ConfigError as error:

@@ -19,7 +19,7 @@ from swarm.wire.route_columns import RouteStatus
 class Route:
     """A planner's route from a vehicle's cell to its target, or the reason why there is none.
 
-    While nobody sees the target the status is "searching", and the route leads to a place where it may be.
+    While the target is unseen the status is "searching", and the route leads to a cell where it may be.
 
     target         id of the target
     status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target;
@@ -31,7 +31,7 @@ class Route:
     lower_bound_s  proven: no route is quicker on the planner's present map
     remaining_s    cost-to-go from the last cell; 0 if that is the target's
     pose_age_s     how long ago the target was heard of, when the planner answered; None if it does not say
-    tracker_lost   nobody tracks the target now: it was there, and may be anywhere
+    tracker_lost   no tracker publishes the target now: this is its last known position
     target_cell    cell of the target that the planner went by: a target that has just moved may be elsewhere by now
     """
 
@@ -65,18 +65,18 @@ class Route:
 
     @property
     def ok(self) -> bool:
-        """Whether there is a way."""
+        """True if a path exists."""
         return self.status == RouteStatus.OK
 
     @property
     def searching(self) -> bool:
-        """Whether it leads to a place where the target may be, which nobody sees: at its end ask again. It has no
+        """True if it leads to a cell where the unseen target may be: request another route at its end. It has no
         cells while no such place is known yet."""
         return self.status == RouteStatus.SEARCHING
 
     @property
     def arrived(self) -> bool:
-        """Whether it is at the target already, or no more than one step away."""
+        """True if it is at the target already, or no more than one step away."""
         return self.ok and len(self.cells) <= 2 and self.remaining_s == 0
 
     @cached_property
@@ -92,11 +92,12 @@ class Route:
 
     @property
     def length_m(self) -> float:
-        """Of its points."""
+        """Length of its polyline (m)."""
         return sum(math.dist(a, b) for a, b in pairwise(self.points_m))
 
     def is_rest_of(self, before: Route) -> bool:
-        """Whether it says no more than the rest of the one before, of which the vehicle has driven a part."""
+        """Returns True if it is only the remainder of the previous route, of which the vehicle has driven a
+        part."""
         if (self.status, self.arrived, self.tracker_lost) != (before.status, before.arrived, before.tracker_lost):
             return False
         if not (self.ok or self.searching) or self.cells == before.cells:
@@ -109,7 +110,7 @@ class Route:
         return rest == self.cells and (self.remaining_s == 0) == (before.remaining_s == 0)
 
     def ahead(self, x_m: float, y_m: float, distance_m: float) -> tuple[float, float, float]:
-        """Where one is after driving `distance_m` along the route from the point of it that is nearest to a place:
+        """Returns the position after driving `distance_m` along the route from its point nearest to a location:
         (x_m, y_m, heading_rad), the heading clockwise from north. At its end it stays there; without a way the
         place itself is returned."""
         points = self.points_m
@@ -123,8 +124,9 @@ class Route:
 
 
 def along(points: Sequence[Point], place: Point, distance_m: float) -> tuple[int, float]:
-    """Where one is on a line of two points or more after driving `distance_m` from the point of it that is nearest
-    to a place: the number of the step, and how far along it, 0 ... 1. It is 1 at the end of the line."""
+    """Returns the position on a polyline of at least two points after driving `distance_m` from its point nearest
+    to a location: the number of the step, and the fraction of that step, 0 ... 1. It is 1 at the end of the
+    line."""
     nearest, at, share = math.inf, 0, 0.0
     for number, (a, b) in enumerate(pairwise(points)):
         there = _share(a, b, place)
@@ -142,7 +144,7 @@ def along(points: Sequence[Point], place: Point, distance_m: float) -> tuple[int
 
 
 def _share(a: Point, b: Point, place: Point) -> float:
-    """How far along a step, 0 ... 1, the point is that is nearest to a place."""
+    """Returns the fraction of a step, 0 ... 1, at the point nearest to a location."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     long = dx * dx + dy * dy
     return min(1.0, max(0.0, ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / long)) if long else 0.0

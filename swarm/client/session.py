@@ -35,13 +35,13 @@ TICK_S = 0.05
 _RUN_TIMEOUT_S = 2.0
 """Longest wait for the answer to which run is in the namespace."""
 _COMPARE_AGAIN_NS = 2 * NS_PER_S
-"""Time until that is asked again where nobody has answered."""
+"""Time until that query is repeated if no process has replied."""
 _SAY_AGAIN_NS = 60 * NS_PER_S
-"""Time until the same problem is told again: once a minute, as logs of the bus are."""
+"""Time until the same problem is reported again: once a minute, as in logs of the bus."""
 _SAME_CLOCK_NS = NS_PER_S
 """Clocks that differ by less are not corrected: an answer is as old as a tick."""
 _MOST_SAID = 1024
-"""Sentences that are remembered for it. Beyond that all are forgotten, and told again at most."""
+"""Sentences that are remembered for it. Beyond this number all are forgotten, and reported again at most."""
 
 
 class Part(Protocol):
@@ -59,7 +59,7 @@ class Session:
 
     frame   the terrain
     run     what a process of the run said of it
-    counts  what was refused, lost and reported since the connection began
+    counts  rejected, lost and reported messages since the connection began
     ahead_ns  by how much the swarm's clocks are ahead of ours; what we stamp is corrected by it
     """
 
@@ -72,21 +72,21 @@ class Session:
         """Held while anything below, or a part, is read or changed."""
         self.post: Post = post if post is not None else self.on_session_event
         self.connected = True
-        """Whether the link to the router is up, as far as is known."""
+        """True if the link to the router is up, as far as is known."""
         self.ended: SwarmError | None = None
         """Why nothing can be said any more: closed, or the run is another one."""
         self._clock = clock
         self._ahead_ns = ahead_ns if abs(ahead_ns) > _SAME_CLOCK_NS else 0
         self._parts: list[Part] = []
         self._asked: dict[str, tuple[Future[list[Any]], list[Any]]] = {}
-        """Tag -> who waits for the answers, and those that came."""
+        """Tag -> the caller that waits for replies, and the replies received."""
         self._tags = itertools.count(1)
         self._compare_due_ns: int | None = None
-        """When to ask again which run is in the namespace, as nobody has answered since the link is back."""
+        """Time of the next query for the namespace's run, if no process has replied since the link is back."""
         self._later: list[Callable[[], None]] = []
         """Callbacks to call once the lock is free."""
         self._said_ns: dict[str, int] = {}
-        """Problem -> when it was told last."""
+        """Problem -> time of its last report."""
         self._on_problem: list[Callable[[str], None]] = []
         self._owner: int | None = None
         """The thread that calls `handle` and `tick`."""
@@ -201,7 +201,8 @@ class Session:
         return found
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
-        """Wait for what was asked. Raises BusError; ConfigError on the thread that would have to bring it."""
+        """Waits for the replies to a query. Raises BusError; ConfigError on the thread that would have to bring
+        it."""
         if threading.get_ident() == self._owner:
             raise ConfigError("a callback must not wait for an answer: ask from another thread, or follow a target")
         try:
@@ -269,7 +270,7 @@ class Session:
         self._call_later()
 
     def close(self) -> None:
-        """Take away what was reported, and leave the network."""
+        """Withdraws all reports, and closes the session."""
         with self.lock:
             for part in list(self._parts):
                 part.leave()
@@ -366,7 +367,7 @@ class Stream(Generic[T]):
             self._wake()
 
     def close(self) -> None:
-        """End it: readers take what waits, and then stop."""
+        """Ends it: readers receive the remaining items, and then stop."""
         with self._changed:
             self.closed = True
             self._wake()

@@ -18,8 +18,8 @@ _REPEAT_NS = NS_PER_S * 2 // 5
 class Target(Reported):
     """A target of the scenario whose walk is `external`. Made by `Swarm.target`; use it in a `with`, or `leave`.
 
-    Of several trackers the one that has tracked the target for the longest owns it, and its poses count; the next
-    one takes over when its lease ends, or at once when it leaves (decision 42).
+    Of several trackers the one that has tracked the target for the longest owns it, and its poses count. The next
+    one takes over when its lease ends, or immediately when it leaves (decision 42).
 
     id           of the target, as in the scenario
     tracker      name of this tracker; a later start under the same name takes over at once. None: each start is a
@@ -39,14 +39,16 @@ class Target(Reported):
     def at(self, x_m: float, y_m: float) -> None:
         """Say where the target is, in the terrain's frame. It is repeated until the next call or `leave`.
 
-        Raises ConfigError on a place outside the terrain and on what is no number; what was said before stands.
+        Raises ConfigError on a location outside the terrain and on a value that is not a number; the previous pose
+        is kept.
         """
         with self._session.lock:
             self._say(x_m, y_m, cell=self._cell_at(x_m, y_m), tracker=self.tracker)
 
     @property
     def owned(self) -> bool:
-        """Whether this tracker's poses count, as far as is heard: false until the first one has come back."""
+        """True if this tracker's poses count, as far as is known: false until the first one has been received
+        back."""
         with self._session.lock:
             counts = self._tracking.pose
             lost = self._tracking.lost(self._session.now_ns())

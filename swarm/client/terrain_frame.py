@@ -24,8 +24,8 @@ _Transform = Callable[[float, float], Point]
 
 
 class Frame:
-    """Where things are on a swarm's terrain. `x_m` grows to the east and `y_m` to the north, in the coordinate
-    system `crs` ("local" is metres from anywhere). A cell is `row * cols + col`, row 0 in the north.
+    """Coordinates on a swarm's terrain. `x_m` grows to the east and `y_m` to the north, in the coordinate system
+    `crs` ("local" is metres from anywhere). A cell is `row * cols + col`, row 0 in the north.
 
     grid  shape and place of the terrain
     """
@@ -35,7 +35,7 @@ class Frame:
 
     @classmethod
     def of(cls, info: RunInfo) -> Frame:
-        """Of what a process of the run answers. Raises ConfigError if it has no grid."""
+        """Builds the frame from the reply of a process of the run. Raises ConfigError if it has no grid."""
         try:
             return cls(
                 GridSpec(info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs or "local")
@@ -48,7 +48,8 @@ class Frame:
         return self.grid.crs
 
     def cell(self, x_m: float, y_m: float) -> int:
-        """The cell at a place. Raises ConfigError on a place outside the terrain and on what is no number."""
+        """The cell at a place. Raises ConfigError on a location outside the terrain and on a value that is not a
+        number."""
         grid, x_m, y_m = self.grid, number("x_m", x_m), number("y_m", y_m)
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
             raise ConfigError(f"x_m {x_m!r}, y_m {y_m!r} is no place: both must be finite numbers of metres")
@@ -96,7 +97,7 @@ class Frame:
 
     def cells_in(self, polygon_m: Sequence[Point]) -> list[int]:
         """The cells whose middle is inside a polygon, given by its corners; edges that cross leave holes
-        (even-odd). Raises ConfigError on fewer than three corners and on what is no number."""
+        (even-odd). Raises ConfigError on fewer than three corners and on a value that is not a number."""
         try:
             corners = [(number("x_m", x_m), number("y_m", y_m)) for x_m, y_m in polygon_m]
         except (TypeError, ValueError):
@@ -151,7 +152,7 @@ class Frame:
 
 
 def _degrees_of(system: Any) -> str:
-    """What latitudes and longitudes are on the body on which a system lies: WGS 84 on the Earth."""
+    """Returns the geographic system of the body on which a coordinate system lies: WGS 84 on the Earth."""
     ellipsoid = system.ellipsoid
     if ellipsoid is None or abs(ellipsoid.semi_major_metre - _EARTH_M) < 0.01 * _EARTH_M:
         return WGS84
@@ -159,7 +160,8 @@ def _degrees_of(system: Any) -> str:
 
 
 def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
-    """Cells of the terrain, each once. Raises ConfigError on one outside, and on what is no cell."""
+    """Cells of the terrain, each once. Raises ConfigError on a cell outside the terrain, and on a value that is not
+    a cell."""
     once: dict[int, None] = {}
     for each in cells:
         try:
@@ -172,7 +174,7 @@ def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
 
 
 def number(name: str, value: Any) -> float:
-    """What a program gives for a number, as one. Raises ConfigError on anything else, such as text."""
+    """Converts a program's number to a float. Raises ConfigError on anything else, such as text."""
     if not isinstance(value, str):
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             return float(value)

@@ -32,7 +32,7 @@ _DIGEST_NS = NS_PER_S
 _TIMEOUT_S = 5.0
 """Longest wait for a route if a program does not say: a planner that begins grows its tree for seconds."""
 _NEAR_END_CELLS = 16
-"""A vehicle that is within so many cells of the end of a cut route asks for its continuation."""
+"""Distance to the end of a truncated route, in cells, at which a vehicle requests its continuation."""
 
 
 class Vehicle(Reported):
@@ -78,13 +78,15 @@ class Vehicle(Reported):
 
     def at(self, x_m: float, y_m: float, *, heading_rad: float | None = None, speed_m_per_s: float = 0.0) -> None:
         """Say where the vehicle is. All vehicles of the swarm avoid this place from their next tick on, and where
-        it will be soon. It is repeated until the next call or `leave`: who says nothing more, stands.
+        it will be soon. It is repeated until the next call or `leave`: without another call the vehicle counts as
+        at rest.
 
         x_m, y_m       in the terrain's frame; of a latitude and longitude: `at(*swarm.frame.from_wgs84(lat, lon))`
         heading_rad    clockwise from north; None if it may go any way
         speed_m_per_s  by the wall clock
 
-        Raises ConfigError on a place outside the terrain and on what is no number; what was said before stands.
+        Raises ConfigError on a location outside the terrain and on a value that is not a number; the previous
+        position is kept.
         """
         session = self._session
         with session.lock:
@@ -117,8 +119,8 @@ class Vehicle(Reported):
 
     def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
         """Say into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
-        and wait until it may enter the first. Returns those that it may enter now: nobody else does, before the
-        vehicle has left them by its `at`. What was reserved before and is not in `cells` is given back.
+        and wait until it may enter the first. Returns the cells that it may enter now: no other vehicle enters them
+        before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
 
         Raises ConfigError where cells leap, and unless the vehicle was made with `right_of_way`.
         """
@@ -133,7 +135,7 @@ class Vehicle(Reported):
         return list(way.cells[1:])
 
     def may_enter(self, cell: int, timeout_s: float = 0.0) -> bool:
-        """Whether the vehicle may drive into a cell now, after waiting for it for so long. Raises ConfigError
+        """Returns True if the vehicle may drive into a cell now, after waiting up to a timeout. Raises ConfigError
         unless it was made with `right_of_way`."""
         return self._has_way().may_enter(cell, timeout_s)
 
@@ -152,12 +154,13 @@ class Vehicle(Reported):
         return found
 
     def route_soon(self, target: str, timeout_s: float = _TIMEOUT_S) -> Future[Route]:
-        """As `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
+        """Like `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
         return self._session.ask_route(target, self.cell, self.vehicle_class, timeout_s)
 
     def follow(self, target: str) -> Stream[Route]:
         """Routes to a target from now on: the first one, and a newer one whenever the target moves, the map changes
-        or the route runs out. Ends what was followed before. `newest` of the stream is the route to drive."""
+        or the route runs out. Ends the previous subscription to routes. `newest` of the stream is the route to
+        drive."""
         session = self._session
         with session.lock:
             session.check_open()
@@ -215,7 +218,7 @@ class Vehicle(Reported):
         return self.cell in route.cells[-_NEAR_END_CELLS:]
 
     def _take(self, reply: RouteReply | PushedRoute) -> None:
-        """A route that was given: told if it says anything new."""
+        """Takes a received route, and reports it if it differs from the last one."""
         try:
             given = reply.route if isinstance(reply, PushedRoute) else reply.routes[0]
             route = Route.of(self._session.frame, given, reply)
@@ -245,10 +248,10 @@ class Vehicle(Reported):
         """State something about cells, for all vehicles and planners. Returns how many cells were stated.
 
         cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)` or `swarm.frame.cells_in(polygon_m)`
-        lethal        nobody may enter them
+        lethal        no vehicle may enter them
         pace_s_per_m  they take so long to drive
         clear         they are as the map had them before
-        for_s         the statement ends by itself; None: it stands until somebody states otherwise
+        for_s         lifetime of the mark; None: it holds until another mark replaces it
         only_for      one of the scenario's classes of vehicles, for which the statement counts before those for
                       all, unless they are lethal. To the others it says nothing
 
@@ -328,7 +331,7 @@ class Vehicle(Reported):
             self._session.bus.publish(DIGEST, self._marks.digest(), author=self._marks.author)
 
     def leave(self) -> None:
-        """Take the vehicle away: its place is free at once. What it marked stays. May be repeated."""
+        """Take the vehicle away: its place is free at once. Its marks stay. May be repeated."""
         session = self._session
         with session.lock:
             self.unfollow()

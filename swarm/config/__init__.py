@@ -6,7 +6,7 @@ meaning
 - `load` makes a `Scenario` of TOML: size and nesting are bounded before anything is parsed (`input_files`), presets
   and costs of classes are filled in (`cost_rules`), msgspec checks types and ranges, and last come the rules about
   several settings.
-- `explain` turns msgspec's errors into sentences: file, key, what was found, what is allowed, what was meant.
+- `explain` turns msgspec's errors into sentences: file, key, the value found, the values allowed, and a near name.
 - `write` is the way back to TOML, which `load` reads as the same scenario.
 - `plugin_names` knows which settings name a plug-in, and `agents` which processes a scenario needs.
 

@@ -40,9 +40,9 @@ PRESETS: Mapping[str, PresetRow] = {
 
 
 def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
-    """What was read of a scenario, with the settings of its preset where it gives none itself.
+    """Returns the settings of a scenario, with those of its preset where it gives none itself.
 
-    What is no preset is left to the check of types.
+    A value that is not a preset is left to the check of types.
     """
     cost = raw.get("cost")
     name = cost.get("preset") if isinstance(cost, dict) else None
@@ -70,7 +70,7 @@ def cost_of_preset(name: str | None) -> CostConfig:
 _SLOPES = ("slope_deg", "slope_percent")
 _VALUES = ("factor", "pace_s_per_m", "speed_m_per_s")
 _LEVEL_TOLERANCE = 1e-3
-"""A table in three decimals may say 0.999 of level ground; what is further off is a mistake."""
+"""A table in three decimals may state 0.999 for flat ground; larger deviations are mistakes."""
 
 
 def with_slope_csv(cost: CostConfig, source: str, base: Path | None) -> CostConfig:

@@ -1,6 +1,7 @@
-"""What each setting means, by the rows of its section's docstring, and what its type allows, in words.
+"""Meaning of each setting, from the rows of its section's docstring, and the values which its type allows, in
+words.
 
-Errors of a scenario are said in these terms: the key, what was found, what is allowed, what was probably meant.
+Errors of a scenario are stated in these terms: the key, the value found, the values allowed, and a near name.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def hints_of(section: Any) -> Mapping[str, Any]:
 
 
 def expected(hint: Any) -> str:
-    """What a type allows, in words: "a whole number, 0 to 9"."""
+    """Returns the values that a type allows, in words: "a whole number, 0 to 9"."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         bounds = [word for meta in args[1:] if isinstance(meta, msgspec.Meta) for word in _bounds(meta)]
@@ -120,7 +121,7 @@ def section_in(hint: Any) -> Any:
 
 
 def is_several(hint: Any) -> bool:
-    """Whether a key holds several sections."""
+    """Returns True if a key holds several sections."""
     return typing.get_origin(bare(hint)) is tuple and section_in(hint) is not None
 
 
@@ -136,7 +137,7 @@ _UNITS: tuple[tuple[str, dict[str, float]], ...] = (
     ("seconds", _SECONDS),
     ("", {}),
 )
-"""Ending of a key -> the units that somebody may write after its number, in its own unit."""
+"""Suffix of a key -> units that a user may write after its number, in its own unit."""
 _MEANT = dict.fromkeys(
     ("vehicles.count", "vehicles.number", "vehicles.vehicles"),
     "how many vehicles there are is `vehicles` of [[groups]]",
@@ -147,7 +148,7 @@ def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario
     """One sentence from msgspec's error message.
 
     reason  the message: "Expected `int`, got `str` - at `$.targets[0].count`"
-    raw     what was read from the file
+    raw     the content of the file
     root    the type that it was to become
     whole   what the file is called
     """
@@ -194,7 +195,8 @@ def _refused_key(values: dict[str, Any], hint: Any) -> str:
 
 
 def located(reason: str) -> tuple[str, list[str | int]]:
-    """What msgspec says, and where: keys and indices from the root on; -1 is an index that it does not tell."""
+    """Splits msgspec's message into text and location: keys and indices from the root on; -1 is an index that it
+    does not state."""
     found = re.fullmatch(r"(.*) - at (?:`key` in )?`(.*)`", reason, re.DOTALL)
     if found is None:
         return reason, []
@@ -219,7 +221,8 @@ def doubled(names: Iterable[str], what: str) -> Iterator[str]:
 
 
 def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
-    """What a word should have been: the nearest of the allowed words, and all of them where they are few."""
+    """Returns the sentence about an unknown word: the nearest of the allowed words, and all of them if they are
+    few."""
     near, every = nearest(word, allowed), ", ".join(map(repr, allowed))
     if near and len(every) > _LONGEST_LIST:
         return near
@@ -294,7 +297,7 @@ def _wrong(name: str, value: Any, hint: Any) -> str:
 
 
 def _finite(value: Any) -> str:
-    """What `expected` leaves out, as nobody meets it by chance: that there is a largest number."""
+    """Returns the bounds without the largest number of the type, which no user meets by chance."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or abs(value) < UNBOUNDED:
         return "" if value == value else ", which nan is not"
@@ -302,7 +305,7 @@ def _finite(value: Any) -> str:
 
 
 def _meant_number(key: str, value: Any, kind: Any) -> str:
-    """What a text that holds a number should have been."""
+    """Returns the number that a text holds, as a suggestion."""
     if not isinstance(value, str) or kind not in (int, float):
         return ""
     match = re.fullmatch(r"\s*([+-]?(?:\d+[.,]?\d*|[.,]\d+))\s*(\S.*?)?\s*", value)

@@ -1,4 +1,4 @@
-"""Settings of the ground: elevation, photo and classes, what is hidden, zones, and what driving costs."""
+"""Settings of the ground: elevation, photo and classes, hidden hazards, zones, and driving costs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from swarm.config.setting_types import (
 
 
 class WayConfig(Section, frozen=True, kw_only=True):
-    """What a class of features in a file of zones is worth.
+    """Cost of a class of features in a zone file.
 
     width_m  of its lines; a width that a line has of its own counts more
     factor   pace relative to the road pace (kind road), or to the ground; "ignored" leaves such features out
@@ -82,12 +82,12 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
 
     @property
     def called(self) -> str:
-        """How messages call it."""
+        """Name of the zone in messages."""
         return self.name or self.kind
 
 
 class HiddenConfig(Section, frozen=True, kw_only=True):
-    """What is true of the terrain and missing from the map, until vehicles find it.
+    """Hazards of the terrain that are missing from the map until vehicles find them.
 
     closed_roads   barriers: a stretch of road and the cells beside it is lethal
     rubble_fields  ragged patches, 4 to 10 cells in radius, of three times the pace
@@ -104,7 +104,7 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 
 
 class TerrainConfig(Section, frozen=True, kw_only=True):
-    """Where elevation and photo come from.
+    """Sources of elevation and photo.
 
     source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
                    .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .csv, .xyz, .map (MovingAI), .yaml or
@@ -119,8 +119,8 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     resolution_m   cell size to bring everything to; the source's own if not given
     crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
     height_scale   metres per unit of height, where the file does not say it (.png)
-    elevation_encoding  what stands for a height, where the file does not show it: numbers, or the colours of
-                   Terrain-RGB or Terrarium tiles
+    elevation_encoding  encoding of heights, where the file does not state it: numbers, or the colours of
+                        Terrain-RGB or Terrarium tiles
     nodata         voids are lethal, or filled from their surroundings
     nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
     level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
@@ -131,7 +131,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     cols           synthetic: cells from west to east
     relief_m       synthetic: height of the highest cell above the lowest
     rivers         synthetic: how many rivers cross the terrain
-    hidden         what is true of the terrain and missing from the map
+    hidden         hazards of the terrain that are missing from the map
     """
 
     source: Annotated[str, Meta(min_length=1)] = "jacksboro"
@@ -170,7 +170,7 @@ class CostLayerConfig(Section, frozen=True, kw_only=True):
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
-    """How terrain becomes pace.
+    """Rules that turn terrain into pace.
 
     preset                  a class of vehicles, whose settings stand for those that are not given here
     flat_speed_m_per_s      speed on level open ground
@@ -197,7 +197,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
     vehicle_radius_m        cells in whose middle a vehicle of this radius touches a lethal cell are lethal
                             (inflation)
-    layers                  rules of the user's own, one after the other; what is a void stays lethal
+    layers                  rules of the user's own, applied in order; no-data cells stay lethal
     zones                   parts of the terrain with a cost of their own, painted in order; forbidden ones last
     """
 

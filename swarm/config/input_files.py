@@ -1,4 +1,4 @@
-"""Reading files that somebody hands us: refused by size before they are read, in one sentence.
+"""Readers of the user's files, which are refused by size before they are read, in one sentence.
 
 `FileKind` is the table of what may be read and how much of it. A new kind of file is a row.
 """
@@ -24,7 +24,8 @@ MAX_DEPTH = 16
 
 
 class FileKind(Enum):
-    """What a file is to us: its name in sentences, how many bytes are read at most, the error that refuses it."""
+    """Kind of an input file: its name in sentences, the largest size that is read (bytes), the error that refuses
+    it."""
 
     SCENARIO = ("scenario", 1 << 19, ConfigError)
     HOSTS = ("hosts", 1 << 19, ConfigError)
@@ -169,7 +170,7 @@ _TOML_FAULTS = {
     "Expected '=' after a key": "expected KEY = VALUE or [SECTION]",
     "Exceeds the limit": "it holds a number of thousands of digits",
 }
-"""How the parser's message begins -> what it means to somebody who does not know TOML."""
+"""First words of the parser's message -> explanation for readers who do not know TOML."""
 _TOML_PLACE = re.compile(r" \(at (?:line (\d+)(, column \d+)|end of document)\)\Z")
 
 
@@ -181,7 +182,7 @@ def _toml_fault(reason: str, text: str) -> str:
     if place is None:
         return meant
     lines = text.rstrip().split("\n")
-    number = int(place[1]) if place[1] else len(lines)  # it ends too soon, so what is wrong began before
+    number = int(place[1]) if place[1] else len(lines)  # the file ends too soon, so the fault began before
     line = lines[min(number, len(lines)) - 1].strip()
     return f"line {number}{place[2] or ''}: {meant}, found {line if len(line) <= 60 else f'{line[:57]}...'!r}"
 

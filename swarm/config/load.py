@@ -36,7 +36,7 @@ def parse_scenario(
     base: Path | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given.
+    """Like `load_scenario`, from a text. Relative paths in it are made relative to `base`, if given.
 
     settings  as of `read_scenario`
     """
@@ -53,8 +53,8 @@ def read_scenario(
     most: int = 50,
     settings: Mapping[str, Any] | None = None,
 ) -> tuple[Scenario | None, list[str]]:
-    """The scenario of a text, and what is wrong with it: at most so many sentences. None where not all keys could
-    be read.
+    """Returns the scenario of a text and its faults, up to a limit of sentences. None where not all keys could be
+    read.
 
     settings  dotted key -> value, instead of what the text says (`with_settings`)
     """
@@ -73,7 +73,8 @@ def read_scenario(
             place, lacks = _place(str(error))
             if not (lacks and place in taken_out):
                 faults.append(f"{source}: {explain(str(error), raw, Scenario)}")
-            # What lacks a key goes whole. An item of a list alone cannot: those after it would have other numbers.
+            # A table that lacks a key is removed as a whole. An item of a list alone cannot: those after it would
+            # have other numbers.
             place = place[:1] if lacks else place
             taken_out.add(place)
             if not _take_out(raw, place):
@@ -97,7 +98,7 @@ def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:
     """The key that msgspec complains of, from the root on, and whether it is missing."""
     what, path = located(reason)
     named = re.fullmatch(r"Object (contains unknown|missing required) field `(.*)`", what, re.DOTALL)
-    if -1 in path:  # somewhere in a table whose key is not told: all of that table
+    if -1 in path:  # somewhere in a table whose key is not stated: all of that table
         path = path[: path.index(-1)]
     elif named:
         return (*path, named[2]), named[1] == "missing required"
@@ -115,7 +116,7 @@ def _take_out(raw: dict[str, Any], place: tuple[str | int, ...]) -> bool:
 
 
 def _faults(scenario: Scenario, source: str) -> Iterator[str]:
-    """Where settings that are valid each do not fit together."""
+    """Returns contradictions between settings that are valid each."""
     count = sum(target.count for target in scenario.targets)
     if count > MOST_TARGETS:
         yield f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}"
@@ -213,7 +214,7 @@ def _check_climbs(planner: PlannerConfig, why: str, source: str) -> None:
 
 
 def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
-    """Raise ConfigError on what is no endpoint, and on one beyond loopback without mutual TLS."""
+    """Raises ConfigError on an invalid endpoint, and on one beyond loopback without mutual TLS."""
     match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
     if match is None:
         raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
@@ -229,7 +230,7 @@ def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine by name or address."""
+    """Returns True if a host is this machine by name or address."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -288,7 +289,7 @@ EACH = "*"
 
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted key and value of whatever is no table, in the order of the file. A key in quotes may have dots."""
+    """Returns dotted keys and values of all leaves, in the order of the file. A key in quotes may have dots."""
     for key, value in table.items():
         if isinstance(value, Mapping) and value:
             yield from flat(value, f"{above}{key}.")
@@ -297,8 +298,8 @@ def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]
 
 
 def with_settings(raw: Mapping[str, Any], settings: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """What was read of a file, with other values at dotted keys. Tables that are missing are made; what is no
-    setting is left to the check of types. Raises ConfigError, which begins with `source`."""
+    """Returns the content of a file with other values at dotted keys. Missing tables are made; an unknown setting
+    is left to the check of types. Raises ConfigError, which begins with `source`."""
     changed: dict[str, Any] = copy.deepcopy(dict(raw))
     for key, value in settings.items():
         if key.count(".") >= MAX_DEPTH:

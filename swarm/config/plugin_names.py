@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PluginKind:
-    """What a kind of plug-in is called, and what becomes of a process whose plug-in fails.
+    """Kind of a plug-in: its name, and the consequence for a process whose plug-in fails.
 
     name      as in the group of its entry points
     role      the role that calls it; every role builds the map, if it is not prepared
@@ -118,7 +118,7 @@ def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
 
 def installed(kind: PluginKind) -> dict[str, list[EntryPoint]]:
     """The plug-ins that installed packages offer, by name: more than one where two packages use the same."""
-    # Imported here: it takes a while, and few scenarios name what is not built in.
+    # Imported here: the import is slow, and few scenarios name a plug-in that is not built in.
     from importlib.metadata import entry_points
 
     found: dict[str, list[EntryPoint]] = {}

@@ -2,7 +2,7 @@
 
 Every setting is declared here, those of the ground in `swarm.config.ground`: its unit in its name, its range in its
 type, its meaning as one row of its section's docstring (`swarm.config.explain` reads the rows). A wrong key, type
-or value is rejected with the file, the key, what was found and what is allowed.
+or value is rejected with the file, the key, the value found and the values allowed.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     caught         jump: a captured target goes on from another place; stay: it goes on from where it is
     start          [row, col], or a place: "46.81,9.85" (latitude, longitude), "xy:X,Y" in metres of the map; a
                    random passable cell if not given
-    body_radius_m  vehicles keep out of the cells within so many metres of it, and of those that it drives to;
-                   if not given, they may share its cell
+    body_radius_m  vehicles keep out of the cells within this distance of it, and of those that it drives to (m); if
+                   not given, they may share its cell
     """
 
     name: Name = "t"
@@ -71,13 +71,13 @@ class TargetConfig(Section, frozen=True, kw_only=True):
 
     @property
     def is_simulated(self) -> bool:
-        """Whether the run moves it; the pose of an external target comes from another process."""
+        """True if the run moves it; the pose of an external target comes from another process."""
         return self.walk != "external"
 
 
 class RoverConfig(Section, frozen=True, kw_only=True):
-    """A simulated outside vehicle, or `count` alike: it says where it is, speaks no right of way and looks out for
-    nobody. Ids as those of targets.
+    """A simulated external vehicle, or `count` alike: it publishes its position, reserves no cells and avoids no
+    other vehicle. Ids as those of targets.
 
     name           id of the rover, or what the ids begin with
     count          how many rovers
@@ -104,7 +104,8 @@ class GroupConfig(Section, frozen=True, kw_only=True):
 
     assignment  which vehicle goes for which target: as `vehicles.assignment`, which counts if this is not given; a
                 plug-in takes `vehicles.assignment_options`
-    pursuers    balanced: so many vehicles each target gets first, those which together are the quickest there
+    pursuers    balanced: number of vehicles that each target gets first, those which together are the quickest
+                there
     class       the class of its vehicles: one of `classes`, or "ground", that of `cost` and `vehicles`
     """
 
@@ -121,7 +122,7 @@ class GroupConfig(Section, frozen=True, kw_only=True):
 
 
 class VehicleConfig(Section, frozen=True, kw_only=True):
-    """How vehicles behave.
+    """Behaviour of vehicles.
 
     per_agent           vehicles that one agent process hosts, at most
     tick_hz             how often an agent moves its vehicles and publishes their positions
@@ -132,7 +133,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     reassign_s          how often a vehicle asks which target is the cheapest
     sensor              truth: sees the true ground within `sense_range_m`; or a plug-in
     sensor_options      what a plug-in for `sensor` takes
-    assignment          spread: the cheapest pairs first, to each target an even share of an agent's vehicles;
+    assignment          spread: the lowest-cost pairs first, to each target an even share of an agent's vehicles;
                         cheapest: each vehicle the target that it reaches first; balanced: every target first gets
                         its pursuers out of the whole group, the rest are spread over it; or a plug-in
     assignment_options  what a plug-in for `assignment` takes
@@ -156,9 +157,9 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
 
 
 class PlannerConfig(Section, frozen=True, kw_only=True):
-    """How a planner keeps its tree.
+    """Updates of a planner's tree.
 
-    strategy          what is grown again when the target has moved; auto chooses by `cpu_budget`; or a plug-in
+    strategy          extent of the search when the target has moved; auto chooses by `cpu_budget`; or a plug-in
     strategy_options  what a plug-in for `strategy` takes
     tick_hz           how often a planner follows its target and its map
     edge              octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
@@ -170,7 +171,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     cpu_budget        auto: share of one core that this planner may use
     push_s            newer routes are pushed to a vehicle at most this often
     routes            grid: vehicles drive from the middle of a cell to that of a neighbour; pulled: straight from
-                      cell to distant cell, where that is no slower. Where `cost.directional` only flights are
+                      cell to distant cell, where that is no slower. With `cost.directional` only flights are
     """
 
     strategy: Annotated[str, plugin_name(Strategy)] = "auto"
@@ -198,7 +199,7 @@ class StandbyConfig(Section, frozen=True, kw_only=True):
 
 
 class MapConfig(Section, frozen=True, kw_only=True):
-    """How the shared map is replicated.
+    """Replication of the shared map.
 
     interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
                         only. Planners, keepers and the monitor hold all
@@ -238,7 +239,7 @@ class TlsConfig(Section, frozen=True, kw_only=True):
 
 
 class NetworkConfig(Section, frozen=True, kw_only=True):
-    """Where processes meet.
+    """Endpoints at which processes meet.
 
     namespace          first chunk of all keys: runs in different ones do not hear each other
     listen             endpoints of the router; beyond loopback they must be tls/ with certificates

@@ -28,7 +28,7 @@ RESERVED_GROUP = "operator"
 MOST_PER_AGENT = 1000
 """Vehicles of one agent process."""
 MOST_TARGETS = 1000
-"""Of all entries together."""
+"""Limit for all entries together."""
 
 Strategy = Literal["auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution"]
 SlopeRule = Literal[
@@ -62,14 +62,14 @@ def plugin_name(built_in: Any = None) -> Meta:
 
 
 Options = dict[str, Any]
-"""What is said to a plug-in: its own struct checks it."""
+"""Options of a plug-in, which its own struct checks."""
 
 ClassName = Literal[
     "unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow", "shrub", "wetland"
 ]
 
 CoverGround = Literal[ClassName, "lethal"] | Positive
-"""What a code of a land-cover map stands for: a class, or a pace relative to open ground."""
+"""Meaning of a code of a land-cover map: a class, or a pace relative to open ground."""
 
 CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}\Z")]
 

@@ -26,7 +26,7 @@ SHARED = ("zones", "layers", "directional")
 
 
 class WindConfig(Section, frozen=True, kw_only=True):
-    """The wind in which vehicles fly: everywhere and at every height alike. What drives does not feel it.
+    """The wind in which vehicles fly: everywhere and at every height alike. Ground vehicles are not affected by it.
 
     speed_m_per_s  less than the speed of every class that flies, so that each makes headway in every direction
     from_deg       where it comes from, clockwise from the map's north: 270 is a wind from the west
@@ -37,15 +37,15 @@ class WindConfig(Section, frozen=True, kw_only=True):
 
 
 class AirConfig(Section, frozen=True, kw_only=True):
-    """What makes a class fly: over a surface that keeps its clearance and is no steeper than it can climb.
+    """Flight of a class: over a surface that keeps its clearance and is no steeper than it can climb.
 
     speed_m_per_s    in level flight, through the air; over the ground the wind adds to it, or takes from it
     clearance_m      it is never lower over the highest ground of a cell and its eight neighbours
     climb_m_per_s    a metre of climb takes this much longer: 1 / climb_m_per_s
     descent_m_per_s  the same of a metre of descent
     grade            steepest rise and fall of the surface, metres per metre; by the terrain's relief if not given
-    no_fly           zones of kind forbidden, each with a polygon. Other zones, marks and what is hidden do not
-                     concern what flies
+    no_fly           zones of kind forbidden, each with a polygon. Other zones, marks and hidden hazards do not
+                     affect flying classes
     """
 
     speed_m_per_s: Annotated[float, Meta(ge=0.1, le=340)] = 15.0
@@ -62,13 +62,13 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     name                 what groups and queries call it
     cost                 what differs from `[cost]`: its preset, slope rule, speeds, limits, radius. Zones, layers
                              and `directional` are those of `[cost]`
-    max_speed_m_per_s    it is never faster than this: level, on roads, downhill, whatever is marked or learned
+    max_speed_m_per_s    top speed: level, on roads, downhill, with any mark or learned factor
     sense_range_m        as `vehicles.sense_range_m`, which counts if this is not given
     accel_m_per_s2       it speeds up no quicker, and brakes no harder before turns and where it has to stop
     turn_rate_deg_per_s  it turns no quicker, so it takes turns slowly. With this or `accel_m_per_s2` it drives by
                          these, not by `vehicles.dynamics`
-    air                  it flies: then `cost` and `max_speed_m_per_s` say nothing, and it neither meets nor waits
-                         for what drives
+    air                  it flies: then `cost` and `max_speed_m_per_s` have no effect, and it neither meets nor
+                         waits for ground vehicles
     """
 
     name: Name
@@ -86,10 +86,10 @@ def class_numbers(scenario: Scenario) -> dict[str, int]:
 
 
 def with_class_costs(raw: dict[str, Any]) -> dict[str, Any]:
-    """What was read of a scenario, with the whole cost of every class: that of `[cost]`, then the settings of the
-    class's own preset, then what it says itself.
+    """Returns the settings of a scenario with the whole cost of every class: that of `[cost]`, then the settings of
+    the class's preset, then the class's own.
 
-    What is no table is left to the check of types. To do it again changes nothing.
+    A value that is not a table is left to the check of types. To do it again changes nothing.
     """
     classes, common = raw.get("classes"), raw.get("cost", {})
     if not isinstance(classes, list) or not isinstance(common, dict):
@@ -116,7 +116,7 @@ def _over(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
-    """What is wrong with the classes of a scenario, one sentence each."""
+    """Returns the faults of a scenario's classes, one sentence each."""
     names = [each.name for each in scenario.classes]
     if GROUND in names:
         yield f"{source}: classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
@@ -170,7 +170,7 @@ def aloft_classes(scenario: Scenario) -> list[str]:
 
 
 def flies(scenario: Scenario, name: str) -> bool:
-    """Whether vehicles of a class fly. Raises ConfigError on an unknown class."""
+    """Returns True if vehicles of a class fly. Raises ConfigError on an unknown class."""
     own = class_named(scenario, name)
     return own is not None and own.air is not None
 
@@ -188,7 +188,7 @@ def of_class(scenario: Scenario, name: str) -> Scenario:
 
 
 def least_sense_range_m(scenario: Scenario) -> float:
-    """How far vehicles of every class that drives see."""
+    """Returns the sensing range (m) that vehicles of every ground class have."""
     driven = {group.vehicle_class for group in scenario.groups}
     return min(of_class(scenario, name).vehicles.sense_range_m for name in sorted(driven))
 

@@ -19,7 +19,7 @@ from swarm.config.scenario import Scenario
 
 _DATES = (datetime.datetime, datetime.date, datetime.time)
 _WIDTH = 100
-"""Of a comment, in characters."""
+"""Width of a comment, in characters."""
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 

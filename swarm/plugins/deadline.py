@@ -14,9 +14,9 @@ from typing import TypeVar
 T = TypeVar("T")
 
 KILLED_BY = signal.SIGVTALRM
-"""What ends a process whose call cannot be broken off."""
+"""Signal that ends a process whose call cannot be interrupted."""
 _KILL_FACTOR = 5
-"""A call that goes on for so many times its limit, or swallows so many alarms, ends its process."""
+"""A call that exceeds its limit by this factor, or swallows this number of alarms, ends its process."""
 
 
 class Hangs(BaseException):
@@ -24,7 +24,7 @@ class Hangs(BaseException):
 
 
 def call_within(seconds: float, call: Callable[[], T]) -> T:
-    """What `call` returns. Raises `Hangs` in it once so many seconds have passed, and again as often.
+    """Returns the result of `call`. Raises `Hangs` in it after this time (s), and again at the same interval.
 
     An alarm of the operating system ends loops, sleeps and waits alike. It does not reach native code that never
     comes back to the interpreter, nor end a call that swallows it, as a bare `except` does. Once the first has used
@@ -48,7 +48,7 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         signal.signal(signal.SIGALRM, before)
-        if left_s:  # somebody else's alarm, such as a test's
+        if left_s:  # an alarm of another user, such as a test's
             signal.setitimer(signal.ITIMER_REAL, max(left_s - (time.monotonic() - began_s), 1e-3), every_s)
 
 

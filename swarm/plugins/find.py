@@ -1,9 +1,9 @@
 """From a name in the scenario to the code that it names, with its options checked.
 
-A plug-in is called with its world and its options, and returns what has the method of its kind's `Protocol`: mostly
-it is a class. What has that method already is taken as it is. If the plug-in has an attribute `Options`, a msgspec
-Struct or a dataclass, the table of the scenario becomes one of these, and a key, type or value that does not fit is
-refused; else it gets the table as it stands.
+A plug-in is called with its world and its options, and returns an object with the method of its kind's `Protocol`:
+usually it is a class. An object that has the method already is used as it is. If the plug-in has an attribute
+`Options`, a msgspec Struct or a dataclass, the table of the scenario becomes one of these. A key, type or value
+that does not fit is refused. Otherwise the plug-in gets the table as it is.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from swarm.errors import ConfigError
 from swarm.plugins.deadline import Hangs, call_within
 
 Factory = Callable[[Any, Any], Any]
-"""(world, options) -> what does the work."""
+"""(world, options) -> the object with the method."""
 START_S = 60.0
 """Importing a plug-in and making one takes longer if it hangs."""
 
@@ -46,8 +46,8 @@ class Plugin:
         return f"{self.named.kind.name} plug-in {self.named.name!r}"
 
     def make(self, world: object) -> Any:
-        """What does the work, for a plug-in from outside. Raises ConfigError if that raises, hangs or lacks the
-        method of its kind."""
+        """Makes the object of an external plug-in. Raises ConfigError if that raises, hangs or lacks the method of
+        its kind."""
         assert self.factory is not None
         factory = self.factory
         made = _started(self.named, "could not be made", lambda: factory(world, self.options))
@@ -58,8 +58,8 @@ class Plugin:
 
 
 def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
-    """Import what a scenario names, and check its options. Raises ConfigError with the key, what was found and what
-    is expected.
+    """Import what a scenario names, and check its options. Raises ConfigError with the key, the value found and the
+    value expected.
 
     folder  where modules lie that are not installed
     """
@@ -151,7 +151,7 @@ def _options(named: NamedPlugin, wanted: Any) -> Any:
 
 
 def _started(named: NamedPlugin, what: str, call: Callable[[], Any]) -> Any:
-    """What a call returns that imports or makes a plug-in. Raises ConfigError where it fails."""
+    """Returns the result of a call that imports or makes a plug-in. Raises ConfigError where it fails."""
     try:
         return call_within(START_S, call)
     except ConfigError:

@@ -25,11 +25,11 @@ _SLOW_SHARE = 0.1
 
 
 class Nonsense(SwarmError):  # noqa: N818
-    """What a plug-in returned breaks its contract: what was found, what was expected."""
+    """A result of a plug-in breaks its contract: the value found, and the value expected."""
 
 
 class Guard:
-    """Where one plug-in is called.
+    """The single place where one plug-in is called.
 
     tell   takes its fault
     works  false once it has failed: then it is not called any more
@@ -42,7 +42,7 @@ class Guard:
         self._slow = False
 
     def ask(self, call: Callable[[], object], check: Callable[[object], T], otherwise: Callable[[], T]) -> T:
-        """What `call` returns, as `check` makes it; what `otherwise` returns if the plug-in fails, or has failed.
+        """Returns the result of `call` after `check`, or of `otherwise` if the plug-in fails or has failed.
 
         check  raises `Nonsense` on what breaks the contract; what else it raises counts as the plug-in's fault, too
         """

@@ -1,5 +1,5 @@
-"""What enters a service by a call, as records of a recording, and back: events of the bus, and what the loop of its
-process counted, which the service publishes."""
+"""Calls into a service as records of a recording, and back: events of the bus, and the loop's counters, which the
+service publishes."""
 
 from __future__ import annotations
 
@@ -83,7 +83,8 @@ def record_of(event: Event, now_ns: int) -> Handled:
 
 
 def rest_of(record: Handled) -> Any:
-    """What a record holds beside topic, key and messages. Raises StoreError where that is not of its event."""
+    """Returns the content of a record beside topic, key and messages. Raises StoreError where that is not of its
+    event."""
     try:
         return msgspec.convert(record.rest, _REST[record.kind])
     except (KeyError, msgspec.ValidationError) as error:
@@ -93,7 +94,7 @@ def rest_of(record: Handled) -> Any:
 def event_of(record: Handled, answerer: Answerer) -> Event:
     """The event in a record, but for jobs. Raises StoreError on one that cannot have been an event.
 
-    answerer  takes the answers to what was asked
+    answerer  receives the replies to the query
     """
     rest = rest_of(record)
     match record.kind:
@@ -140,7 +141,7 @@ class LoopCounters(Counters):
     def __init__(self, counters: Counters) -> None:
         vars(self).update(vars(counters))  # the same, not copies
         self._recorded = LoopFigures({}, {}, {})
-        """What the loop has written, as last recorded; of what it never was a value that no figure has."""
+        """Counters of the loop as last recorded; a value that no counter has for those never written."""
 
     def count(self, name: str, by: int = 1) -> None:
         self._recorded.counts.setdefault(name, -1)
@@ -160,7 +161,7 @@ class LoopCounters(Counters):
         super().observe(name, value)
 
     def changed(self) -> LoopFigures | None:
-        """What the loop has changed since this was called last; None if it has not changed anything."""
+        """Returns the counters that the loop has changed since the last call; None if there are none."""
         last, gauges = self._recorded, self.gauges
         new = LoopFigures(
             {name: self.counts[name] for name, was in last.counts.items() if self.counts[name] != was},

@@ -1,4 +1,4 @@
-"""How values that a service reads of the outside are written down: the type of each call's result, by name."""
+"""Encoding of external values that a service reads: the type of each call's result, by name."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 from swarm.errors import StoreError
 
 _MOST_BYTES = 1 << 30
-"""Of one value, unpacked."""
+"""Limit for one value, unpacked."""
 
 
 @dataclass(frozen=True)
 class ExternalCalls:
-    """What a service may use of an object outside, such as a store.
+    """Calls of an external object, such as a store, that a service may use.
 
     name   of it, in the recording
     calls  method -> type of what it returns; its arguments are outputs of the service
@@ -69,7 +69,7 @@ def pack(value: object) -> bytes:
 
 
 def unpack(content: bytes, kind: Any) -> Any:
-    """Raises StoreError on what is no value of this type."""
+    """Raises StoreError if it is not a value of this type."""
     try:
         if kind in (np.ndarray, np.ndarray | None) and content[:1] == b"x":
             content = zlib.decompressobj().decompress(content, _MOST_BYTES)

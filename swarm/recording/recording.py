@@ -36,7 +36,7 @@ from swarm.runtime.stats import Counters
 
 T = TypeVar("T")
 FAILED = "!"
-"""Before the sentence of a StoreError, in the name of what was read."""
+"""Precedes the sentence of a StoreError, in the name of the reading."""
 RAISED = "raise "
 """Before an error by which a service ended, as its last output."""
 _FLUSH_NS = NS_PER_S
@@ -55,7 +55,7 @@ def digest_of(content: bytes) -> bytes:
 
 
 def versions() -> dict[str, str]:
-    """What a recording was made with, or is replayed with."""
+    """Versions of this code, Python and libraries, for a recording or a replay."""
     found = {"python": python_version()}
     for package in _PACKAGES:
         try:
@@ -66,7 +66,7 @@ def versions() -> dict[str, str]:
 
 
 def path_of(folder: Path, role: str, id: str, incarnation: int) -> Path:
-    """Where one life of a process is recorded, below a run's folder."""
+    """Returns the file of the recording of one process, below a run's folder."""
     return folder / FOLDER / f"{role}-{id}.{incarnation}{SUFFIX}"
 
 
@@ -83,7 +83,7 @@ class Recording(Crossing):
         self._outputs: list[Output] = []
         self._jobs = 0
         self._job = threading.local()
-        """Of the thread that runs a job: `reads`, what that has read."""
+        """State of the thread that runs a job: `reads`, its readings."""
         self._flush_due_ns = 0
         self._writer.write(
             Head(

@@ -3,7 +3,7 @@
     "swarm recording 2\n" {length u32, crc32 u32, zlib({length u32, record} {length, record} ...)} ...
 
 Records are MessagePack, numbers little-endian. A process that is killed leaves a file that can be read up to its
-last whole block. Whatever stands in a file, reading it raises nothing but StoreError.
+last whole block. Reading a file raises nothing but StoreError, whatever its content.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ log = logging.getLogger(__name__)
 MAGIC = b"swarm recording 2\n"
 SUFFIX = ".inputs"
 FOLDER = "inputs"
-"""Of a run's folder: one recording per life of a process."""
+"""Folder in a run's folder: one recording per start of a process."""
 MOST_BYTES = 64 << 20
-"""Of one recording: what comes later is not recorded, and the last record says so."""
+"""Limit of one recording: later records are dropped, and the last record states so."""
 _BLOCK_BYTES = 1 << 16
-"""Of records, before they are compressed: a block is written once it has more."""
+"""Size of records before compression: a block is written once it has more."""
 _LONGEST_BLOCK_BYTES = 256 << 20
 """A block is taken to hold no more, whatever it says."""
 _LEVEL = 1
-"""Of compression, the fastest: it leaves a third to a quarter of the bytes."""
+"""Compression level, the fastest: it leaves a third to a quarter of the bytes."""
 _HEAD = struct.Struct("<II")
 _LENGTH = struct.Struct("<I")
 
@@ -73,7 +73,7 @@ class Head(Record, frozen=True, tag=0):
 
 
 class LoopFigures(msgspec.Struct, frozen=True, array_like=True):
-    """What the loop of a process, not its service, has counted since the last call."""
+    """Counters of a process's loop, not of its service, since the last call."""
 
     counts: dict[str, int]
     gauges: dict[str, float]
@@ -107,14 +107,15 @@ class Handled(Record, frozen=True, tag=2):
 
 
 class Read(Record, frozen=True, tag=3):
-    """What the service read of the outside, inside the call before; before the first call while it was made."""
+    """A reading of an external value, inside the preceding call; before the first call while the service was
+    made."""
 
     what: str
     value: bytes
 
 
 class Output(msgspec.Struct, frozen=True, array_like=True):
-    """What a call let out: to whom, how many bytes, and their digest."""
+    """An output of a call: its destination, its number of bytes, and their digest."""
 
     to: str
     length: int
@@ -122,7 +123,7 @@ class Output(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Outputs(Record, frozen=True, tag=4):
-    """All that the call before let out, in order. A call that lets nothing out has none."""
+    """All outputs of the preceding call, in order. A call that lets nothing out has none."""
 
     outputs: list[Output]
 
@@ -189,7 +190,7 @@ class RecordWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Hand over to the system what waits."""
+        """Hands the waiting records over to the system."""
         if self._file is None or not self._waiting:
             return
         block = _block(self._waiting)

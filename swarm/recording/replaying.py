@@ -42,7 +42,7 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a replay has found.
+    """Result of a replay.
 
     events      how many were fed whose outputs are the same
     outputs     how many were compared
@@ -81,16 +81,16 @@ class _LetOut:
 
 
 class Replaying(Crossing):
-    """Gives a service what was recorded, and takes what it lets out."""
+    """Feeds a service the recorded inputs, and receives its outputs."""
 
     def __init__(self, namespace: str) -> None:
         super().__init__()
         self.nobody = _Nobody(namespace=namespace)
         """The bus on which nothing is heard, and the worker."""
         self.reads: deque[tuple[str, bytes]] = deque()
-        """Of the event in hand: what it may still read."""
+        """Readings of the current event that are not used yet."""
         self.outputs: list[_LetOut] = []
-        """What it has let out."""
+        """Outputs of the current event."""
         self._jobs: dict[int, Callable[[], object]] = {}
         """Jobs whose result was not taken yet, by number."""
         self._submitted = 0
@@ -295,7 +295,7 @@ def _described_output(let_out: _LetOut) -> str:
 
 
 class _Nobody:
-    """Stands for what is outside: a bus on which nothing is heard, a worker, who asked. It takes every call."""
+    """Null object for the outside: a bus without messages, a worker, an asker. It takes every call."""
 
     def __init__(self, **facts: object) -> None:
         vars(self).update(facts)

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class Boundary:
-    """What a service is given in place of what is outside: here that itself, and nothing is written down."""
+    """Access of a service to the outside, without recording."""
 
     def bus(self, bus: Bus) -> Bus:
         return bus
@@ -46,7 +46,7 @@ class Boundary:
 
 
 class Crossing(Boundary):
-    """A boundary that takes down what is read and let out, or says what was read and takes what is let out."""
+    """A boundary that records readings and outputs, or feeds recorded readings and compares outputs."""
 
     def __init__(self) -> None:
         self._asked = 0
@@ -56,7 +56,7 @@ class Crossing(Boundary):
         raise NotImplementedError
 
     def read_as(self, what: str, of: Callable[[], T], kind: Any) -> T:
-        """As `read`, of a value that is as it was outside where nothing is fed."""
+        """Like `read`, for a value that is the external one unless it is fed."""
         raise NotImplementedError
 
     def let_out(self, to: str, content: bytes, what: object = None) -> None:
@@ -131,7 +131,7 @@ class BoundaryBus:
     def _samples(
         self, what: str, topic: Topic, collect: Callable[[], list[tuple[T, Message]]], kind: Any
     ) -> list[tuple[T, Message]]:
-        """Samples that wait, each with its key: collected from the bus and taken down, or made of what was."""
+        """Waiting samples, each with its key: collected from the bus and recorded, or made from a record."""
         collected: list[tuple[T, Message]] | None = None
 
         def taken_down() -> bytes:
@@ -262,7 +262,7 @@ class BoundaryObject:
 
 
 def _kept(value: object) -> object:
-    """What can be gone through only once, as a list."""
+    """Copies a value that can be iterated only once, as a list."""
     if isinstance(value, (str, bytes, list, tuple, set, dict, np.ndarray, msgspec.Struct)):
         return value
     return list(value) if isinstance(value, Iterable) else value

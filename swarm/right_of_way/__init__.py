@@ -1,4 +1,5 @@
-"""Right of way: no two vehicles are on one cell, whatever is lost, late, repeated, stopped or started again.
+"""Right of way: no two vehicles are in one cell, even if messages are lost, late or repeated and processes stop or
+restart.
 
 The map is cut into *plots* (`lock_regions`): lock regions. Three agents are the *members* of a plot, and one of
 them is its *warden*: the leader, by epoch and majority. A *host* is a process with vehicles in a plot or at its
@@ -13,14 +14,14 @@ and chance are arguments.
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
 1. Begin with a life whose number is greater than all that anybody knows, and have it on file before the first
-   word. So ask all agents first (`KnownRequest`), until of every plot so many members have answered that one of
-   them has its newest usable table.
+   word. First ask all agents (`KnownRequest`), until so many members of every plot have replied that one of them
+   has its newest usable table.
 2. Tell each plot that concerns it everything about its vehicles there, whenever that is news and once a beat.
-   What is left out is given back.
+   Cells that it omits are released.
 3. Enter a cell only if a `Granted` for this life, newer than all that it knows of the plot, adds it to the path
    of the vehicle. Never go back to an older table of a plot, not even after the vehicles have left it.
-4. Never ask for a cell that it has given up while a table still grants it: granted anew, the cell could not be
-   told from one that is about to be freed.
+4. Never ask for a released cell while a table still grants it: granted again, the cell could not be told from one
+   that is about to be freed.
 5. Stop once a table names a greater life of this host, and say so where the vehicles are simulated ones.
 6. Speak to the warden, and to all members where no warden was heard for half a second.
 
@@ -45,7 +46,7 @@ Messages (`swarm.wire.messages.traffic`), each of which carries the whole state 
 
 A *guest* (`Guest`) is a host that is not in the scenario. It is a member of no plot, so who joins and leaves
 changes no majority. It enters from nowhere: a standing asks for its first cell and holds nothing. It leaves by
-a standing without the vehicle. One that dies keeps its cells shut until its next life proves, by the file which
-that has locked, that it has ended, or until an operator says that it is gone (`Removal`): a life that names all
+a standing without the vehicle. The cells of a dead guest stay shut until its next life proves, by the file which
+that has locked, that the process has ended, or until an operator removes it (`Removal`): a life that names all
 lives as ended, itself among them.
 """

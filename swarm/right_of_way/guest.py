@@ -1,4 +1,4 @@
-"""A vehicle that is not in the scenario: how it gets right of way, and how an operator says that it is gone
+"""External vehicles in right of way: how such a guest enters and reserves cells, and how an operator removes it
 (decision 40)."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from swarm.wire.messages.traffic import Granted, Known
 MOST_AHEAD = 16
 """Cells ahead of itself that a guest is granted at most."""
 _OLDEST_MS = 1 << 31
-"""Greatest age that is told: half of what the message has room for, so that a push may still add to it."""
+"""Greatest age that is sent: half of the message's range, so that a push may still add to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Guest:
         self._host = Host(plots, name, [self.vehicle], lambda vehicle, cells: None)
         self._lives = list(lives)
         self._cell: int | None = None
-        """Where it stands or would enter; None while it is away."""
+        """Its cell, or the one that it would enter; None while it is away."""
         self._path: tuple[int, ...] = ()
         self._aside: tuple[int, ...] = ()
         self._wish = Wish()
@@ -64,12 +64,12 @@ class Guest:
 
     @property
     def replaced(self) -> bool:
-        """Whether another process speaks for this guest. It stands where it stands, and must not move."""
+        """True if another process represents this guest. It stands where it stands, and must not move."""
         return self._host.holdings.replaced
 
     @property
     def gone(self) -> bool:
-        """Whether it holds and wants nothing, and every warden that it spoke to knows."""
+        """True if it holds and requests nothing, and every warden that it contacted knows."""
         return self._cell is None and (not self._host.holdings.life or self._host.holdings.gone)
 
     @property
@@ -78,7 +78,7 @@ class Guest:
 
     @property
     def refused(self) -> list[str]:
-        """Sentences about what cannot be true; whoever tells them clears them."""
+        """Sentences about impossible statements; the reader clears them."""
         return self._host.holdings.refused
 
     def enter(self, cell: int) -> None:
@@ -133,7 +133,7 @@ class Guest:
 
     @property
     def settled(self) -> bool:
-        """Whether nobody needs to be asked what is known of it, now or once more."""
+        """True if no recovery query is pending."""
         return not self.needs_life and self._host.informed
 
     def hear_known(self, known: Known) -> None:
@@ -153,7 +153,7 @@ class Guest:
         return [SaveLives(self._lives)]
 
     def hear_granted(self, granted: Granted, now_ns: int) -> bool:
-        """A warden's word to us. Whether the vehicle has entered by it."""
+        """A warden's word to us. Returns True if the vehicle has entered by it."""
         return bool(self._host.hear_granted(granted, now_ns))
 
     def hear_token(self, peer: Peer, *, up: bool) -> None:
@@ -165,7 +165,7 @@ class Guest:
         return list(self._host.unled(now_ns).values())
 
     def tick(self, now_ns: int) -> list[GuestAction]:
-        """What it has to say now."""
+        """Returns the messages to send in this tick."""
         if self.replaced:
             # Not that it has ended, as a host would: its vehicle still stands there.
             return [AskKnown()] if self._host.ended_alone(now_ns) and self._cell is not None else []
@@ -188,7 +188,7 @@ class Guest:
 
 
 class Removal:
-    """An operator's word that a guest is gone: it, and whatever process spoke for it, is on no cell any more.
+    """An operator's removal of a guest: neither it nor any process that represented it is in a cell any more.
 
     It is a new life of the guest, which proves by the operator's word that all before it have ended, and holds
     nothing. A process that still speaks for the guest stops as soon as it hears of it.
@@ -201,22 +201,22 @@ class Removal:
 
     @property
     def known(self) -> bool:
-        """Whether anybody has ever heard of this guest."""
+        """True if any reply knew this guest."""
         return bool(self._lives)
 
     @property
     def done(self) -> bool:
-        """Whether every warden that had cells of the guest has freed them."""
+        """True if every warden that had cells of the guest has freed them."""
         return self._host.holdings.life > 0 and self._host.holdings.gone and self.settled
 
     @property
     def settled(self) -> bool:
-        """Whether so many have answered that no plot can be missing."""
+        """True if so many agents have replied that no plot can be missing."""
         return self._host.informed
 
     @property
     def replaced(self) -> bool:
-        """Whether the guest has begun a later life meanwhile."""
+        """True if the guest has begun a later life meanwhile."""
         return self._host.holdings.replaced
 
     def hear_known(self, known: Known) -> None:

@@ -1,8 +1,8 @@
 """Right of way of a vehicle that is not in the scenario, on the bus.
 
 `GuestSession` is what a program of one's own uses: a thread that keeps the right of way, and calls that may be
-made from any other. `GuestService` is the same without the thread, for another loop to drive. `say_gone` is the
-word of an operator that such a vehicle is gone.
+made from any other. `GuestService` is the same without the thread, for another loop to drive. `say_gone` is an
+operator's statement that such a vehicle is not on the map any more.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from swarm.wire.messages.traffic import Granted, Known, KnownRequest
 from swarm.wire.topics import GRANTED, KNOWN, STANDING
 
 _NOBODY_NS = 10 * NS_PER_S
-"""A guest that nobody has answered for so long is told so."""
+"""Time without a reply after which a guest is informed of it."""
 _ANSWERS_S = 0.3
 """A new life waits so long for the agents' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
@@ -80,7 +80,7 @@ class GuestService:
         self._tokens: set[Peer] = set()
         self._began_ns = 0
         self._cell: int | None = None
-        """Where to enter, once there is a guest."""
+        """The cell to enter, once there is a guest."""
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role=_ROLE)
@@ -146,7 +146,7 @@ class GuestService:
             self.guest.refused.clear()
 
     def tell(self, now_ns: int) -> None:
-        """Send what is new, without waiting for the next tick."""
+        """Sends new statements without waiting for the next tick."""
         if self.guest is not None:
             self._perform(self.guest.tick(now_ns), now_ns)
 
@@ -197,7 +197,7 @@ class GuestService:
 
 
 def _tells_of_larger(known: Known, guest: Guest) -> bool:
-    """Whether plots are larger than the guest takes them to be. An agent says so only if this is so for the whole
+    """Returns True if plots are larger than the guest assumes. An agent says so only if this is so for the whole
     run; one that says less may not belong."""
     return known.plot_cells > guest.plots.side and not guest.cells
 
@@ -205,7 +205,7 @@ def _tells_of_larger(known: Known, guest: Guest) -> bool:
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.1
-"""Time between two ticks: half a beat, so that each beat is told in time."""
+"""Time between two ticks: half a beat, so that each beat is sent in time."""
 _ENTER_S, _LEAVE_S = 5.0, 3.0
 """Longest waits for the first cell, and at the end for the word that all cells are free: a few hops, or an election
 of a warden, which takes a second."""
@@ -222,8 +222,8 @@ class GuestSession:
     ...         rover.left(cell)
 
     The vehicle drives into a cell only while `may_enter` of it is true, and says which it has left. At its end the
-    session leaves; a program that dies leaves its cells shut, until the next one of the same name and file enters,
-    or an operator says that the vehicle is gone (`swarm vehicle gone`).
+    session leaves. A program that dies leaves its cells shut, until the next one of the same name and file enters,
+    or an operator removes the vehicle (`swarm vehicle gone`).
 
     name   of the vehicle, unlike all agents of the scenario
     grid   of the run's map
@@ -238,7 +238,7 @@ class GuestSession:
         """Guards the service; notified whenever it may have come to hold other cells."""
         self._closed = threading.Event()
         self._entered = False
-        """Whether `stands` was called."""
+        """True if `stands` was called."""
         self._bus = bus
         self._lives = lives
         self._failure: BaseException | None = None
@@ -268,7 +268,7 @@ class GuestSession:
 
     @property
     def replaced(self) -> bool:
-        """Whether another process has taken the name: this vehicle must stand still, and its cells stay shut."""
+        """True if another process has taken the name: this vehicle must stand still, and its cells stay shut."""
         with self._changed:
             guest = self._service.guest
             return guest is not None and guest.replaced
@@ -299,7 +299,7 @@ class GuestSession:
             self._service.tell(self._clock.now_ns())
 
     def may_enter(self, cell: int, timeout_s: float | None = None) -> bool:
-        """Whether the vehicle may drive into a cell, after waiting for it for so long."""
+        """Returns True if the vehicle may drive into a cell, after waiting up to a timeout."""
         return self._wait(lambda: cell in self.cells, timeout_s)
 
     def left(self, cell: int) -> None:
@@ -314,7 +314,7 @@ class GuestSession:
     def stands(self, cell: int) -> bool:
         """The vehicle is in a cell: those behind it are given back. Returns whether it was let in there.
 
-        The first cell is asked for, and waited for: somebody else may be there.
+        The first cell is requested, and waited for: another vehicle may be there.
         """
         if not self._entered:
             self._entered = True
@@ -382,7 +382,7 @@ _WORDS_S = 0.5
 
 
 def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
-    """Say that a guest is gone, and wait until its cells are free. Returns whether they are within the timeout.
+    """Removes a guest, and waits until its cells are free. Returns whether they are within the timeout.
 
     bus  opened with the run's secret, or the guest's own certificate
 

@@ -25,7 +25,7 @@ Place = Callable[[str, Sequence[int]], int | None]
 
 
 class Wish(msgspec.Struct, frozen=True):
-    """Where a vehicle would go.
+    """Candidate cells of a vehicle, in order of preference.
 
     ahead   its next cells after all that it holds
     wants   where else it could go from its cell, the best first; `better` of them are better than to stay
@@ -52,17 +52,17 @@ class Tell:
 
 @dataclass(slots=True)
 class _View:
-    """What a host knows of one plot.
+    """State of one plot as a host knows it.
 
-    warden   who granted last, and when that was heard
+    warden   of the last grant, and the time when that was received
     knows    stamp of the table in use; it never goes back, not even when the vehicles leave the plot and return
     heard    the newest standing of ours that the table in use takes into account
     seen     vehicle -> the cells that the table in use grants it
     pushed   vehicle -> the age with which it is to make way into another plot
-    others   cells beside our vehicles that are granted to vehicles of other hosts, or to nobody
+    others   cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet    the first standing from which on we want nothing here; None while we do
-    told     what was last told of our vehicles, and when
-    same     whether it is known that the same would be told again
+    told     the last statement about our vehicles, and its time
+    same     whether the next statement is known to be the same
     """
 
     warden: str = ""
@@ -83,7 +83,7 @@ _Told = tuple[Stand, object]
 
 
 class _Said(msgspec.Struct, frozen=True):
-    """What is told of one vehicle while nothing about it changes: by plot a stand."""
+    """Statement about one vehicle while nothing about it changes: a stand per plot."""
 
     wish: Wish
     path: list[int]
@@ -99,7 +99,7 @@ class Holdings:
     plots     those that concern the host now: it speaks to their members and listens to their tables
     replaced  a later life of this host has spoken: this one must end
     newest    the greatest life of this host that a table in use names
-    refused   sentences about what cannot be true; whoever tells them clears them
+    refused   sentences about impossible statements; the reader clears them
     """
 
     def __init__(self, plots: Plots, agent: str, vehicles: Collection[str] | None) -> None:
@@ -121,14 +121,14 @@ class Holdings:
         self._enters: dict[str, int] = {}
         """Vehicle that holds nothing -> the cell on which it would begin, until that is granted."""
         self._away: set[str] = set()
-        """Vehicles that have left in this life: what is still granted to them is given back."""
+        """Vehicles that have left in this life: cells that are still granted to them are released."""
         self._pushed: dict[str, int] | None = None
         """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
         self._said: dict[str, _Said] = {}
         self._seen_anew: set[str] = set()
-        """Vehicles to which another table grants other cells: what is asked for them may be another thing now."""
+        """Vehicles to which another table grants other cells: their requests may change."""
         self._stands: dict[int, dict[str, _Told]] = {}
-        """Plot -> vehicle -> what is told of it, in the order of `_paths`; follows `_said`."""
+        """Plot -> vehicle -> statement about it, in the order of `_paths`; follows `_said`."""
         self._views: dict[int, _View] = {}
         self._seq = 0
 
@@ -138,7 +138,7 @@ class Holdings:
         self._dead = list(dead)
 
     def end_at_once(self) -> None:
-        """Say that nobody drives by this life: it only gives back what those before it held."""
+        """States that no vehicle drives by this life: it only releases the cells of those before it."""
         self._dead.append(self.life)
 
     # --- what is held ---------------------------------------------------------------------------------------
@@ -182,8 +182,8 @@ class Holdings:
             self._paths[vehicle] = self._paths[vehicle][:keep]
 
     def enter(self, vehicle: str, cell: int) -> None:
-        """Ask for a first cell for a vehicle that holds none; the newest call counts. Where an earlier life of ours
-        was granted cells for it, this one of them is taken and all others are given back."""
+        """Ask for a first cell for a vehicle that holds none; the newest call counts. If an earlier life of ours
+        was granted cells for it, it takes this one of them and releases all others."""
         if vehicle not in self._paths:
             self._enters[vehicle] = cell
             self._away.discard(vehicle)
@@ -201,11 +201,11 @@ class Holdings:
 
     @property
     def gone(self) -> bool:
-        """Whether no vehicle of ours holds or wants a cell, and all wardens that we spoke to know it."""
+        """True if no vehicle of ours holds or requests a cell, and all wardens that we contacted know it."""
         return not (self.plots or self._paths or self._enters)
 
     def is_granted(self, vehicle: str) -> bool:
-        """Whether a table in use grants cells to a vehicle, though it may have left them."""
+        """Returns True if a table in use grants cells to a vehicle, which may have left them."""
         return any(vehicle in view.seen for view in self._views.values())
 
     def waiting(self, plot: int) -> list[str]:
@@ -270,8 +270,8 @@ class Holdings:
         return placed
 
     def _first_cell(self, vehicle: str, cells: Sequence[int], seen: Sequence[int], place: Place) -> int | None:
-        """Where a vehicle that holds nothing begins, of the cells that are granted to it; None if it does not. What
-        was granted to a life before it was replaced may come late: its successor may have given that back."""
+        """Returns the first cell of a vehicle that holds none, from the cells granted to it; None if there is none.
+        A grant to a life before it was replaced may come late: its successor may have released that cell."""
         if vehicle in self._away or self.replaced:
             return None
         cell = self._enters.get(vehicle)
@@ -283,7 +283,7 @@ class Holdings:
         return cell
 
     def _extend(self, vehicle: str, cells: Sequence[int], seen: Sequence[int]) -> None:
-        """Take the cells that are granted anew. One that does not follow the path is left, and so given back."""
+        """Adds newly granted cells. One that does not follow the path is left, and so given back."""
         path = self._paths[vehicle]
         first = len(cells)
         while first and cells[first - 1] not in path:
@@ -296,8 +296,8 @@ class Holdings:
     # --- what to say ----------------------------------------------------------------------------------------
 
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
-        """What to tell of each plot that concerns us, where it is new or the last word is a beat old. What is left
-        out is given back."""
+        """Returns the statements for each plot that concerns us, if they are new or the last one is a beat old.
+        Cells that a statement omits are released."""
         self._seq += 1
         self._say_changed(wishes)
         by_plot = {plot: self._stands.get(plot, _NO_STANDS) for plot in self.plots}
@@ -315,7 +315,7 @@ class Holdings:
         ]
 
     def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
-        """Make anew what is told of those vehicles of which path, wish, or what tables grant has changed."""
+        """Rebuilds the statements about vehicles of which path, wish or granted cells have changed."""
         anew, known, moved = self._seen_anew, self._said, False
         for vehicle, path in self._paths.items():
             before, wish = known.get(vehicle), wishes.get(vehicle, _NO_WISH)
@@ -341,7 +341,7 @@ class Holdings:
                     self._stands.setdefault(plot, {})[vehicle] = told
 
     def _say_all_again(self) -> None:
-        """What is told may be another thing in any plot."""
+        """Statements of all plots may change."""
         for view in self._views.values():
             view.same = False
 
@@ -367,7 +367,7 @@ class Holdings:
         view = self._views[plot]
         lately = 0 <= now_ns - view.told_ns < BEAT_NS
         if not view.same:
-            # What a table grants and we do not hold is freed only if we say so, knowing that table.
+            # A granted cell that we do not hold is freed only if we state so, knowing that table.
             in_step = view.seen == {id: stand.holds for id, (stand, _) in stands.items() if stand.holds}
             knows = view.knows[0] if in_step else view.knows
             told = (self.replaced, knows, [news for _, news in stands.values()])
@@ -396,8 +396,8 @@ class Holdings:
         return _Said(wish, path, stands)
 
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
-        """Without cells that were left or given back while a table still grants them: granted anew, such a cell
-        could not be told from one that is about to be freed."""
+        """Excludes released cells which a table still grants: granted again, such a cell could not be told from one
+        that is about to be freed."""
         wanted = {*wish.ahead, *wish.wants}
         if not wanted:
             return wish

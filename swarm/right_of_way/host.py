@@ -46,7 +46,7 @@ class Host:
         self._place = place
         self._known_life = 0
         self._told_by: set[str] = set()
-        """Agents that have told us what they know of us."""
+        """Agents that have sent us their knowledge of us."""
         self._twins = Roster()
         self._alone_since_ns: int | None = None
         self._led_ns: dict[int, int] = {}
@@ -61,8 +61,8 @@ class Host:
 
     @property
     def informed(self) -> bool:
-        """Whether we have heard of every plot in which cells are granted to us: of each plot so many members have
-        answered that one of them has the newest usable table."""
+        """True if we know every plot in which cells are granted to us: of each plot so many members have replied
+        that one of them has the newest usable table."""
         if self._told_by.issuperset(self.plots.agents):
             return True
         every = map(self.plots.members, self.plots.all)
@@ -94,12 +94,12 @@ class Host:
             (self._twins.appeared if up else self._twins.gone)(Peer("host", peer.id, peer.incarnation))
 
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
-        """What our vehicles have to say now."""
+        """Returns the statements of our vehicles to publish now."""
         return self.holdings.standings(wishes, now_ns) if self.holdings.life else []
 
     def ended_alone(self, now_ns: int) -> bool:
-        """Whether a life that was replaced is to begin again, as its successor is gone. It holds and knows nothing
-        then: ask what is known of us, and `begin`."""
+        """Returns True if a replaced life is to begin again, as its successor has ended. It holds and knows nothing
+        then: send a recovery query, and `begin`."""
         if not self.holdings.replaced:
             return False
         if self._twins.is_alive("host", self.name) or self._alone_since_ns is None:

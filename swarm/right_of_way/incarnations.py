@@ -11,22 +11,22 @@ from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 
 BEAT_NS = NS_PER_S // 5
-"""What has not changed is told again so often: so the members know of a warden, and a warden of its hosts."""
+"""Period at which an unchanged statement is repeated: by it members know of a warden, and a warden of its hosts."""
 FURTHEST_EPOCH = 3 << 20
-"""No run gets so many epochs further while somebody does not hear of it."""
+"""No run advances by this number of epochs while one process does not receive them."""
 _LIFE_BITS = 32
 """Bits of chance in a life's number, by which two that begin at once differ."""
 _FURTHEST_LIFE = 1 << 16
-"""Restarts of a host beyond what is known, which no host has in a run."""
+"""Restarts of a host beyond the known number, which no host reaches in a run."""
 
 
 def first_life(after: int, chance: int) -> int:
-    """A new life's number: greater than all that are known. Of two that begin at once, chance decides."""
+    """A new life's number: greater than all that are known. If two begin at the same time, chance decides."""
     return ((after >> _LIFE_BITS) + 1 << _LIFE_BITS) | (chance & 0xFFFF_FFFF)
 
 
 def is_far_ahead(life: int, known: int) -> bool:
-    """Whether a number is further ahead than a host can have been restarted."""
+    """Returns True if a number is too high to be explained by restarts."""
     return life >> _LIFE_BITS > (known >> _LIFE_BITS) + _FURTHEST_LIFE
 
 
@@ -38,8 +38,8 @@ class MemoryLives:
     """The lives of a guest that have begun here, the oldest first: by them a new life proves that those before it
     have ended.
 
-    These survive a simulated process, not this one. What was granted to a life that is forgotten stays shut until
-    an operator says that it is gone.
+    These survive a simulated process, not this one. Cells granted to a forgotten life stay shut until an operator
+    removes it.
     """
 
     def __init__(self) -> None:

@@ -17,7 +17,7 @@ FEWEST_FOR_MAJORITY = 3
 
 
 def fitting_regions(rows: int, cols: int, agents: int) -> int:
-    """The least side of a plot, in regions, by which a grid has no more plots than so many agents have use for."""
+    """Returns the least side of a plot, in regions, at which a grid has no more plots than these agents can use."""
     regions = 1
     while _count(rows, cols, regions * REGION_CELLS) > MOST_PLOTS_AN_AGENT * agents and regions < MOST_PLOT_REGIONS:
         regions += 1
@@ -25,7 +25,7 @@ def fitting_regions(rows: int, cols: int, agents: int) -> int:
 
 
 def _count(rows: int, cols: int, side: int) -> int:
-    """How many squares of a side cover a grid."""
+    """Returns the number of squares of a side that cover a grid."""
     return -(-rows // side) * -(-cols // side)
 
 
@@ -35,16 +35,16 @@ class Plots:
     The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998); of fewer
     than three agents one, because two of two are harder to keep alive than one.
 
-    What drives and what flies are two layers, with plots and agents of their own: nobody in one asks, holds or
-    waits for anything in the other.
+    Ground and air are two layers, with plots and agents of their own: no vehicle in one requests, holds or waits
+    for anything in the other.
 
     agents  those of the layer
     side    of a plot, in cells: `map.plot_regions`. Messages go by plot, so that smaller ones cost more of them
     layer   0 is the ground, 1 the air
     others  the agents of the other layer: no guest may take their names
 
-    all    the numbers of the layer's plots. Those of two sides are never the same: whoever speaks of plots of
-           another side is not understood, instead of being taken for somebody who gives cells back
+    all    the numbers of the layer's plots. Numbers of plots of two sides are never equal: a statement about plots
+           of another side is not understood, and cannot be mistaken for a release of cells
     spare  how many agents of the layer may have plots of another side while ours have seats (`has_quorum`)
 
     Raises ConfigError where the numbers of so narrow a grid do not fit into a message.
@@ -86,10 +86,10 @@ class Plots:
         return self._first + cell // cols // side * self._across + cell % cols // side
 
     def has_quorum(self, agents: Collection[str]) -> bool:
-        """Whether no other layout can have seats, if these agents are of this one.
+        """Returns True if no other layout can have seats, given that these agents use this one.
 
-        Three agents make a seat in a plot of a region, whatever the rest are; so of larger plots so many have to be
-        that no three are left, and all where one has a seat by itself.
+        Three agents make a seat in a plot of one region, independent of the others. Larger plots therefore need so
+        many agents that fewer than three are left, or all agents if one makes a seat by itself.
         """
         return self.side <= REGION_CELLS or len(set(self.agents).difference(agents)) <= self.spare
 
@@ -106,7 +106,7 @@ class Plots:
         return members[epoch % len(members)]
 
     def adjacent(self, one: int, other: int) -> bool:
-        """Whether one step leads from one cell to the other."""
+        """Returns True if one step leads from one cell to the other."""
         cols = self._cols
         south, east = one // cols - other // cols, one % cols - other % cols
         return -1 <= south <= 1 and -1 <= east <= 1 and one != other

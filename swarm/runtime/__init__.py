@@ -1,7 +1,7 @@
 """The runtime of a process: its loop, its membership in a run, and what it tells of itself.
 
 One thread owns the state of a service (`process`); all others post to its `inbox`, which is bounded, fair by topic
-and answers in time under overload. What every role shares:
+and answers in time under overload. Mechanisms of every role:
 
 `membership`     Shows that the process is alive, compares runs, publishes counters (`stats`) and alarms.
 `election`       Decides which of several processes with one job leads: by rank, beats and a lease.

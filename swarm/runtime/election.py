@@ -44,14 +44,16 @@ class _Other:
 class Leadership:
     """One candidate's view of who leads.
 
-    - Who leads stops when it hears a better one lead. Better is: ready, then of lower rank, then the younger life.
-    - Who hears nobody lead for a lease begins, unless a better one is there, which does so itself.
-    - Who hears a worse one lead begins once it has been ready for `SETTLED_NS`, or for a lease if that one is not
-      ready.
+    - A leader stops when it receives beats of a better-ranked leader. Better is: ready, then of lower rank, then
+      the younger life.
+    - A candidate that receives no leader's beat for one lease takes over, unless a better-ranked candidate is
+      alive, which does so itself.
+    - A candidate that receives a worse-ranked leader takes over once it has been ready for `SETTLED_NS`, or for a
+      lease if that one is not ready.
     - A leader that stalls for a lease stops if another was ready to replace it.
 
-    All periods are measured on a clock that counts the time between two ticks for half a lease at most: while this
-    process stalls, the beats of others wait unread, and nobody is taken for dead because of that.
+    All periods are measured on a clock that counts at most half a lease between two ticks. While this process
+    stalls, beats of others wait unread, and no process is considered dead because of that.
 
     alone    there is no other candidate: this one leads, always
     period_ns  time between two ticks
@@ -59,7 +61,7 @@ class Leadership:
 
     def __init__(self, id: str, incarnation: int, *, alone: bool, period_ns: int) -> None:
         self.leads = alone
-        """Whether this process leads. Changed by `tick` only."""
+        """True if this process leads. Changed by `tick` only."""
         self.lease_ns = max(LEASE_NS, 4 * period_ns)
         self._alone = alone
         self._rank = split_rank(id)[1]
@@ -130,7 +132,7 @@ class Leadership:
         return self._awake_ns - self._better_since_ns >= (self.lease_ns if leader[0] else SETTLED_NS)
 
     def _counted(self, now_ns: int) -> int:
-        """What the time since the last tick counts."""
+        """Returns the time since the last tick, as it counts."""
         if self._ticked_ns is None:
             return 0
         return min(max(now_ns - self._ticked_ns, 0), self.lease_ns // 2)
@@ -156,7 +158,7 @@ class Candidacy:
         self._post = post
         self._core = Leadership(setup.id, setup.incarnation, alone=standbys == 0, period_ns=int(NS_PER_S / tick_hz))
         self._due_ns = 0
-        """When the next beat is to be told; at a change of who leads it is told at once."""
+        """Time of the next beat; a change of the leader is published immediately."""
 
     @property
     def leads(self) -> bool:
@@ -169,14 +171,14 @@ class Candidacy:
             self._bus.subscribe(LEAD, self._post, role=self._setup.role, id=id)
 
     def on_election_event(self, event: Event, now_ns: int) -> bool:
-        """Whether the event was a beat, and is done with."""
+        """Returns True if the event was a beat, which needs no other handler."""
         if isinstance(event, Heard) and isinstance(event.message, Beat):
             self._core.on_beat(event.message, now_ns)
             return True
         return False
 
     def tick(self, ready: bool, now_ns: int) -> bool:
-        """Whether this process leads from now on."""
+        """Returns True if this process leads from now on."""
         before = self._core.leads
         leads = self._core.tick(ready, now_ns)
         if self._standbys and (leads != before or now_ns >= self._due_ns):

@@ -1,7 +1,7 @@
 """The health of a process, as its own loop tells it at each tick: to other threads and processes, and to systemd.
 
-The loop writes into a small piece of memory (`Board`) and waits for nobody; readers take no lock that it holds. So
-a process whose loop hangs, or that is stopped, is still read: what it wrote last grows old.
+The loop writes into a small piece of memory (`Board`) without waiting; readers take no lock that it holds. A
+process that is stopped or whose loop hangs can therefore still be read: its last record ages.
 
 A supervisor such as systemd gets the datagrams of sd_notify(3) on the Unix socket that `NOTIFY_SOCKET` names. None
 may hold the loop up, so one for which there is no space is not sent; what matters is said again.
@@ -34,7 +34,7 @@ _PINGS_PER_LIMIT = 4
 class Supervisor:
     """Tells it when the process is up, that its loop turns, and what it does.
 
-    address    of the socket: a path, or `@name` in the abstract namespace; None: nobody wants to know
+    address    of the socket: a path, or `@name` in the abstract namespace; None: there is no supervisor
     limit_ns   after so long without a ping the supervisor takes the process for hung; None: it does not look
     """
 
@@ -44,11 +44,11 @@ class Supervisor:
         self._due_ns = 0
         self._told_ready = False
         self._status: str | None = None
-        """What is to be said with the next datagram; None: nothing new."""
+        """Content of the next datagram; None: nothing new."""
         self._socket = None if address is None else _opened()
 
     def says(self, what: str) -> None:
-        """What the process does now, in a line for people (`systemctl status`)."""
+        """Publishes the current activity of the process, in a line for people (`systemctl status`)."""
         self._status = "".join(each if each.isprintable() else " " for each in what)[:_LONGEST_STATUS]
         self._send([])
 
@@ -65,7 +65,7 @@ class Supervisor:
         self._send(["STOPPING=1"])
 
     def _send(self, words: list[str]) -> bool:
-        """Whether it has arrived."""
+        """Returns True if it has arrived."""
         if self._socket is None or self._address is None:
             return True
         told = [*words, *([] if self._status is None else [f"STATUS={self._status}"])]
@@ -80,7 +80,7 @@ class Supervisor:
 
 
 def supervisor_of(environment: Mapping[str, str]) -> Supervisor:
-    """The one that an environment names; one to whom nothing is told where it names none."""
+    """Returns the supervisor that an environment names; a null one if it names none."""
     address = environment.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return Supervisor(None)
@@ -98,7 +98,7 @@ def _opened() -> socket.socket:
 HUNG_S, HUNG_PERIODS = 10.0, 20
 """A loop that has not ticked for so long hangs: longer than a busy machine keeps a process from its tick."""
 SLOT_BYTES = 1024
-"""Bytes of one record: a head of 23 and what is lacking, some ten needs of `_LONGEST_NEED` characters at most."""
+"""Bytes of one record: a head of 23 and the missing needs, some ten of `_LONGEST_NEED` characters at most."""
 BOARD_BYTES = 2 * SLOT_BYTES
 _HEAD = struct.Struct("<IQQBH")
 """Checksum of all behind it, when it was written, `limit_ns`, phase, length of what follows."""
@@ -109,7 +109,7 @@ _WRITE_NS = NS_PER_S // 10
 _LONGEST_NEED = 100
 """Characters of one need: a line in a terminal."""
 LIFE_BEFORE = "the end of the life before it"
-"""What a process waits for that is started to follow one which still runs."""
+"""Need of a process that was started to follow one which still runs."""
 
 
 class Phase(IntEnum):
@@ -121,7 +121,7 @@ class Phase(IntEnum):
 
 
 class Vitals(NamedTuple):
-    """What a process has said of itself last.
+    """Last health record of a process.
 
     stamp_ns  when, on the monotonic clock of the machine
     limit_ns  if older, its loop hangs
@@ -134,7 +134,8 @@ class Vitals(NamedTuple):
     lacks: tuple[str, ...]
 
     def hangs(self, now_ns: int) -> bool:
-        """Whether its loop has stood still for too long. That of a process which starts or ends does not turn."""
+        """Returns True if its loop has not turned for too long. The loop of a process that starts or ends does not
+        turn."""
         return self.phase is Phase.RUNS and now_ns - self.stamp_ns > self.limit_ns
 
 
@@ -161,7 +162,8 @@ class Board:
         self._slot = 1 - self._slot
 
     def read(self) -> Vitals | None:
-        """What was written last; None if nothing was. Called by any thread, of any process that has the memory."""
+        """Returns the last record; None if there is none. Called by any thread, of any process that has the
+        memory."""
         found = [_record(bytes(self._memory[at : at + SLOT_BYTES])) for at in (0, SLOT_BYTES)]
         return max((each for each in found if each is not None), default=None)
 
@@ -175,7 +177,7 @@ def _record(slot: bytes) -> Vitals | None:
 
 
 class Health:
-    """What the loop of one process tells: on a board, and to the supervisor that started it."""
+    """Health reports of one process's loop: on a board, and to the supervisor that started it."""
 
     def __init__(self, board: Board | None = None, supervisor: Supervisor | None = None) -> None:
         self.board = board or Board()
@@ -185,7 +187,7 @@ class Health:
         self.starts("its start")
 
     def starts(self, what: str) -> None:
-        """The process is busy with what comes before its loop."""
+        """Reports that the process is still starting, before its loop."""
         self._write(Vitals(time.monotonic_ns(), 0, Phase.STARTS, (what,)))
         self._supervisor.says(what)
 
@@ -205,7 +207,7 @@ class Health:
         self._supervisor.turned(now_ns)
 
     def ends(self) -> None:
-        """The loop has ended; what comes now is the end of the process."""
+        """Reports that the loop has ended, and that the process ends next."""
         self._write(Vitals(time.monotonic_ns(), 0, Phase.ENDS, ("it ends",)))
         self._supervisor.ends()
 

@@ -17,7 +17,7 @@ first: an answer to it still finds its asker."""
 _UNREAD_BATCHES = 2
 """Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
 _KEPT = ""
-"""Name of the queue of what is never dropped."""
+"""Name of the queue of items that are never dropped."""
 
 _Queue = OrderedDict[Hashable, tuple[int, Event | BaseException]]
 """Key -> (number, event), in the order of arrival. The key is the number, or what only the newest counts of."""
@@ -26,7 +26,7 @@ _Queue = OrderedDict[Hashable, tuple[int, Event | BaseException]]
 class Inbox:
     """Queues of events from any thread to the one that owns the state.
 
-    Samples    `CAPACITY` per topic, then the oldest goes. Of topics whose samples each carry the whole state of
+    Samples    `CAPACITY` per topic, then the oldest goes. On topics whose samples each carry the whole state of
                their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
     Questions  `CAPACITY` per topic, then the oldest is refused. One whose asker has left is refused, too. One that
                is `Undecoded` is decoded in its turn.
@@ -46,7 +46,7 @@ class Inbox:
         owner in half the time that a Condition takes."""
         self._bell.acquire()
         self._asleep = False
-        """Whether `take` waits for the bell; whoever sets it to false releases the bell."""
+        """True if `take` waits for the bell; the thread that sets it to false releases the bell."""
         self._batch_taken = threading.Event()
         """Set when a batch is taken, and when the inbox closes."""
         self._unread_batches = 0

@@ -21,14 +21,14 @@ LONG_NS = 200_000_000
 _LOOK_AGAIN_S = 0.02
 """Time between two looks for a free slot: a tenth of the shortest job that queues."""
 _LONGEST_S = 20.0
-"""Nobody waits longer: the one whose turn it is may be stopped for good. Turns make jobs quick, not right."""
+"""Longest wait (s): the process whose turn it is may be stopped for ever. Turns make jobs quick, not right."""
 
 
 class JobSlots:
-    """Files of a folder which all processes of a run on one machine see; whoever has locked one has a turn. The
+    """Lock files in a folder which all processes of a run on one machine see; the holder of a lock has a turn. The
     system ends the turn of a process that dies.
 
-    folder     None, or one that cannot be written: nobody queues
+    folder     None, or one that cannot be written: no process queues
     most       turns at once; the processors that this process may use if not given
     longest_s  the longest wait
     """

@@ -1,4 +1,4 @@
-"""What every process does besides its work: shows that it is alive, names its run, publishes its counters."""
+"""Membership of a process: it shows that it is alive, names its run, and publishes its counters."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _MOST_STANDING, _MOST_OVER = 40, 20
 class Alarms:
     """The alarms of one process: those that last, 40 at most, and the newest 20 that are over.
 
-    They are told again with each `Stats`, so that one who begins to listen late knows them.
+    They are repeated with each `Stats`, so that a late subscriber knows them.
     """
 
     def __init__(self, before: Iterable[Alarm] = ()) -> None:
         self._standing: dict[tuple[str, str], Alarm] = {}
-        """(kind, about) -> what lasts. What lasted in an earlier life lasts no longer: this one says it anew."""
+        """(kind, about) -> what lasts. An alarm of an earlier life has ended: this life raises it again."""
         self._over: deque[Alarm] = deque((each for each in before if each.over_ns is not None), maxlen=_MOST_OVER)
 
     def happened(
@@ -64,13 +64,13 @@ class Alarms:
             self._over.append(msgspec.structs.replace(known, over_ns=max(now_ns, known.since_ns)))
 
     def last_of(self, kind: str, abouts: Collection[str], now_ns: int) -> None:
-        """Of this kind only these last: all others are over."""
+        """Keeps only these alarms of this kind open, and closes all others."""
         for standing, about in list(self._standing):
             if standing == kind and about not in abouts:
                 self.end(kind, about, now_ns)
 
     def current(self) -> list[Alarm]:
-        """What lasts, then what is over, each in order of time."""
+        """Returns open alarms, then closed ones, each in order of time."""
         return [*sorted(self._standing.values(), key=lambda alarm: alarm.since_ns), *self._over]
 
 
@@ -81,11 +81,12 @@ NO_RUN = ""
 """The run id of what belongs to no run: a router passes on all messages."""
 _TAG = "run-check"
 _MOST_STRANGERS = 256
-"""Strangers that are counted and named: whoever may put on the namespace can make up any number."""
+"""Foreign processes that are counted and named: any process that may put on the namespace can make up any
+number."""
 _RATE_LEAST_S = 0.5
 """Over a shorter time no rate is measured, as at the end."""
 _BEHIND_TICKS = 5
-"""A process that skips so many ticks in a second is behind."""
+"""Skipped ticks in a second from which on a process is behind."""
 
 
 class Member:
@@ -102,16 +103,16 @@ class Member:
     def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
         self.info = info
         self._before = before
-        """What earlier lives of this process have counted: those who hear of it late are told that, too."""
+        """Counts of earlier lives of this process, which late subscribers receive, too."""
         self.alarms = Alarms(() if before is None else before.alarms)
-        """What people should know that watch the run."""
+        """Alarms for people that watch the run."""
         self.counters = Counters()
-        """All that this process counts; never reset. What must not be is counted from 0, so that whoever watches
-        sees the first time."""
+        """All counters of this process; never reset. Counters of faults start at 0, so that a watcher sees the
+        first one."""
         for name in ("strangers", "plugin_failed"):
             self.counters.count(name, 0)
         self.web_port = 0
-        """Where people can look at this process. Told each second: whoever begins to listen later hears it, too."""
+        """Port of this process's web page. Published each second, for late subscribers."""
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
@@ -124,11 +125,11 @@ class Member:
         # Whether another process of this run has ever answered: from then on no answer ends this one.
         self._confirmed = info.run_id == NO_RUN
         self._linked = True
-        """Whether the router is reached; a bus opens with its link."""
+        """True if the router is reached; a bus opens with its link."""
         self._asked_all = self._confirmed
-        """Whether a round of answers has ended, in which no other run was alone."""
+        """True if a round of replies has ended in which no other run was alone."""
         self._needs: list[tuple[str, Callable[[], bool]]] = []
-        # What the round of answers that is coming in has told: the first that differs, in words.
+        # The first differing reply of the current round, in words.
         self._differs: RunMismatchError | None = None
         # Processes which were named already, and sentences that the next tick publishes.
         self._strangers: set[Peer] = set()
@@ -143,7 +144,7 @@ class Member:
         self._needs.append((what, met))
 
     def lacks(self) -> list[str]:
-        """What the process needs and is not there: link, run, and what was named by `needs`. Changes nothing."""
+        """Returns the missing needs of the process: link, run, and the names in `needs`. Changes nothing."""
         own = [("its router", self._linked), ("word of its run", self._asked_all)]
         return [what for what, met in own if not met] + [what for what, met in self._needs if not met()]
 
@@ -162,7 +163,8 @@ class Member:
         self.join()
 
     def on_member_event(self, event: Event) -> bool:
-        """Whether the event was about membership only and is done with. Raises RunMismatchError."""
+        """Returns True if the event was about membership only, and needs no other handler. Raises
+        RunMismatchError."""
         match event:
             case Asked(topic=topic) if topic is RUN:
                 event.answer(msgspec.structs.replace(self.info, now_ns=self._now_ns))

@@ -1,4 +1,5 @@
-"""An operator's orders to a running swarm: each returns when those concerned have answered, and names who has not.
+"""An operator's orders to a running swarm: each returns when the processes concerned have replied, and names those
+that have not.
 
 A keeper takes an order in, puts it on its disk and tells everybody; then every process that the order concerns is
 asked to answer as soon as it obeys.
@@ -33,16 +34,16 @@ _LEAVE_S = 0.3
 _MOST_REPLIES = 1 << 16
 """More than any swarm has processes, tiles with marks or orders: who floods a question fills no memory."""
 _MOST_SEEN = 1 << 12
-"""Whoever holds a certificate may raise tokens of any number of lives, one after the other."""
+"""The holder of a certificate may raise tokens of any number of lives, one after the other."""
 
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """What became of an order.
+    """Result of an order.
 
     obeyed  processes that obey, as role-id, and how many seconds after the order each said so
     silent  those which it concerns and that have not said so in time: they will obey once they hear a keeper.
-            Who has left since is not among them
+            Processes that have left since are not among them
     """
 
     obeyed: dict[str, float] = field(default_factory=dict)
@@ -59,7 +60,7 @@ class Operator:
         self._bus = bus
         self._patience_s = patience_s
         self._roster: Roster | None = None
-        """Whose tokens are up, once they are watched; guarded by `_lock`."""
+        """Processes with tokens, once they are watched; guarded by `_lock`."""
         self._seen: set[tuple[str, str]] = set()
         """(role, id) of all whose tokens ever were, guarded likewise."""
         self._lock = threading.Lock()
@@ -80,7 +81,7 @@ class Operator:
         return zones, self._obeyed(Obey(author=author, sets=zones.sets), members, began_s)
 
     def orders(self) -> Orders:
-        """What is ordered. Raises BusError without a keeper."""
+        """Returns the orders in force. Raises BusError without a keeper."""
         reply = self._order(GIVE_ORDER, GiveOrder(), self._keeper())
         assert isinstance(reply, Orders)
         return reply
@@ -143,7 +144,7 @@ class Operator:
             match inbox.take(0.1):
                 case Replied(message=Obeyed() as who):
                     obeyed.setdefault(f"{who.role}-{who.id}", time.monotonic() - began_s)
-                case AskEnded():  # also where who has not answered yet leaves: its token falls just then
+                case AskEnded():  # also if a process that has not replied yet leaves: its token falls just then
                     deadline_s = min(deadline_s, time.monotonic() + _LEAVE_S)
             concerned -= self._who_left() - obeyed.keys()
             if concerned <= obeyed.keys():
@@ -177,7 +178,7 @@ def replies_to(
 ) -> tuple[list[Message], str | None]:
     """Asks, waits for all answers, and returns (replies, why there are no more).
 
-    at_most  replies are kept; what comes beyond them is dropped
+    at_most  replies are kept; further ones are dropped
     fields   of the topic's key
     """
     inbox = Inbox()

@@ -1,4 +1,4 @@
-"""What operators have ordered and not taken back: the newest order about each subject. Pure.
+"""Orders in force: the newest order about each subject. Pure.
 
 A state-based register map: of two orders about one subject the one with the later stamp counts, of two with one
 stamp that of the larger content, so the order, grouping and repetition in which books arrive cannot matter. An
@@ -16,7 +16,7 @@ from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.wire.messages.orders import GiveOrder, Order, Subject
 
 MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
-"""An order stamped further ahead of the reader's clock is refused, as nobody could take it back."""
+"""An order with a timestamp further ahead of the reader's clock is refused, because no operator could revoke it."""
 MOST_ORDERS = 1999
 """Beside a pause, for which there is always room."""
 
@@ -60,7 +60,7 @@ class OrderBook:
         return None if order is None or order.off else order
 
     def knows(self, subject: Subject, name: str, stamp_ns: int) -> bool:
-        """Whether an order of this stamp about the subject, or a later one, is in the book."""
+        """Returns True if an order of this timestamp about the subject, or a later one, is in the book."""
         order = self._orders.get((subject, name))
         return order is not None and order.stamp_ns >= stamp_ns
 
@@ -71,7 +71,7 @@ class OrderBook:
 
     @property
     def standing(self) -> list[str]:
-        """In words, what is ordered and not taken back."""
+        """Returns the orders in force, in words."""
         stands = (order for order in self if not order.off or (order.subject == "target" and not order.added))
         return [described(order) for order in stands]
 
@@ -82,7 +82,7 @@ class OrderBook:
         return self.about("pause") is not None
 
     def stopped(self, vehicle: str) -> bool:
-        """Whether a vehicle is to stand."""
+        """Returns True if a vehicle is ordered to stop."""
         return bool(self._orders) and (self.paused or self.about("vehicle", vehicle) is not None)
 
     def setting(self, name: str, usual: float) -> float:

@@ -1,4 +1,4 @@
-"""A process's side of orders: it knows what is ordered, and answers who asks whether it obeys, once it does."""
+"""A process's side of orders: it knows the orders in force, and replies once it obeys."""
 
 from __future__ import annotations
 
@@ -22,22 +22,21 @@ _ASK_S = 2.0
 _ASKS_OF_KEEPERS = 2
 """Questions to keepers alone, before everybody is asked: a keeper knows best, others may know as much."""
 _ASKS_OF_NOBODY = 4
-"""So many asks, a second in all, that reached nobody who knows: a keeper may start a little later than others."""
+"""Queries, one per second, that no informed process answered: a keeper may start a little later than others."""
 _ASKS = 10
-"""So many that were not answered in time, though somebody is there."""
+"""Queries without a timely reply, although a process is there."""
 
 
 class OrderClient:
     """The orders that a process goes by, and the queries of operators that wait until it does.
 
-    A process that starts asks keepers for their book; where none answers, everybody; where nobody answers, it goes
+    A process that starts asks keepers for their book. If none replies, it asks all; if no process replies, it goes
     on without. Later it hears keepers once a second.
 
     obeys  whether the process goes by an order that it knows
 
     book   the orders
-    known  whether a book was told, or nobody is there who could: until then nothing moves, as the swarm may be
-           paused
+    known  whether a book was received, or no process has one: until then nothing moves, as the swarm may be paused
     """
 
     def __init__(
@@ -62,7 +61,7 @@ class OrderClient:
         self._ask(now_ns)
 
     def on_order_event(self, event: Event, now_ns: int) -> bool:
-        """Whether the event was about orders, and is done with."""
+        """Returns True if the event was about orders, and needs no other handler."""
         match event:
             case Heard(message=Orders() as orders) | Replied(message=Orders() as orders):
                 self.known = True
@@ -87,7 +86,7 @@ class OrderClient:
         return True
 
     def tick(self, now_ns: int) -> None:
-        """Ask again what is ordered if nobody has told, and answer those whose order is obeyed by now."""
+        """Repeats the query for orders if there was no reply, and replies to orders that are obeyed by now."""
         if not self.known and not self._asking and now_ns >= self._ask_due_ns:
             self._ask(now_ns)
         self._answer()

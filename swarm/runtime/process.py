@@ -64,7 +64,7 @@ class Service(Protocol):
     def counters(self) -> Counters: ...
 
     def lacks(self) -> Sequence[str]:
-        """What its role needs and is not there, one short text each; empty if it is ready. Changes nothing."""
+        """Returns the missing needs of its role, one short text each; empty if it is ready. Changes nothing."""
         ...
 
     def start(self, now_ns: int) -> None:
@@ -76,7 +76,7 @@ class Service(Protocol):
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Do what is due by time. Called `tick_hz` times a second, less often under load."""
+        """Does all work that is due. Called `tick_hz` times a second, less often under load."""
         ...
 
     def stop(self, now_ns: int) -> None:
@@ -89,7 +89,7 @@ class ThreadWorker:
     in a job is raised in the process's own thread, by its next `take`.
 
     The first job is as urgent as the process: until its result is there, the process has nothing to answer from.
-    Later jobs give way to whoever answers or drives. A thread cannot become more urgent again.
+    Later jobs yield to threads that answer or drive. A thread cannot become more urgent again.
 
     turns  in which long jobs of this machine are run; each at once if not given
     """
@@ -98,7 +98,7 @@ class ThreadWorker:
         self._inbox = inbox
         self._turns = turns or JobSlots(None)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        """What is to be run; None ends the thread."""
+        """Jobs to run; None ends the thread."""
         self._closed = False
         # A daemon, because the interpreter waits at its exit for all other threads, however long a kernel takes.
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
@@ -125,8 +125,8 @@ class ThreadWorker:
                 _give_way()
 
     def close(self) -> None:
-        """Begin no other job. The one in hand is left to itself: nobody waits for it, and the process's end ends
-        it."""
+        """Begin no other job. The current job is abandoned: `close` does not wait for it, and the process's end
+        ends it."""
         self._closed = True
         self._jobs.put(None)
 
@@ -140,7 +140,8 @@ def _give_way() -> None:
 
 
 def tick_phase(id: str) -> float:
-    """Where in their period the ticks of a process fall, from 0 to 1: processes of one kind must not tick together.
+    """Returns the phase of a process's ticks in their period, from 0 to 1: processes of one kind must not tick
+    together.
 
     Their ids differ by a number. Its multiples of the golden ratio lie spread, however many there are (Knuth, The
     Art of Computer Programming, vol. 3, 6.4, theorem S).
@@ -155,7 +156,7 @@ class Process:
     tick_hz  ticks a second; those that come too late are dropped and counted (`ticks_dropped`). `ticks_late` counts
              these and those that come later than half a period after they were due
     phase    where in the clock's periods all ticks but the first fall, from 0 to 1; if None, where that falls
-    health   what is told of the loop and of what the service lacks; None: nobody wants to know
+    health   receives the health of the loop and the missing needs of the service; None: no reports
     """
 
     def __init__(
@@ -193,11 +194,11 @@ class Process:
             signal.signal(number, lambda *_: self.stop())
 
     def run(self) -> None:
-        """Start the service, loop, stop it. Of ticks that are late one is taken and the others are counted as
-        dropped. Raises what the service, a worker's job or any other thread raised, after stopping the service.
+        """Start the service, loop, stop it. Of several late ticks one is run and the others are counted as dropped.
+        Raises what the service, a worker's job or any other thread raised, after stopping the service.
 
         Ticks and events share the thread: while events wait, they get at least as long as the last tick took before
-        the next one is taken. So a tick that takes its whole period halves its rate and starves no event.
+        the next one is taken. A tick that takes its whole period therefore halves its rate, and delays no event.
         """
         with _failing_with_threads(self._inbox):
             self._run()
@@ -281,7 +282,7 @@ def _failing_with_threads(inbox: Inbox) -> Iterator[None]:
 def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_s: float = 3.0) -> None:
     """Stop when the parent process ends; after `grace_s` more seconds end this process with exit code 1.
 
-    parent_gone  blocks until the parent is gone, as `wait([parent_process().sentinel])` does
+    parent_gone  blocks until the parent has ended, as `wait([parent_process().sentinel])` does
     """
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""What a process is started with: the same for every role, live or simulated."""
+"""Arguments of a process: the same for every role, live or simulated."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class RoleSetup:
     added        of an agent that the scenario does not name: what it hosts
     restarts     how often it was started before in this run
     before       what its earlier lives have counted; None if that is not known
-    anew         whether the run begins with it: nobody has seen an earlier life of it
+    anew         True if the run begins with it: there was no earlier life of it
     takes_over   whether the life before it may still run on this machine, and ends soon
     record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
-    health         what its loop tells of itself; None: nobody wants to know
+    health         receives the health of its loop; None: no reports
     """
 
     scenario: Scenario
@@ -47,7 +47,7 @@ class RoleSetup:
     health: Health | None = None
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
-        """What this process answers when others ask which run it belongs to."""
+        """Returns this process's reply to the question which run it belongs to."""
         return RunInfo(
             run_id=self.run_id,
             role=self.role,

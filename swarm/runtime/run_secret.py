@@ -12,11 +12,11 @@ from swarm.errors import ConfigError
 from swarm.wire.access import Authenticator
 
 _SECRET_BYTES = 32
-"""As many bits as the hash by which codes are made has."""
+"""As many bits as the hash that makes the codes."""
 
 
 def authenticator_of(network: NetworkConfig, run_id: str) -> Authenticator | None:
-    """What makes and checks the codes of a run; None where certificates say who speaks.
+    """Returns the object that makes and checks codes of a run; None if certificates identify senders.
 
     Raises ConfigError where the secret cannot be read or made, or others may read it.
     """
@@ -24,7 +24,7 @@ def authenticator_of(network: NetworkConfig, run_id: str) -> Authenticator | Non
 
 
 def state_folder() -> Path:
-    """Where this user's swarms keep what survives runs."""
+    """Returns the folder for state of this user's swarms that outlives runs."""
     state = os.environ.get("XDG_STATE_HOME", "")
     base = Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state"
     return base / "terrain-swarm"

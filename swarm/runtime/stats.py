@@ -65,7 +65,8 @@ class Histogram:
         self.buckets[bucket] = self.buckets.get(bucket, 0) + times
 
     def add_all(self, values: NDArray[np.float64]) -> None:
-        """As `add` of each, the positive ones first and in order: the order of buckets reaches the wire."""
+        """Like `add` for each value, the positive ones first and in order: the order of buckets reaches the
+        wire."""
         values = values[np.isfinite(values)]
         positive = values[values > 0]
         found = np.minimum(np.rint(np.log(positive) / _LOG_BASE), TOP_BUCKET).astype(np.int64)
@@ -153,7 +154,7 @@ def _merged_each(
 
 
 class Counters:
-    """What a process counts, measures and times, by name. Names carry units: `route_query_ms`.
+    """Counts, measured values and times of a process, by name. Names carry units: `route_query_ms`.
 
     Used by the thread that owns the service only; published by `Member` and never reset.
     """
@@ -185,7 +186,7 @@ class Counters:
         self.counts[name] = self.counts.get(name, 0) + by
 
     def set_counts(self, counts: Mapping[str, int]) -> None:
-        """Take over what somebody else counts, under its names."""
+        """Copies counters of another object, under its names."""
         self.counts.update(counts)
 
     def gauge(self, name: str, value: float) -> None:

@@ -4,18 +4,18 @@ Every receiver of poses decides by this rule alone, from the poses that it has h
 
 1. A tracker lives from the arrival of a pose until the lease in it has passed. A pose with a lease of 0 hands the
    target over: its tracker lives no longer.
-2. Of the lives of one tracker, which have one name, the latest incarnation that lives speaks for it.
-3. Of the trackers that live, the one which has tracked the target for the longest time owns it. Trackers which
-   began within `SAME_NS` of each other are ordered by name.
+2. Of the lives of one tracker, which have one name, the latest incarnation that lives counts.
+3. Of the living trackers, the one which has tracked the target for the longest time owns it. Trackers which began
+   within `SAME_NS` of each other are ordered by name.
 
 The owner's poses count; those of others are refused. Leases are counted from the arrival, by the receiver's
 clock, and how long a tracker has tracked is the difference of two times of its own clock: no clock is compared with
 another.
 
-The rule looks at those only who live. So receivers which have heard different things, or the same in another
-order, agree again as soon as each has heard a pose of every tracker that lives: seniority as in the oldest member
-of a process group (Birman, Joseph 1987), not the first that each happened to hear. What it costs: a tracker that
-was silent for longer than its lease gets its target back when it returns with the same incarnation.
+The rule looks at those only who live. Receivers which have received different messages, or the same in another
+order, agree again once each has received a pose of every living tracker. This is seniority as in the oldest member
+of a process group (Birman, Joseph 1987), not the first that each happened to receive. Cost: a tracker that was
+silent for longer than its lease gets its target back when it returns with the same incarnation.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ SAME_NS = 3 * NS_PER_S // 4
 LONGEST_AGE_NS = 366 * 86_400 * NS_PER_S
 """A tracker that has tracked for longer has no clock, or gives no time as its incarnation: others come first."""
 MOST_LIVES = 16
-"""Of trackers of one target, remembered. Of more that live the youngest are refused."""
+"""Limit for the remembered trackers of one target. Of more living trackers the youngest are refused."""
 _MOST_TARGETS = 4096
-"""Targets of which anything is remembered: whoever may put poses can make up any number."""
+"""Limit for the targets that are remembered: any process that may put poses can make up any number."""
 
 
 class Verdict(Enum):
-    """What a receiver makes of a pose."""
+    """Result of checking a pose."""
 
     COUNTS = "counts"
     """It is the owner's, and news."""
     LATE = "late"
-    """Its tracker has told a newer one before."""
+    """Its tracker has published a newer one before."""
     REFUSED = "refused"
     """Another tracker owns the target."""
     OUTSIDE = "outside"
@@ -75,7 +75,7 @@ class _Life:
 
 
 class Tracking:
-    """What one receiver knows about the trackers of one target."""
+    """Trackers of one target, as one receiver knows them."""
 
     def __init__(self, grid: GridSpec) -> None:
         self.pose: TargetPose | None = None
@@ -86,10 +86,10 @@ class Tracking:
         self._until_ns = 0
         """When the last lease ends."""
         self._lives: dict[tuple[str | None, int], _Life] = {}
-        """Also those which have ended, so that what comes late is known."""
+        """Includes ended lives, so that late poses are recognised."""
 
     def lost(self, now_ns: int) -> bool:
-        """Whether no tracker lives: the target was where `pose` says, and may be anywhere."""
+        """True if no tracker lives: `pose` is the last known position."""
         return self.pose is not None and now_ns >= self._until_ns
 
     def age_ns(self, now_ns: int) -> int | None:
@@ -145,7 +145,7 @@ class Tracking:
 
 
 class Trackings:
-    """The trackers of many targets. Of targets beyond 4096 nothing is known, and all is refused."""
+    """The trackers of many targets. For targets beyond 4096 there is no state, and all poses are refused."""
 
     def __init__(self, grid: GridSpec) -> None:
         self._grid = grid
@@ -164,14 +164,14 @@ class Trackings:
         return tracking.pose if verdict is Verdict.COUNTS else None
 
     def place(self, pose: TargetPose, now_ns: int) -> None:
-        """As `Tracking.place`, of any target."""
+        """Like `Tracking.place`, for any target."""
         if pose.target not in self._of and len(self._of) < _MOST_TARGETS and 0 <= pose.cell < self._grid.cells:
             self._of[pose.target] = Tracking(self._grid)
         if (tracking := self._of.get(pose.target)) is not None:
             tracking.place(pose, now_ns)
 
     def of(self, target: str) -> Tracking | None:
-        """What is known of a target's trackers; None before its first pose."""
+        """Returns the state of a target's trackers; None before its first pose."""
         return self._of.get(target)
 
     def lost(self, now_ns: int) -> set[str]:
@@ -180,8 +180,8 @@ class Trackings:
 
 
 def _is_late(seq: int, life: _Life, now_ns: int) -> bool:
-    """As `swarm.liveness.Newest`: after a silence any other number is news, so that no pose outweighs all that
-    follow it."""
+    """As `swarm.liveness.Newest`: after a silence any other number counts as new, so that no pose outweighs all
+    later ones."""
     return seq == life.seq or (seq < life.seq and now_ns - life.heard_ns < POSE_SILENCE_NS)
 
 
@@ -207,7 +207,7 @@ def _oldest(living: list[_Life]) -> _Life | None:
 
 
 def _is_elder(life: _Life, first_ns: int | None) -> bool:
-    """Whether nobody began clearly before it."""
+    """Returns True if no tracker began clearly before it."""
     if first_ns is None:
         return True  # of none is it known when it began
     return life.began_ns is not None and life.began_ns - first_ns < SAME_NS

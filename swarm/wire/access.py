@@ -1,11 +1,11 @@
-"""Who may do what with a topic, which is a column of the table of topics; and codes that show who said something.
+"""Access rules per topic, which are a column of the table of topics; and codes that authenticate the sender.
 
-A router grants by these rules, so they are complete: what no topic grants, nobody may do. A router itself passes on
-everybody's messages, may therefore do everything, and is named nowhere.
+A router enforces these rules, so they are complete: it denies everything that no topic grants. A router itself
+passes on everybody's messages, may therefore do everything, and is named nowhere.
 
 On a topic where a false message would harm, a message counts only with a code that the processes of one run alone
-can make (decision 32): a keyed BLAKE2b (RFC 7693) of the key, of what was asked if it is an answer, and of the
-payload. It travels beside the payload, as Zenoh's attachment, so who has no secret may still read.
+can make (decision 32). The code is a keyed BLAKE2b (RFC 7693) of the key, the query if it is a reply, and the
+payload. It travels beside the payload, as Zenoh's attachment, so a process without the secret may still read.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Grant:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may do what, as the router enforces it.
+    """Access rules of a topic, as the router enforces them.
 
     put    publish a value
     serve  declare a queryable and reply
@@ -61,8 +61,8 @@ class Access:
 
 def access(*, put: str = "", serve: str = "", ask: str = "", hear: str = "") -> Access:
     """Access from roles separated by blanks, each with the fields of the key that must be its own after a colon:
-    `put="agent:author keeper"`. Operators may hear what is put and ask what is served, always. Raises ValueError on
-    an unknown role."""
+    `put="agent:author keeper"`. Operators may always subscribe to published topics and query served ones. Raises
+    ValueError on an unknown role."""
     return Access(
         put=_grants(put),
         serve=_grants(serve),
@@ -82,14 +82,14 @@ def _grants(text: str) -> tuple[Grant, ...]:
 
 
 _CODE_BYTES = 16
-"""128 bits, which nobody guesses; half of them would do for a run of hours."""
+"""128 bits, which cannot be guessed; half of them would do for a run of hours."""
 
 
 class Authenticator:
     """Makes and checks the codes of one run.
 
-    secret  what the processes of the run share and nobody else knows
-    run_id  of the run: what was said in another one does not count
+    secret  shared by the processes of the run, and by no others
+    run_id  of the run: messages of another run do not count
     """
 
     def __init__(self, secret: bytes, run_id: str) -> None:
@@ -107,7 +107,7 @@ class Authenticator:
 def code_of(
     authenticator: Authenticator | None, topic: Topic, key: str, payload: bytes, asked: bytes = b""
 ) -> bytes | None:
-    """What to send beside a payload: its code, on a trusted topic; None where no secret is shared."""
+    """Returns the attachment of a payload: its code, on a trusted topic; None if no secret is shared."""
     return authenticator.code(key, payload, asked) if authenticator is not None and topic.trusted else None
 
 

@@ -1,4 +1,4 @@
-"""Messages to bytes and back, by msgspec; msgpack reads what is long, and says what is wrong with the rest.
+"""Codec of messages: msgspec reads and writes them; msgpack reads long ones, and explains invalid ones.
 
 People and their tools write and read JSON instead, or parameters of a selector. JSON follows the annotations of a
 message's fields, as the checks do: a column of numbers is a list of numbers, other bytes are a list of bytes,
@@ -47,7 +47,7 @@ N = TypeVar("N", bound=Message)
 _ENCODER = msgspec.msgpack.Encoder()
 _SCHEMA = b"\xa6schema"
 _BYTES = (bytes,)
-"""What msgspec leaves as it is, because msgpack has a type of its own for it (JSON, its default, has not)."""
+"""Types that msgspec leaves as they are, because msgpack has its own type for them (JSON, its default, has not)."""
 _LIMITS: dict[str, Any] = {
     "strict_map_key": False,  # histograms are maps from int
     "max_str_len": 1 << 16,
@@ -55,12 +55,12 @@ _LIMITS: dict[str, Any] = {
     "max_ext_len": 0,
 }
 _STEPS = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
-"""Of a path such as `held.cells[3]`: names and indices."""
+"""Parts of a path such as `held.cells[3]`: names and indices."""
 _MANY_SETS = 8
-"""From so many sets of marks on, checking them as arrays is faster than one by one."""
+"""Number of mark sets from which on checking them as arrays is faster than one by one."""
 _STATEMENT_COLUMNS = ("cells", "kinds", "paces", "stamps_ns")
 _DECODERS: dict[type[Message], msgspec.msgpack.Decoder[Any]] = {}
-"""Of each message type that was decoded so far."""
+"""Decoders of the message types decoded up to now."""
 
 
 def encode(message: Message) -> bytes:
@@ -71,12 +71,12 @@ def encode(message: Message) -> bytes:
 
 
 def decode(payload: bytes, message_type: type[M]) -> M:
-    """The message in a payload. Raises ProtocolError, and nothing else, on what is not one."""
+    """The message in a payload. Raises ProtocolError, and nothing else, on an invalid one."""
     return _checked(_read(payload, message_type))
 
 
 def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | N:
-    """As `decode`, of a payload that is of type `other` if its schema says so, else of type `usual`."""
+    """Like `decode`, for a payload that is of type `other` if its schema says so, else of type `usual`."""
     if other is not None and _unpacked(payload)["schema"] in read_schemas(other):
         return decode(payload, other)
     return decode(payload, usual)
@@ -85,10 +85,10 @@ def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | 
 def _read(payload: bytes, message_type: type[M]) -> M:
     """The message in a payload, its types and ranges checked. Raises ProtocolError.
 
-    What a swarm sends is short and right, and msgspec reads it at once; `MAX_ITEMS` bytes cannot hold more items
-    than a payload may. A longer one goes the long way, so that its items are counted; one that msgspec refuses, so
-    that the error says which field is wrong and what was found; and one that does not begin with its schema, as
-    msgspec takes a tag that is missing for the right one.
+    Messages of a swarm are short and valid, and msgspec reads them directly; `MAX_ITEMS` bytes cannot hold more
+    items than a payload may. Three kinds take the slow path: a longer one, to count its items; one that msgspec
+    refuses, to name the wrong field and its value; and one that does not begin with its schema, as msgspec accepts
+    a missing tag as the right one.
     """
     if len(payload) <= MAX_ITEMS and _begins_with_schema(payload):
         decoder = _DECODERS.get(message_type) or _DECODERS.setdefault(
@@ -103,12 +103,13 @@ def _read(payload: bytes, message_type: type[M]) -> M:
 
 
 def _begins_with_schema(payload: bytes) -> bool:
-    """Whether it is a map whose first key is "schema", as `encode` writes it."""
+    """Returns True if it is a map whose first key is "schema", as `encode` writes it."""
     return payload.startswith(_SCHEMA, 1 if payload[:1] < b"\x90" else 3)
 
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
-    """As `decode` of each payload, errors in place. The statements of many mark sets are checked at once."""
+    """Like `decode` for each payload, with errors in place. The statements of many mark sets are checked at
+    once."""
     at_once = len(payloads) >= _MANY_SETS and numpy_loaded()
     found: list[M | ProtocolError] = []
     unchecked: list[tuple[int, MarkSet]] = []
@@ -181,12 +182,12 @@ def _converted(fields: dict[Any, Any], message_type: type[M]) -> M:
 
 
 def field_fault(error: Exception, fields: Mapping[Any, Any]) -> str:
-    """What msgspec finds wrong with fields, as a sentence: which it is, what was expected, what was found."""
+    """Returns msgspec's fault of a field, as a sentence: its name, the value expected and the value found."""
     expected, _, place = str(error).partition(" - at `$")
     path = place.rstrip("`").lstrip(".")
     if not path:
         return (expected or type(error).__name__)[:300]
-    if expected.startswith("Invalid"):  # says itself what was found
+    if expected.startswith("Invalid"):  # states the value found itself
         return f"{path}: {expected}"[:300]
     found: Any = fields
     try:
@@ -231,7 +232,8 @@ _QUOTED = 60
 
 
 def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
-    """The request in a selector such as `?row=40&col=200`. Raises ProtocolError on what does not fit."""
+    """The request in a selector such as `?row=40&col=200`. Raises ProtocolError on a parameter that does not
+    fit."""
     fields = {key: value for key, value in parameters.items() if key != "format"}
     allowed = message_type.__struct_fields__
     unknown = sorted(set(fields) - set(allowed))
@@ -251,7 +253,7 @@ def may_be_json(payload: bytes) -> bool:
 def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str, str] | None = None) -> bytes:
     """The MessagePack of a message written as JSON: what `decode` reads. Raises ProtocolError, and nothing else.
 
-    `schema` may be left out, as the key says what is meant.
+    `schema` may be left out, as the key implies it.
 
     named  the fields of the key, which may be left out as well
     """
@@ -301,8 +303,8 @@ def _hints_of(struct: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def _turned(value: Any, hint: Any, place: str, turn: Callable[[Any, Column, str], Any]) -> Any:
-    """A value from MessagePack's form to JSON's or back, by its type. What does not fit the type stays as it is,
-    for the decoder to refuse.
+    """A value from MessagePack's form to JSON's or back, by its type. A value that does not fit the type stays as
+    it is, for the decoder to refuse.
 
     place  of the value in its message, for errors
     turn   how columns are turned, and with them the whole: `_listed_column` or `_packed_column`
@@ -349,7 +351,7 @@ _DIRECTION_COLUMN = taken_apart(Directions)[1][-1]
 
 
 def _layout_of(column: Column) -> tuple[struct.Struct, list[str] | None]:
-    """How the values or rows of a column are packed; the types in a row, None where there are single values."""
+    """Returns the packing of a column's values or rows; the types in a row, None for single values."""
     row = [part for _, part in column.dtype] if isinstance(column.dtype, tuple) else None
     return struct.Struct("<" + "".join(CODES[part] for part in row or [str(column.dtype)])), row
 

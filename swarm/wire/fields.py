@@ -83,7 +83,7 @@ class Column:
     checked: bool = True
 
     def describe(self) -> str:
-        """As in the reference of the wire: "column of float32, 0 ... inf"."""
+        """Returns the text for the reference of the wire: "column of float32, 0 ... inf"."""
         dtype = self.dtype
         name = f"column of {name_of(dtype)}" if isinstance(dtype, str) else f"rows of {width_of(dtype)} bytes"
         return name + (f", one for each of `{self.per}`" if self.per else "")
@@ -105,7 +105,7 @@ StampNs = Annotated[int, Meta(ge=0, lt=1 << 62)]
 Incarnation = Annotated[int, Meta(ge=0, lt=1 << 62)]
 """The time at which a process started, which tells its lives apart."""
 Count = Annotated[int, Meta(ge=0, lt=1 << 53)]
-"""How often something happened: what a float64 counts exactly."""
+"""Number of occurrences, exact in a float64."""
 Metres = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """A place in the map frame. Rejects infinities and NaN."""
 Distance = Annotated[float, Meta(ge=0, le=1e9)]
@@ -119,28 +119,28 @@ Cost = Annotated[float, Meta(ge=0), OR_INFINITE]
 FiniteCost = Annotated[float, Meta(ge=0, le=1e18)]
 """Seconds of travel along a way that there is."""
 Millis = Annotated[float, Meta(ge=0, le=1e12)]
-"""What something took, in ms."""
+"""Duration, in ms."""
 AgeMillis = Annotated[float, Meta(ge=0), OR_INFINITE]
-"""How old something is, in ms; inf while it is not there yet."""
+"""Age in ms; inf if it does not exist yet."""
 LONGEST_LEASE_S = 60.0
 """For so long a single lie may stand."""
 LeaseSeconds = Annotated[float, Meta(ge=0, le=LONGEST_LEASE_S)]
 """For how long a sender counts as alive after each message."""
 AgeSeconds = Annotated[float, Meta(ge=0, le=1e10)]
-"""How long ago something was heard."""
+"""Time since a message was received (s)."""
 Gap = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Cost over optimum or lower bound: 1 but for rounding, or more; inf is nothing proven."""
 WebPort = Annotated[int, Meta(ge=0, le=65535)]
 """A page of the sender's own machine; 0 is none."""
 Gauge = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
-"""What a process measured of itself: any finite number."""
+"""Measured value of a process: any finite number."""
 
 GridSide = Annotated[int, Meta(ge=1, le=1 << 16)]
 """Rows or columns of a grid."""
 GridSideOrNone = Annotated[int, Meta(ge=0, le=1 << 16)]
-"""As `GridSide`; 0 of a process that has no grid."""
+"""Like `GridSide`; 0 for a process without a grid."""
 Cell = Annotated[int, Meta(ge=-(1 << 31), lt=1 << 32)]
-"""A cell, row or column to which somebody refers. It may lie outside the grid, which messages do not know."""
+"""A cell, row or column in a reference. It may lie outside the grid, which messages do not know."""
 CellIndex = Annotated[int, Meta(ge=0, lt=1 << 32)]
 """A cell in which something is: not negative, which Python would count from the end."""
 Tile = Annotated[int, Meta(ge=0, lt=1 << 22)]
@@ -160,7 +160,7 @@ Bucket = Annotated[int, Meta(ge=ZERO_BUCKET, le=TOP_BUCKET)]
 
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 Id = Annotated[str, Meta(min_length=1, max_length=64), Characters(_ID)]
-"""What can be one chunk of a key: 1 to 64 of letters, digits, '_', '.', '-'."""
+"""One chunk of a key: 1 to 64 of letters, digits, '_', '.', '-'."""
 VehicleId = Id
 Word = Annotated[str, Meta(max_length=100)]
 """A name, of a counter or a strategy, or what kind of note it is."""
@@ -175,10 +175,10 @@ LongText = Annotated[str, Meta(max_length=1 << 16)]
 Directions = Annotated[bytes, Meta(max_length=4 << 20), Column("<u1", least=0, most=7)]
 """One code 0..7 per step, clockwise from north. No planner gives more steps in one answer."""
 Legs = Annotated[bytes, Meta(max_length=4 << 20), Column("<u4", least=1, most=8 << 20)]
-"""Of the straight segments of pulled routes, over how many steps each goes."""
+"""Number of steps of each straight segment of any-angle routes."""
 
 MOST_VEHICLES = 1000
-"""Of one agent: what a scenario may say at most."""
+"""Limit for one agent: the largest number in a scenario."""
 MOST_IDS = 1 << 12
 """Agents, authors or targets in one message."""
 SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=100_000)
@@ -192,7 +192,7 @@ def width_of(dtype: str | tuple[tuple[str, str], ...]) -> int:
 
 
 def name_of(dtype: str) -> str:
-    """As people say it: float32 for "<f4"."""
+    """Returns the name for people: float32 for "<f4"."""
     return {"u": "uint", "i": "int", "f": "float"}[dtype[1]] + str(8 * width_of(dtype))
 
 
@@ -247,7 +247,7 @@ class Bounded(msgspec.Struct, frozen=True):
         Bounded.__post_init__(self)
 
     def relate(self) -> None:
-        """Raise ValueError where fields contradict each other. What one field says alone is in its type."""
+        """Raise ValueError where fields contradict each other. Rules of a single field are in its type."""
 
 
 class Part(msgspec.Struct, frozen=True):
@@ -257,7 +257,7 @@ class Part(msgspec.Struct, frozen=True):
 
 Rule = Callable[[Any], None]
 _RULES: dict[type[Bounded], tuple[Rule, ...]] = {}
-"""Of each struct type that was made so far."""
+"""Rules of each struct type made up to now."""
 
 
 def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class RouteStatus(enum.StrEnum):
-    """Whether a planner has a route from a cell, and why not."""
+    """State of a route from a cell: found, or the reason why not."""
 
     OK = "ok"
     UNREACHABLE = "unreachable"
@@ -47,8 +47,8 @@ class RouteStatus(enum.StrEnum):
     NO_TARGET = "no_target"
     """The planner does not know yet where the target is, or it stands on a lethal cell or outside."""
     SEARCHING = "searching"
-    """Nobody sees the target: the route leads to a place where it may be, and nothing is proven of it. At its end
-    ask again. Without steps and with an infinite cost no place has been found yet: ask later."""
+    """The target is unseen: the route leads to a cell where it may be, without a proven bound. At its end ask
+    again. Without steps and with an infinite cost no place has been found yet: ask later."""
 
 
 STATUSES = tuple(RouteStatus)
@@ -86,7 +86,7 @@ class Route(Bounded, frozen=True, kw_only=True):
 
     @property
     def turns(self) -> tuple[int, ...]:
-        """Of a pulled route the indices of the cells in which it turns, its first and last included; else empty."""
+        """Indices of the cells in which an any-angle route turns, its first and last included; else empty."""
         return tuple(accumulate(_listed(self.legs, "I"), initial=0)) if self.legs else ()
 
     @property
@@ -98,7 +98,7 @@ class Route(Bounded, frozen=True, kw_only=True):
 
 
 class RouteOutline(NamedTuple):
-    """Some fields of a `Route`, unchecked: what somebody may know of it already."""
+    """Some fields of a `Route`, unchecked, to recognise a known route."""
 
     status: RouteStatus
     start: int
@@ -171,7 +171,7 @@ class RouteBatch:
 
     @cached_property
     def _leg_ends(self) -> list[int]:
-        """Where the legs of each route begin, and the end of all."""
+        """Start of each route's legs, and the end of all."""
         ends = np.searchsorted(np.cumsum(self.legs, dtype=np.int64), self.ends, "right")
         return [0, *ends.tolist()]
 
@@ -179,7 +179,7 @@ class RouteBatch:
         return map(self.__getitem__, range(len(self)))
 
     def outlines(self) -> Iterator[RouteOutline]:
-        """Of each route what tells it from others: many are looked at for few that are sent."""
+        """Returns the distinguishing fields of each route: many are compared for few that are sent."""
         directions, ends = self.directions.tobytes(), [0, *self.ends.tolist()]
         each = (self.statuses.tolist(), self.starts.tolist(), pairwise(ends), self.remaining_s.tolist())
         for status, start, (begin, end), remaining_s in zip(*each, strict=True):
@@ -200,7 +200,7 @@ class RouteBatch:
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """How many steps each route has, int64."""
+        """Number of steps of each route, int64."""
         if len(self) == 1:
             return self.ends
         steps = self.ends.copy()  # `np.diff` with `prepend` takes ten times as long for a few
@@ -209,7 +209,7 @@ class RouteBatch:
 
     @property
     def gaps(self) -> NDArray[np.float64]:
-        """As `Route.gap`, of the routes whose status is OK, float64."""
+        """Like `Route.gap`, for the routes whose status is OK, float64."""
         found = self.statuses == OK
         cost, bound = self.cost_s[found], self.lower_bound_s[found]
         gaps = np.ones(cost.size)
@@ -218,7 +218,7 @@ class RouteBatch:
         return gaps
 
     def columns(self) -> Routes:
-        """As on the wire."""
+        """Columns in the wire format."""
         return Routes(
             statuses=self.statuses.tobytes(),
             starts=self.starts.tobytes(),
@@ -261,7 +261,8 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     legs: Legs = b""
 
     def __post_init__(self) -> None:
-        """Whoever makes them of routes knows that they are right; whoever decodes them calls `check_bounds`."""
+        """A caller that makes them of routes knows that they are valid; one that decodes them calls
+        `check_bounds`."""
 
     def check_bounds(self) -> None:
         if not self._is_one_found:
@@ -269,8 +270,8 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
 
     @property
     def _is_one_found(self) -> bool:
-        """Whether this is one route that was found and not pulled, and breaks no rule: all columns are looked at at
-        once, as most answers are of one route. Of any other the rules say what is wrong, if something is."""
+        """Returns True if this is one found route that is not any-angle and breaks no rule: all columns are checked
+        together, as most replies hold one route. For any other the rules state the fault, if there is one."""
         columns = (self.starts, self.steps, self.cost_s, self.lower_bound_s, self.length_m, self.remaining_s)
         if self.statuses != b"\0" or self.legs or tuple(map(len, columns)) != _WIDTHS:
             return False
@@ -280,7 +281,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
         return in_bounds and len(self.directions) == 3 * -(-steps // 8) and bool(sum(numbers) < math.inf)
 
     def relate(self) -> None:
-        # As lists, not arrays: of the usual answer, a few routes, in an eighth of the time.
+        # Lists, not arrays: for the usual reply, a few routes, in an eighth of the time.
         listed = _listed(self.steps, "I")
         steps = sum(listed)
         check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
@@ -294,7 +295,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def batch(self) -> RouteBatch:
-        """As read-only arrays, made once."""
+        """Read-only arrays, made once."""
         ends = np.cumsum(column(self.steps, "<u4"), dtype=np.int64)
         many = int(ends[-1]) if ends.size else 0
         return RouteBatch(
@@ -308,7 +309,7 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def listed(self) -> list[Route]:
-        """As `Route`s, read without NumPy, made once."""
+        """`Route`s, read without NumPy, made once."""
         steps = _listed(self.steps, "I")
         codes = unpack_directions(self.directions, sum(steps))
         ends = accumulate(steps)
@@ -348,7 +349,7 @@ def check_legs(steps: Sequence[int], packed: bytes) -> None:
 
 
 def _split_legs(steps: Sequence[int], packed: bytes) -> Iterator[bytes]:
-    """Of checked columns the legs of each route."""
+    """Returns the legs of each route of checked columns."""
     turns = list(accumulate(_listed(packed, "I"), initial=0))
     begin = 0
     for end in accumulate(steps):
@@ -379,14 +380,14 @@ _TELLING_COLS = 3
 
 @lru_cache(maxsize=16)
 def _codes_by_offset(cols: int) -> dict[int, int]:
-    """What a step adds to a cell of a grid of so many columns -> its direction code."""
+    """Returns offset of a step in a grid with `columns` columns -> its direction code."""
     offsets = zip(STEP_ROW, STEP_COL, strict=True)
     return {south * cols + east: code for code, (south, east) in enumerate(offsets)}
 
 
 @cache
 def _moves() -> NDArray[np.int64]:
-    """What a step in each direction adds to the row, and to the column."""
+    """Returns the change of row and of column by a step in each direction."""
     return np.array((STEP_ROW, STEP_COL), np.int64)
 
 

@@ -28,11 +28,11 @@ class Topic:
     """One topic.
 
     key        template below the namespace; `{name}` stands for one chunk
-    message    what is put, or what a query is answered with
+    message    the published message, or the reply to a query
     what       its meaning, for `docs/wire.md`
     rate       how often it is put or asked, for `docs/wire.md`
     access     which roles may put, serve, ask and hear it
-    request    for a queryable: what is asked; None for a topic that is only published
+    request    for a queryable: the query; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it
     published  whether values are put, not only answered
     trusted    only with a code of the run's secret does a message on it count (`swarm.wire.access`)
@@ -346,7 +346,7 @@ _TOKEN = re.compile(r"(?:.*/)?alive/([A-Za-z0-9_.-]{1,64})/([A-Za-z0-9_.-]{1,64}
 
 def peer_of(key: str) -> Peer:
     """The process whose liveliness token stands under a key. Raises ProtocolError, and nothing else, on another
-    key: whoever reads tokens must not be ended by one."""
+    key: an invalid token must not end its reader."""
     match = _TOKEN.fullmatch(key)
     if match is None or int(match[3]) >= 1 << 62:
         raise ProtocolError(f"{key[:200]} is no token: {ALIVE_KEY}, with an incarnation below 2^62")

@@ -5,10 +5,10 @@ ones have their default. Any other change is a `Step` to a new version:
 
 1. the build of wire version W in which the step begins reads both versions and writes the older one;
 2. from W + 1 on a build writes the newer one, and reads the older one still;
-3. from W + 2 on nobody who may share a run writes the older one, and the step is removed from `STEPS`.
+3. from W + 2 on no process which may share a run writes the older one, and the step is removed from `STEPS`.
 
-So each build writes what its neighbours on both sides read, whoever is started again in whatever order: nobody has
-to know who else lives. A message takes its next step at W + 2 at the earliest.
+Each build therefore writes a version that its neighbours on both sides read, in any order of restarts: no process
+has to know which others live. A message takes its next step at W + 2 at the earliest.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from swarm.errors import ProtocolError
 from swarm.wire.messages import WIRE_VERSION, Message
 
 Fields = dict[str, Any]
-"""Of a message, as MessagePack has them, without `schema`."""
+"""Content of a message in MessagePack, without `schema`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """How a message came from the version before to the version of its type.
+    """Conversion of a message from the previous version to the version of its type.
 
     begun_in  wire version of the first builds that read the new one
     raised    fields of the version before as those of the new one
@@ -40,11 +40,11 @@ class Step:
     lowered: Callable[[Fields], Fields]
 
     def writes_older(self, wire: int) -> bool:
-        """Whether builds of a wire version write the version before."""
+        """Returns True if builds of a wire version write the previous version."""
         return wire <= self.begun_in
 
     def reads_older(self, wire: int) -> bool:
-        """Whether builds of a wire version read the version before: as long as a neighbour writes it."""
+        """Returns True if builds of a wire version read the previous version: as long as a neighbour writes it."""
         return self.writes_older(wire - 1)
 
 
@@ -122,5 +122,5 @@ def as_written(message: Message) -> Fields | None:
 
 
 def are_neighbours(one: int, other: int) -> bool:
-    """Whether builds of two wire versions may share a run."""
+    """Returns True if builds of two wire versions may share a run."""
     return abs(one - other) <= 1

@@ -13,7 +13,7 @@ WIRE_VERSION = 8
 """The wire that this build speaks. It rises by one, once a release, where a message steps to a version that builds
 before it do not read, or where a key changes (`swarm.wire.versions`, decision 87). Two neighbours share a run."""
 _FIRST_VERSION = 8
-"""Of every message when each got a version of its own."""
+"""Version of every message when each got a version of its own."""
 
 
 class Message(Bounded, frozen=True, kw_only=True, tag_field="schema"):

@@ -38,17 +38,17 @@ STAMP_LIMIT_NS = 1 << 62
 """Marks stamped from here on (year 2116) are rejected by all processes, so that there is always a newer stamp."""
 
 PACE_LEAST: float = struct.unpack("<f", struct.pack("<f", 1 / 340))[0]
-"""s/m; what drives quicker than sound is no vehicle. Float32, as marks are."""
+"""s/m; anything faster than sound is no vehicle. Float32, as marks are."""
 PACE_MOST = 100.0
-"""s/m, a cell of 10 m in 17 minutes: slower ground is better told as lethal. Both bound what one wrong mark can do
-to lower bounds and to the number of buckets of every planner."""
+"""s/m, a cell of 10 m in 17 minutes: slower ground is better marked as lethal. Both bound what one wrong mark can
+do to lower bounds and to the number of buckets of every planner."""
 
 FOREVER = (1 << 63) - 1
 """`until_ns` of a mark that does not expire."""
 
 
 class MarkKind(enum.IntEnum):
-    """What a mark states about a cell."""
+    """Meaning of a mark for its cell."""
 
     PACE = 0
     """It can be driven at this pace, in s/m."""
@@ -119,7 +119,7 @@ SEQ_STEP = 1 << 16
 """An author's own numbers are multiples of this."""
 _ROW = (("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8"))
 DIGEST_ROW = list(_ROW)
-"""As NumPy wants it."""
+"""Row type, as NumPy wants it."""
 DIGEST_ROW_BYTES = width_of(_ROW)
 MOST_TILES = 1 << 18
 """Named in one message: every tile of a map of 16,384 x 16,384 cells."""
@@ -138,7 +138,7 @@ def owner_of(author: str) -> str:
 
 
 class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
-    """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
+    """All marks of one author in one tile. Replaces the author's set with a lower (epoch, seq).
 
     An author counts `seq` in steps of 65536. The numbers between are for keepers, which compact the sets of dead
     authors: drop from them what others overrule. Such a set without statements is a tombstone: readers forget the
@@ -233,7 +233,7 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     """Which sets a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
     rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
 
-    whole  false: only tiles that changed lately, told between the whole digests
+    whole  false: only tiles that changed lately, published between the whole digests
     seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
     """
 
@@ -257,13 +257,13 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-requ
 
 BASE_DIGEST_BYTES = 8
 MOST_REGIONS = 1 << 16
-"""Of the largest grid."""
+"""Number of regions of the largest grid."""
 _DIGESTS = Meta(max_length=BASE_DIGEST_BYTES * MOST_REGIONS)
 _LAYERS = Meta(max_length=100)
 
 
 class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
-    """What a keeper has of the run's terrain, for machines without its files.
+    """A keeper's copy of the run's terrain, for machines without its files.
 
     digests  layer -> 8 bytes per region (256 x 256 cells): BLAKE2b of its bytes, in order of region
     notes    sentences about where the terrain came from

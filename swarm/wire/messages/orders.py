@@ -1,4 +1,4 @@
-"""Messages of operators: orders to keepers, what is ordered, and who obeys."""
+"""Messages of operators: orders to keepers, orders in force, and the processes that obey."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from swarm.wire.messages import Message, schema_of
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, DigestRows
 
 MOST_CORNERS = 256
-"""Of a zone's polygon."""
+"""Corners of a zone's polygon."""
 MOST_ZONES = 1000
 ZoneName = Annotated[str, Meta(max_length=40)]
 """Empty where none is given."""
@@ -43,8 +43,8 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     """Asks a keeper to close an area, to open it again, or which zones there are.
 
     name          of the zone; one that exists is replaced. Without a name the keeper finds one
-    kind          lethal: no vehicle enters; pace: what the terrain does not close is driven at
-                  `pace_s_per_m`, whatever is found there
+    kind          lethal: no vehicle enters; pace: cells that the terrain does not close are driven at
+                  `pace_s_per_m`, with any marks
     polygon       corners [row, col]; (0, 0) is the north-west corner of the terrain, (1, 1) of the cell one further
     polygon_m     corners [x_m, y_m] instead, as poses have them
     corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
@@ -109,8 +109,8 @@ class Zone(Bounded, frozen=True, kw_only=True):
 class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
     """The zones that stand, and on the disk of this keeper.
 
-    changed  the name of the zone that was added or removed, and `sets` its sets of marks, as rows of a digest: who
-             holds these obeys
+    changed  the name of the zone that was added or removed, and `sets` its mark sets, as rows of a digest: a
+             process that holds these obeys
     """
 
     keeper: Id
@@ -127,11 +127,11 @@ _Speed = Annotated[float, Meta(ge=0, le=1e4)]
 _Targets = Annotated[list[Id], IDS]
 _WALK: SimulatedWalk = "waypoints"
 _SPEED_M_PER_S = 4.0
-"""As targets of a scenario have it."""
+"""Range of speeds as for targets of a scenario."""
 
 
 class Order(Bounded, frozen=True, kw_only=True):
-    """What was ordered last about one subject.
+    """The last order about one subject.
 
     name      of the vehicle, group, target or setting
     stamp_ns  of two orders about one subject the later counts
@@ -162,7 +162,7 @@ class Order(Bounded, frozen=True, kw_only=True):
 class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order")):
     """Asks a keeper to enter an order into its book. Fields as in `Order`.
 
-    subject   None only asks what is ordered
+    subject   None only asks for orders in force
     row, col  instead of a cell
     at        a place instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     new       the target must not be there yet; otherwise it must

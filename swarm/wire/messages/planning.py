@@ -66,7 +66,7 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     map_version  number of changes of its replica
     tree_age_ms  time since the last full growth
     pose_age_s   time since the pose arrived that the route leads to; None before the first
-    tracker_lost  nobody tracks the target now: it was there, and may be anywhere
+    tracker_lost  no tracker publishes the target now: this is its last known position
     vehicle_class  whose routes these are
     """
 
@@ -130,7 +130,7 @@ MOST_BELIEVED = 512
 
 
 class Believed(Message, frozen=True, kw_only=True, tag=schema_of("believed")):
-    """Where a planner believes its target to be that nobody sees. The newest replaces the older; without cells the
+    """A planner's belief about the position of its unseen target. The newest replaces the older; without cells the
     search is over.
 
     side_m  of the square blocks of ground that it tells of
@@ -182,11 +182,11 @@ class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-s
 CELL_OF_PLACE = -1
 """In a pose: the sender knows no grid, and each receiver finds the cell by its own."""
 POSE_LEASE_S = 2.0
-"""Of a tracker that tells at least twice a second, as simulated targets do."""
+"""Lease of a tracker that publishes at least twice a second, as simulated targets do."""
 
 
 class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
-    """Where a target is, by one of its trackers. Whose poses count is decided by `swarm.runtime.tracking`.
+    """Position of a target, by one of its trackers. `swarm.runtime.tracking` decides which poses count.
 
     tracker      name of the tracker; a later incarnation of the same name takes over at once. Without a name each
                  incarnation is a tracker of its own

@@ -68,7 +68,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
-    """What a process wants people to know that watch the run: a collision, an author beyond its quota.
+    """A process's notice to people that watch the run: a collision, an author beyond its quota.
 
     kind      a word of `launch_scripts.observe.run_alarms.KINDS`; any other is shown as it is
     about     the process, target, author or vehicle that it is about
@@ -85,11 +85,11 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
-    """What a process has counted. Histograms are as in `swarm.runtime.stats`.
+    """Counters of a process. Histograms are as in `swarm.runtime.stats`.
 
     counts_by, histograms_by    name -> id of a target or vehicle -> the same, of that one alone
     since                       counts are those of all incarnations of this process from this one on; 0: of its own
-    alarms                      what lasts, and the newest of what is over
+    alarms                      open alarms, and the newest of the closed ones
     web_port                    port of its own machine where people can look at it in a browser; 0: none
     """
 

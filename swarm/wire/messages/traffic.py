@@ -28,7 +28,7 @@ class Stand(Part, frozen=True, array_like=True):
     ahead   its next cells after `end`
     wants   where else it could go from its cell, the best first; only while it stands
     better  how many of those are better than to stay; the others serve to make way
-    age_ms  how long it has been on its way: who has been so for longest goes first
+    age_ms  time for which it has been on its way: the vehicle with the longest goes first
     """
 
     vehicle: VehicleId
@@ -42,8 +42,8 @@ class Stand(Part, frozen=True, array_like=True):
 
 
 class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
-    """All vehicles of a host that hold or want a cell of one plot, told to one of its members. The newest replaces
-    the older.
+    """All vehicles of a host that hold or request a cell of one plot, sent to one of its members. The newest
+    replaces the older.
 
     life   which life of the host speaks; a later one is greater
     knows  the newest table that the host acts on: of what that granted, it holds no more than it lists here
@@ -80,12 +80,12 @@ class Shut(Bounded, frozen=True, array_like=True):
 
 
 class Table(Message, frozen=True, kw_only=True, tag=schema_of("table")):
-    """Who may be where in one plot, for its members. In a publication its author is the plot's warden; in a reply,
-    a member which tells what it has stored.
+    """Granted cells of one plot, for its members. In a publication its author is the plot's warden; in a reply, a
+    member which tells what it has stored.
 
     hosts   agent -> [life, seq] of the newest standing that counts in this table
     grants  vehicle -> its cells
-    shut    what nobody may enter
+    shut    cells that no vehicle may enter
     pushed  vehicle -> the age with which it is to make way into another plot
     """
 
@@ -113,7 +113,7 @@ class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
 
 
 class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
-    """What a plot's table says to one host, once a majority of the plot's members has it on file.
+    """Content of a plot's table for one host, once a majority of the plot's members has it on file.
 
     agent        the plot's warden
     epoch, seq   of the table
@@ -140,15 +140,15 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
 
 
 class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
-    """A member wants to be warden in this epoch: whoever answers with its stored table promises to store nothing of
-    a lower one."""
+    """A member requests to be warden in this epoch: a member that replies with its stored table promises to store
+    none of a lower epoch."""
 
     epoch: Natural
 
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
     """A new life of an agent or a guest asks all agents what they know of it. `disk` names the file that it keeps;
-    a guest's is 0, and nobody notes it. Only agents of its layer answer: 0 is the ground, 1 the air; an agent is
+    a guest's is 0, and is not noted. Only agents of its layer answer: 0 is the ground, 1 the air; an agent is
     answered only by those whose plots are as large as its own."""
 
     agent: Id
@@ -158,10 +158,10 @@ class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-requ
 
 
 class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
-    """What one agent has on file about another.
+    """One agent's record of another.
 
     agent   who answers
-    disk    the file that it takes to be the other's: the first that it was told of
+    disk    the file that it knows as the other's: the first that it received
     life    the greatest life in any table
     plots   those whose tables grant cells to its vehicles, or keep cells of an earlier life of it shut
     agents  for a guest, which may not know the scenario: the agents of which three are members of each plot

@@ -42,11 +42,11 @@ class VehicleState(enum.IntEnum):
     STRANDED = 4
     """No way to any target from here."""
     LOST = 5
-    """Its planner is gone: keeps the last route it has, and says so."""
+    """Its planner has ended: it keeps its last route, and reports this state."""
     OUTDATED = 6
     """Goes by an old pose: its target's tracker is lost."""
     SEARCHING = 7
-    """Looks where its target may be, which nobody sees."""
+    """Searches for its unseen target."""
 
 
 NO_TARGET = 255
@@ -104,7 +104,7 @@ MOST_SHARED_TARGETS = 64
 
 
 class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-costs")):
-    """What the vehicles of one agent need to each target, for the other agents of their group. The newest replaces
+    """Costs from the vehicles of one agent to each target, for the other agents of their group. The newest replaces
     the older.
 
     costs_s  float32 per vehicle and target, the targets of one vehicle side by side; inf where there is no way
@@ -162,16 +162,16 @@ class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
 LONGEST_BODY_LEASE_S = 10.0
 MOST_RADIUS_M = 100.0
 MOST_M_PER_S = 340.0
-"""What drives quicker than sound is no vehicle, as of marks. Whoever hears more of a body names it and goes on."""
+"""Anything faster than sound is no vehicle, as for marks. A receiver of a faster body reports it and goes on."""
 Heading = Annotated[float, Meta(ge=-2 * math.tau, le=2 * math.tau)]
 Speed = Annotated[float, Meta(ge=0, le=1e6)]
 
 
 class Body(Message, frozen=True, kw_only=True, tag=schema_of("body")):
-    """Where something is that vehicles must not drive into: a disc on the map. The newest replaces the older.
+    """Position of an obstacle that vehicles must not drive into: a disc on the map. The newest replaces the older.
 
     group          whose it is, for those who watch
-    incarnation    when its sender started, in ns: two senders under one id are told apart, the later counts
+    incarnation    when its sender started, in ns: of two senders under one id the later counts
     seq            grows with each message of an incarnation
     stamp_ns       when it was there, by the sender's clock; nothing is decided by it
     x_m, y_m       in the terrain's frame, as of a `TargetPose`
@@ -202,7 +202,7 @@ class RemoveVehicles(Message, frozen=True, kw_only=True, tag=schema_of("remove-v
 
 
 class Removed(Message, frozen=True, kw_only=True, tag=schema_of("removed")):
-    """What has become of such a request.
+    """Result of such a request.
 
     left     the vehicles asked for that are gone from the agent
     unknown  those that it does not host, and has not let leave
