@@ -57,8 +57,8 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def private_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy that may be written to. Of an array from `open_array` only the pages that are written to (4 KiB each)
-    are copied, and when they are; the file stays as it is."""
+    """A copy that may be written to. Only the pages (4 KiB each) of an array from `open_array` that are written to
+    are copied, at the first write; the file stays as it is."""
     mapped = array.base
     if not isinstance(mapped, _Mapped) or mapped.shape != array.shape or mapped.dtype != array.dtype:
         return np.array(array)
@@ -107,8 +107,8 @@ class CellsOf:
 
 @functools.cache
 def source_digest(*folders: Path) -> str:
-    """16 hex digits of all Python files in these folders, and of the version of NumPy: what is kept between runs is
-    keyed by the code that made it."""
+    """Returns 16 hex digits of all Python files in these folders, and of the version of NumPy: files kept between
+    runs are keyed by the code that made them."""
     digest = hashlib.blake2b(np.__version__.encode(), digest_size=8)
     for folder in folders:
         for path in sorted(folder.glob("*.py")):

@@ -1,6 +1,6 @@
 """The composite cost map of one process: the prior ground, the marks over it, and inflation.
 
-What is learned of a kind of ground changes the pace of all its cells; a mark replaces the ground of its cell. Then
+A learned factor changes the pace of all cells of its terrain class; a mark replaces the bare cost of its cell. Then
 a cell is lethal where a vehicle in its middle would touch lethal ground. After any sequence of `apply` the
 composite equals one built from the last statement about each cell.
 """
@@ -25,7 +25,8 @@ from swarm.wire.messages.map_data import PACE_MOST, MarkKind, MarkSet
 MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""
 _MANY_BOXES = 8 * MAX_WINDOWS
-"""Beyond so many boxes around changed cells one around all of them is kept: merging is quadratic in them."""
+"""Above this number of boxes around changed cells one box around all of them is kept: merging is quadratic in their
+number."""
 
 
 class CostSnapshot(NamedTuple):
@@ -44,8 +45,8 @@ class CostMap:
 
     pace_s_per_m    float32 (rows, cols)  what may be driven and how fast; changed in place
     ground_s_per_m  float32 (rows, cols)  the same without inflation: compare what a sensor sees with this
-    prior_s_per_m   float32 (rows, cols)  the ground without marks: what is known beforehand, and what is learned
-    factors         float32 (KEYS,)       what is learned: by what the prior of each kind of ground is multiplied
+    prior_s_per_m   float32 (rows, cols) bare cost without marks: the prior, times learned factors
+    factors         float32 (KEYS,) learned factor on the prior of each terrain class
     version         grows by one with every `apply` and `learn` that changed the ground
 
     learning  take in what authors have learned
@@ -68,7 +69,7 @@ class CostMap:
         self.keys: Bytes | None = None
         """The kind of ground of each cell: uint8 (rows, cols). None if nothing is learned."""
         self._stated: NDArray[np.bool_] | None = None
-        """Where a mark is; None if nothing is learned."""
+        """Marked cells; None if no factor is learned."""
         if learning:
             self.keys = keys_of(terrain.classes, terrain.elevation_m, self.grid.resolution_m)
             self._stated = np.zeros(self.grid.cells, np.bool_)
@@ -87,7 +88,7 @@ class CostMap:
         cells  uint32 (n,)   flat indices in the grid; raises OutsideGridError if one is not in it
         kinds  uint8 (n,)    MarkKind
         paces  float32 (n,)  s/m; read where the kind is PACE
-        class_number  0 for all vehicles; what is said for one class alone changes nothing (see `ClassMaps`)
+        class_number  0 for all vehicles; marks for one class alone change nothing here (see `ClassMaps`)
         """
         if class_number:
             return
@@ -143,7 +144,7 @@ class CostMap:
 
     @property
     def dirty(self) -> Sequence[Window]:
-        """What `take_dirty` would return now."""
+        """The box that `take_dirty` would return now."""
         return self._dirty
 
     def take_dirty(self) -> list[Window]:
@@ -217,7 +218,7 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     """Few windows which cover all cells: bounding boxes by tile, merged where they touch; one box if there are very
     many.
 
-    cells  int64 (n,)  flat indices in a grid of so many columns
+    cells  int64 (n,) flat indices in a grid with `columns` columns
     """
     if len(cells) == 0:
         return []

@@ -1,10 +1,10 @@
 """Sightings: where vehicles saw targets. They expire, and change no pace.
 
-Of each author's sightings of a target the newest counts, and of all authors' the newest that has not expired. So,
-as with marks, merging depends on neither order, grouping nor repetition.
+The newest sighting of each author of a target counts, and of all authors' the newest that has not expired. As with
+marks, merging therefore depends on neither order, grouping nor repetition.
 
 No author's clock is trusted further than the reader's own: what an author dates ahead counts as seen when it was
-heard, and no sighting outlives `LONGEST_NS` from then. So a vehicle with a fast clock outweighs no other.
+heard, and no sighting outlives `LONGEST_NS` from then. A vehicle with a fast clock therefore outweighs no other.
 """
 
 from __future__ import annotations

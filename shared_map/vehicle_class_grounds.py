@@ -50,9 +50,9 @@ class ClassGround:
 
 
 _MADE: WeakKeyDictionary[Terrain, dict[bytes, Terrain]] = WeakKeyDictionary()
-"""What was made beside a terrain, so that the processes of a simulation make it once."""
+"""Grounds made beside a terrain, so that the processes of a simulation make them once."""
 _KNOWN: WeakKeyDictionary[Terrain, dict[bytes, ClassGround]] = WeakKeyDictionary()
-"""What was prepared beside a terrain, with its truth."""
+"""Grounds prepared beside a terrain, with its ground truth."""
 
 
 def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | None = None) -> dict[str, Terrain]:
@@ -146,8 +146,8 @@ def _key(scenario: Scenario, name: str) -> bytes:
 # --- prepared once in a run's folder for all processes of a machine -------------------------------------------
 
 _META = "class.json"
-"""Describes the arrays beside it. What all classes share (heights, photo, classes of ground) lies with the terrain
-of the run."""
+"""Describes the arrays beside it. Arrays that all classes share (heights, photo, terrain classes) are stored with
+the terrain of the run."""
 
 
 def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: Floats) -> None:
@@ -166,7 +166,7 @@ def prepare_classes(run_dir: Path, scenario: Scenario, common: Terrain, truth: F
 
 
 def load_classes(setup: RoleSetup, common: Terrain) -> None:
-    """Let `class_grounds` and `class_terrains` take what is prepared in a run's folder, instead of making it."""
+    """Lets `class_grounds` and `class_terrains` take prepared files in a run's folder, instead of making them."""
     if setup.run_dir is not None:
         _open(setup.run_dir, setup.scenario, common)
 
@@ -198,7 +198,7 @@ def _kept_key(scenario: Scenario, name: str) -> str | None:
     common, own = kept_key(scenario), kept_key(of_class(scenario, name))
     if common is None or own is None:
         return None
-    # What is kept of one name is not that of another, as it stands in the description.
+    # A cache entry of one name is not that of another, as the name is in the description.
     payload = msgspec.json.encode([common, own, _prepared_key(scenario, name)])
     return hashlib.blake2b(payload, digest_size=16).hexdigest()
 

@@ -1,9 +1,9 @@
 """The ground as every class of vehicles finds it: one terrain, one set of marks, a cost map for each class.
 
 A mark says what the ground of a cell is for the class "ground", as sensors and operators tell it. Another class
-reads it by its own rule: what is lethal by a mark is so for all; a pace that is three times the prior is so for
-that class, too, and so is what is learned of a kind of ground. What a class cannot drive by its own rule no mark
-opens. What is said for one class alone counts for that class before what is said for all, unless that is lethal.
+reads it by its own rule. A lethal mark is lethal for all; a pace that is three times the prior is so for that
+class, too, and so is a learned factor. No mark opens a cell that a class cannot drive by its own rule. A mark for
+one class alone counts for that class before a mark for all, unless that is lethal.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind, MarkSe
 
 
 def read_by(own_prior: Floats, prior: Floats, paces: Floats, least: float = PACE_LEAST) -> Floats:
-    """What paces of the class "ground" are to another class, s/m.
+    """Returns paces of the class "ground" as another class reads them, s/m.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def read_by(own_prior: Floats, prior: Floats, paces: Floats, least: float = PACE
 def read_marks(
     own: Terrain, common: Terrain, cells: NDArray[Any], kinds: NDArray[np.uint8], paces: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint8], Floats]:
-    """What statements about the ground for "ground" are to another class: kinds and paces.
+    """Returns marks for "ground" as another class reads them: kinds and paces.
 
     own, common  the terrain of that class, and of "ground"
     """
@@ -69,12 +69,12 @@ def for_class(
     own_kinds: NDArray[np.uint8],
     own_paces: Floats,
 ) -> tuple[NDArray[np.uint8], Floats]:
-    """What holds of cells for a class: what is said for it alone, or else for all. What is lethal to all stays so,
-    and so does what the class cannot drive by its own rule.
+    """Returns the marks that hold for a class: those for it alone, or else those for all. Cells that are lethal to
+    all stay so, and so do cells that the class cannot drive by its own rule.
 
     own                   the terrain of the class
-    kinds, paces          what is said for all, as `read_marks` has it for the class
-    own_kinds, own_paces  what is said for the class alone; CLEAR where nothing is
+    kinds, paces          marks for all, as `read_marks` has them for the class
+    own_kinds, own_paces  marks for the class alone; CLEAR where there is none
     """
     closed = (own_kinds == MarkKind.PACE) & np.isinf(own.ground_s_per_m.reshape(-1)[cells])
     stated = (own_kinds != MarkKind.CLEAR) & (kinds != MarkKind.LETHAL) & ~closed
@@ -101,12 +101,12 @@ class ClassMaps:
         }
         self._by_number = {numbers[name]: cost_map for name, cost_map in self.of.items()}
         self._kinds = np.full(common.grid.cells if self.of else 0, MarkKind.CLEAR, np.uint8)
-        """What is said of each cell for all vehicles. A pace is that of the common ground."""
+        """Marks of each cell for all vehicles. A pace is that of the common ground."""
         self._own: dict[int, dict[int, tuple[int, float]]] = {number: {} for number in self._by_number}
-        """Class number -> cell -> kind and pace of what is said for that class alone."""
+        """Class number -> cell -> kind and pace of the marks for that class alone."""
 
     def learn(self, words: Sequence[MarkSet]) -> bool:
-        """As `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""
+        """Like `CostMap.learn`: ground that is three times as slow as its prior is so for every class."""
         return any([cost_map.learn(words) for cost_map in (self.common, *self.of.values())])  # noqa: C419 - all do
 
     def apply(
@@ -116,8 +116,8 @@ class ClassMaps:
         paces: NDArray[np.float32],
         class_number: int = 0,
     ) -> None:
-        """As `CostMap.apply`: what is said for all vehicles to each map as it is to its class, what is said for one
-        class to its map. Of a class that has no map here nothing changes."""
+        """Like `CostMap.apply`: a mark for all vehicles changes each map as its class reads it, a mark for one
+        class its map. A class that has no map here is not affected."""
         if class_number == 0:
             self.common.apply(cells, kinds, paces)
             if not self.of:
@@ -140,7 +140,7 @@ class ClassMaps:
     def _holding(
         self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats
     ) -> tuple[NDArray[np.uint8], Floats]:
-        """What holds for a class, where this is what is said for all."""
+        """Returns the marks that hold for a class, from those for all."""
         own = self._own[number]
         if not own:
             return kinds, paces

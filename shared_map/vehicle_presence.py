@@ -1,7 +1,7 @@
 """Presence: where all vehicles are now. Not stored.
 
 A message lists an author's vehicles in one region, and replaces the author's last message of that region. A message
-expires with its lease. So presence needs no merging, and a lost message needs no repair.
+expires with its lease. Presence therefore needs no merging, and a lost message needs no repeat.
 """
 
 from __future__ import annotations

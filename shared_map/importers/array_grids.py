@@ -1,7 +1,7 @@
 """Grids in plain formats: ESRI ASCII, NumPy's .npz, MovingAI .map, ROS map_server's YAML with its image.
 
-numpy, PyYAML and Pillow read them. What a header promises is checked against the file's length and the largest grid
-before memory is taken.
+numpy, PyYAML and Pillow read them. A header is checked against the file's length and the largest grid before memory
+is taken.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from swarm.grid import MAX_CELLS
 _NPZ_ARRAYS = ("elevation", "photo", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
 _HEADER_BYTES = 4096
 _MOST_TABLE_BYTES = 1 << 20
-"""Of an archive's table of contents."""
+"""Limit of an archive's table of contents."""
 _SHOWN_MEMBERS = 10
 _ASC_HEADER_LINES = 32
 SCALE_FACTOR = 9.0
@@ -36,14 +36,14 @@ SCALE_FACTOR = 9.0
 
 @dataclass(frozen=True, eq=False)
 class PlainGrid:
-    """What a plain file says.
+    """Header of a plain file.
 
     heights      float32 (rows, cols) in the file's unit, NaN is a void; None for a map without heights
     factor       float32 (rows, cols), pace relative to open ground; inf is lethal, NaN unknown; None if all is open
     step         width and height of a cell, in metres, or in degrees if `degrees`; (0, 0) if the file does not say
     west, north  outer corner of cell (0, 0), in the same unit
     photo        uint8 (rows, cols, 3), red, green, blue
-    notes        what was found, for people
+    notes        the format found, for people
     """
 
     heights: Floats | None
@@ -71,7 +71,7 @@ def read_asc(path: Path) -> PlainGrid:
     The header says `ncols`, `nrows`, `cellsize`, `xllcorner` or `xllcenter`, `yllcorner` or `yllcenter`, and
     `nodata_value`, -9999 unless given. Metres and degrees look alike in it: `degrees` is False.
 
-    GDAL's driver is not used: it takes what is no number for 0.
+    GDAL's driver is not used: it reads text that is not a number as 0.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def read_asc(path: Path) -> PlainGrid:
             raise TerrainError(f"terrain {path}: cellsize is {step:g}; it must be positive")
         try:
             heights = np.fromfile(file, np.float32, rows * cols, sep=" ")
-        except ValueError:  # the file is left where numpy found what is no number
+        except ValueError:  # the file is left at the text that numpy could not read as a number
             heights = np.zeros(0, np.float32)
         at, rest = file.tell(), file.read(200).split()
         if rest:
@@ -202,7 +202,7 @@ def _members(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
 
 
 class _ShortReads(io.FileIO):
-    """A file of which nobody reads much at once, so that an archive's table of contents is bounded, too."""
+    """A file that limits each read, so that an archive's table of contents is bounded, too."""
 
     def read(self, count: int | None = -1) -> bytes:
         """Raises BadZipFile where more than `_MOST_TABLE_BYTES` are asked for."""
@@ -231,7 +231,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
             raise ValueError(
                 f"its header promises {size(cells * dtype.itemsize)} of numbers, and it has {size(max(has, 0))}"
             )
-        # All that is left is read, at the end of which the checksum is compared.
+        # The remainder is read, at the end of which the checksum is compared.
         return np.frombuffer(file.read(), dtype).reshape(shape, order="F" if in_columns else "C")
 
 

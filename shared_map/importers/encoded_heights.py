@@ -23,13 +23,13 @@ TITLES = {"terrain-rgb": "Terrain-RGB", "terrarium": "Terrarium"}
 
 _LOWEST_M, _HIGHEST_M = -11_500.0, 9_500.0
 _RED_M = {"terrain-rgb": 6553.6, "terrarium": 256.0}
-"""What one step of red is worth."""
+"""Height of one step of red (m)."""
 _MOST_TORN = 0.7
-"""Of the steps of red. In a photo nearly all are tears, as green follows red; in heights few are."""
+"""Share of the steps of red. In a photo nearly all are tears, as green follows red; in heights few are."""
 _MOST_ROUGH = 0.5
 _MOST_SIDE = 1024
 _MOST_CELLS = 1 << 26
-"""All are decoded at once. Tiles are of 256 or 512 cells a side; a mosaic of so many is as wide as 32 of them."""
+"""All are decoded at once. Tiles have 256 or 512 cells a side; a mosaic of this width has 32 of them."""
 
 
 def decoded(rgb: NDArray[np.uint8], encoding: Encoding) -> Floats:
@@ -58,8 +58,8 @@ def decoded(rgb: NDArray[np.uint8], encoding: Encoding) -> Floats:
 
 
 def is_plausible(rgb: NDArray[np.uint8], shown: NDArray[np.bool_], encoding: Encoding) -> bool:
-    """Whether colours, decoded, are the heights of a landscape: within those of the Earth, and without a tear where
-    red changes by a step, as green and blue make up for it.
+    """Returns True if colours, decoded, are the heights of a landscape: within those of the Earth, and without a
+    tear where red changes by a step, as green and blue make up for it.
 
     Parameters
     ----------

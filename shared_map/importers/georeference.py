@@ -1,4 +1,5 @@
-"""Where a raster lies: its coordinate system, the square metric north-up grid of a terrain, and the way onto it.
+"""Georeference of a raster: its coordinate system, the square metric north-up grid of a terrain, and the
+transformation between them.
 
 rasterio is imported where it is used: agents never need it.
 """
@@ -38,8 +39,8 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
     """A system in metres with `metres_per_degree` of a latitude; x is 0 at a longitude, y at the equator.
 
     PROJ's equidistant cylindrical projection knows spheres only. On that of WGS 84's equator its y is 0.3 % too
-    long: metres of the ellipsoid taken for such y lie kilometres off. So it gets the sphere that is as curved as
-    the ellipsoid is there.
+    long: metres of the ellipsoid taken for such y lie kilometres off. It therefore gets the sphere with the
+    curvature of the ellipsoid there.
     """
     per_lat, per_lon = metres_per_degree(latitude_deg)
     # The standard parallel at which a degree of longitude on this sphere is as long as on the ellipsoid.
@@ -113,7 +114,7 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
 
 
 def _scale(crs: Any, local: Any) -> float:
-    """What a true metre is in a system, in the direction in which it is furthest from one.
+    """Returns the length of a true metre in a system, in the direction in which it is furthest from one.
 
     local  a system that is true around its origin
     """
@@ -125,7 +126,7 @@ def _scale(crs: Any, local: Any) -> float:
 
 
 def is_local(crs: Any) -> bool:
-    """Whether a system is metres from anywhere, as surveys of sites and arenas use."""
+    """Returns True if a system has metres without a place on Earth, as surveys of sites and arenas use."""
     if crs.is_geographic or crs.is_projected:
         return False
     known = crs.to_dict(projjson=True)
@@ -154,7 +155,7 @@ def _shape_of(crs: Any) -> str:
 
 
 def crs_name(crs: Any) -> str:
-    """Of a rasterio CRS, for people: EPSG:32632, or +proj=..., or the beginning of what it is."""
+    """Returns the name of a rasterio CRS for people: EPSG:32632, or +proj=..., or the beginning of its text."""
     text = str(crs.to_string())
     if not text.startswith("EPSG:") and crs.to_epsg() is None:
         known = crs.to_dict()
@@ -285,7 +286,7 @@ def plan_grid(
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         notes.append("the file is rotated or upside down; resampled north-up, so that its corners may be voids")
-    # Where no cell would move by more than half of one, a resampling would only blur.
+    # If no cell would move by more than half of one, a resampling would only blur.
     off = max(abs((resolution_m or width) - width), abs((resolution_m or width) - height)) * max(rows, cols)
     if target == crs and north_up and off <= width / 2:
         check_size(rows, cols, what)

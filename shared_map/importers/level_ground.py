@@ -23,7 +23,7 @@ MOST_SAMPLED = 1 << 24
 _SAME_M = 0.005
 """Levelled water differs by rounding, or by what a resampling before ours left."""
 _STILL_M = 0.02
-"""From its highest to its lowest cell, a patch of still water differs by no more. Where every step is too small to
+"""From its highest to its lowest cell, a patch of still water differs by no more. If every step is too small to
 see, a gentle slope is no lake: its far end is at another height."""
 _COARSE_M = 0.25
 """In whole metres gentle ground is level, too."""
@@ -32,19 +32,19 @@ _MOST_LOWER = 0.25
 """Water has a shore, above it but for an outlet. Level ground beside much lower ground is the top of something, or
 a part of a rounded slope. The next step of a river that is levelled in steps does not count as lower ground."""
 _LEAST_SHORE = 0.2
-"""So much of its border is at another height than the patch, as far as one can see."""
+"""Share of a patch's border that must be visibly at another height."""
 _MOST_BESIDE = 0.7
 """Terraces and the steps of a staircase have other level ground along all of their border."""
 _MOST_TERRACES = 0.4
 """A plain whose heights are rounded is a stair of wide steps. Water has at most so much of its shore beside another
 wide step; a river that is levelled in steps has its ends only."""
 _LEAST_STEEP = 0.1
-"""Of the shore of a lake, somewhere, so much rises by more than one rounding from a cell to the next."""
+"""Share of a lake's shore that must rise by more than one rounding from a cell to the next."""
 _SEA_M = 0.5
 """Level ground at the border so near to zero is the sea, however gentle the coast is."""
 _LEAST_RIPPLES, _RING_CELLS, _SUNK_M = 0.1, 3, 2.0
-"""A cubic filter undershoots at a shore. Where so much of it is such a ripple, what is lower than the lake, down to
-this, is the lake's as well, so far around it."""
+"""A cubic filter undershoots at a shore. If this share of it is such a ripple, cells lower than the lake, down to
+this depth, belong to the lake as well, within this distance."""
 _BLOCK_CELLS = 4
 _ROUGH_M, _BLOCK_SAME_M, _BLOCK_STILL_M, _LEAST_BLOCKS = 0.3, 0.06, 0.1, 6
 _AROUND_BLOCKS = 5
@@ -52,7 +52,7 @@ _NOISY = 0.28
 """Water that a laser measured is rough by a decimetre or two, and level in the mean of 4 x 4 cells. From cell to
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
 _TOLD_SHARE = 0.001
-"""The note has one decimal of a percent: less than this would be told as 0.0 or 0.1 %."""
+"""The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ def level_ground(elevation_m: Floats) -> LevelGround:
 
 
 def _judged(found: Patches, still_m: float) -> tuple[Bools, Bools]:
-    """Of each patch: (whether it is water, whether nobody can know)."""
+    """Returns for each patch: (whether it is water, whether that cannot be known)."""
     still = found.spread_m <= np.float32(still_m)
     # Without any shore to see, it is a floor, or a part of a slope.
     shore = (found.differ > _LEAST_SHORE * found.edge) & (found.lower <= _MOST_LOWER * found.differ)
@@ -121,7 +121,8 @@ def _judged(found: Patches, still_m: float) -> tuple[Bools, Bools]:
 
 
 def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
-    """Add to a mask of level ground what is level but for the roughness of its survey; (height, cells) of each."""
+    """Adds areas to a mask of flat ground which are flat but for the roughness of their survey; (height, cells) of
+    each."""
     from scipy import ndimage
 
     side = _BLOCK_CELLS
@@ -157,7 +158,7 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     taken = np.bincount(of_cell.reshape(-1), minlength=water.size)
     rough_m = np.zeros(water.size, np.float32)
     np.maximum.at(rough_m, of_cell, off_m)
-    # What is exactly level has been found, with its shore to the cell.
+    # Exactly flat areas have been found, with their shore to the cell.
     water &= 2 * np.bincount(of_cell[mask], minlength=water.size) < taken
     rough_m[~water] = -1
     of_cell, off_m = of_cells(ndimage.maximum_filter(lakes, _AROUND_BLOCKS))
@@ -179,13 +180,13 @@ def _add_ripples(elevation_m: Floats, found: Patches, rippled: Bools, mask: Bool
 def looked_at(
     stored: Floats, config: TerrainConfig, scale: float = 1.0, offset: float = 0.0
 ) -> tuple[tuple[float, ...], Bools, list[str]]:
-    """(values that stand for no height, bool (rows, cols) of what is level, what people should know of both).
+    """Returns (values that are no heights, bool (rows, cols) of flat cells, notes for people on both).
 
     Parameters
     ----------
     stored : float32 (rows, cols)
-        As in the file; `scale` and `offset` make metres of it. Of a large one only some cells are looked at for
-        what is level.
+        As in the file; `scale` and `offset` make metres of it. In a large one only a sample is examined for flat
+        areas.
     """
     unknown = undeclared_voids(without(stored, config.nodata_values), scale, offset)
     voids = (*config.nodata_values, *unknown)
@@ -237,11 +238,11 @@ HIGHEST_M = 20_000.0
 """Heights beyond this, up or down, are undeclared voids."""
 _SEARCH_CELLS = 64
 _CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
-"""What programs write where they know no height."""
+"""Values which programs write for an unknown height."""
 _GAPS_M = {**dict.fromkeys(_CODES, 100.0), 0.0: 30.0}
 _ALONE = 3.0
-"""A code is a void if no other height is nearer to it than its gap, and than so many times the widest gap between
-other heights: real ground is never alone in its height."""
+"""A code is no-data if no other height is nearer to it than its gap, and than this multiple of the widest gap
+between other heights: real ground never has an isolated height."""
 _BIN_M = 0.25
 """Gaps between heights are measured in steps of this."""
 
@@ -294,7 +295,7 @@ def without(heights: Floats, voids: Sequence[float]) -> Floats:
 
 
 def voids_of(elevation_m: Floats) -> int:
-    """Make NaN of whatever is no height, and count it.
+    """Replaces every value that is no height by NaN, and counts them.
 
     Parameters
     ----------
@@ -332,7 +333,7 @@ def fill_voids(elevation_m: Floats) -> Floats:
     filled: Floats = fillnodata(
         np.where(known, elevation_m, np.float32(0)), known.astype(np.uint8), max_search_distance=_SEARCH_CELLS
     )
-    # Where GDAL finds nothing near enough, it leaves what it was given.
+    # If GDAL finds no cell near enough, it leaves the value as it was.
     distance, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
     far = distance >= _SEARCH_CELLS
     filled[far] = elevation_m[tuple(nearest)][far]

@@ -16,8 +16,8 @@ from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import bands
 
 _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
-"""So many of its eight neighbours are as high as a cell of a patch: those of a creek one cell wide are two. Among
-means of blocks a chain of equal ones is a contour line."""
+"""Number of the eight neighbours that are as high as a cell of a patch: those of a creek one cell wide are two.
+Among means of blocks a chain of equal ones is a contour line."""
 _RUNS_AT_ONCE = 1 << 18
 """Runs of a model in whole metres may be as many as a third of its cells."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -38,7 +38,7 @@ class Patches:
     spread_m  float32 (count + 1,), from the lowest to the highest cell
     cells     int64 (count + 1,)
     edge      int64 (count + 1,): sides of its cells beyond which another cell lies
-    differ    of these, those with another height beyond: what can be seen of its shore
+    differ    of these, those with another height beyond: the visible part of its shore
     beside    of these, those with another patch beyond that is at least a quarter as large
     below     of these, those with such a patch beyond that is lower
     lower     of `differ`, those with a lower height beyond that is no such patch, and no ripple
@@ -90,7 +90,7 @@ def level_patches(
     many = len(cells)
     first, lowest, highest = (np.full(many, fill, np.float32) for fill in (np.nan, np.inf, -np.inf))
     for row0, row1 in reversed(bands(elevation_m.shape[0])):
-        at = np.flatnonzero(labels[row0:row1])[::-1]  # backwards: what is written of a patch's first cell stays
+        at = np.flatnonzero(labels[row0:row1])[::-1]  # backwards: the value of a patch's first cell is written last
         of_cell, height_m = labels[row0:row1].reshape(-1)[at], elevation_m[row0:row1].reshape(-1)[at]
         np.minimum.at(lowest, of_cell, height_m)
         np.maximum.at(highest, of_cell, height_m)
@@ -163,8 +163,8 @@ def _labelled(elevation_m: Floats, same_m: np.float32, least_cells: int, least_a
 
 
 def _connected(count: int, one: Labels, other: Labels) -> Labels:
-    """Of each of `count` runs the number of its patch, by pairs of runs that touch; patches come as their first
-    runs do."""
+    """Returns for each of `count` runs the number of its patch, by pairs of runs that touch; patches are in the
+    order of their first runs."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

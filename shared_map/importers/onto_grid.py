@@ -28,7 +28,7 @@ def transform_of(grid: GridSpec, row0: int = 0) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """How a raster comes onto the grid of a terrain.
+    """Transformation of a raster onto the grid of a terrain.
 
     transform, crs  affine transform and coordinate system of the raster
     target          the grid's system; None if the raster's pixels are the terrain's cells
@@ -82,7 +82,7 @@ class Placed:
 
 
 def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str) -> Placed:
-    """How a file comes onto the terrain's grid.
+    """Returns the transformation of a file onto the terrain's grid.
 
     Raises TerrainError if one of the two has no place on Earth and they differ in size, the file does not say in
     which system it is (nor does `given`), or does not overlap the terrain.
@@ -151,7 +151,7 @@ def from_degrees(
 def from_metres(
     heights: Floats, step: Steps, west: float, north: float, resolution_m: float | None, what: str, crs: str
 ) -> tuple[Floats, GridSpec, str]:
-    """Heights on a metric grid, the grid, and what was done, for people.
+    """Returns heights on a metric grid, the grid, and the notes for people.
 
     Parameters
     ----------

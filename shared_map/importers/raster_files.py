@@ -42,7 +42,8 @@ _DRIVERS = {
     b"CDF\x02": "netCDF",
     b"UHL1": "DTED",
 }
-"""First bytes -> GDAL's driver. GDAL knows 150 formats, most of which nobody has tried to break for long."""
+"""First bytes -> GDAL's driver. GDAL knows 150 formats, most of which have not been tested against malicious
+files."""
 _DRIVERS_BY_ENDING = {
     ".hgt": "SRTMHGT",
     ".bil": "EHdr",
@@ -55,7 +56,7 @@ BAD_ARCHIVE = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError,
     KeyError, OverflowError,
 )  # fmt: skip
-"""What zipfile and its unpackers raise on damaged, encrypted or unknown members."""
+"""Exceptions of zipfile and its unpackers on damaged, encrypted or unknown members."""
 LONGEST_REASON = 200
 """Characters of what a library says that are passed on."""
 READ_ROWS = 512
@@ -64,16 +65,16 @@ _HGT_BYTES = 2 * 1201 * 1201, 2 * 3601 * 3601
 _MOST_TIMES, _DEEPEST = 32, 4
 _BY_ROWS = ("GTiff", "SRTMHGT", "VRT", "EHdr", "ENVI", "HFA")
 _MAX_PIXELS = 16 * MAX_CELLS
-"""Of formats which are read a part at a time. Of others, `MAX_CELLS`."""
+"""Limit for formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
-"""A block is what has to be unpacked at once."""
+"""A block is unpacked as a whole."""
 _MAX_BANDS = 256
 """Hyperspectral cameras have some 240, and four are needed at most. A header may claim 65,535, each of which GDAL
 describes in memory."""
 
 
 def is_raster(path: Path) -> bool:
-    """Whether a file begins or is named as a raster that is read."""
+    """Returns True if a file begins or is named as a raster that is read."""
     if path.suffix.lower() in (*_DRIVERS_BY_ENDING, ".zip"):
         return True
     with contextlib.suppress(OSError), path.open("rb") as file:
@@ -140,9 +141,9 @@ def _check_size(dataset: Any, what: str) -> None:
 
 
 def _kind_of(path: Path, what: str) -> tuple[str | Path, str]:
-    """How GDAL names a file, or the one raster in it, and the driver that reads it.
+    """Returns GDAL's name for a file, or for the one raster in it, and the driver that reads it.
 
-    Raises TerrainError on what is no raster; `what` names the file. Raises OSError as `open` does.
+    Raises TerrainError on a file that is not a raster; `what` names the file. Raises OSError as `open` does.
     """
     if path.suffix.lower() == ".zip":
         return _in_archive(path, what)
@@ -172,7 +173,7 @@ def _driver(head: bytes, ending: str, what: str) -> str:
 
 
 def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int = 1) -> float:
-    """How many times over a .vrt is painted by its sources; `known` holds that of others.
+    """Returns how many times over a .vrt is painted by its sources; `known` holds that of others.
 
     It names other files: each must be an ordinary one on this machine. GDAL would ask a web server, and wait at a
     pipe for ever. It has no limit of time either, and a megabyte of XML can ask for the same pixels often.
@@ -212,7 +213,7 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
 
 
 def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
-    """How many times over the pixels of a band are painted, at least once."""
+    """Returns how many times over the pixels of a band are painted, at least once."""
     try:
         cells = max(float(root.get("rasterXSize", 1)) * float(root.get("rasterYSize", 1)), 1.0)
         sources = [node for node in band if node.tag.endswith("Source")]
@@ -224,7 +225,7 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
             else:
                 painted += abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
     except ValueError:
-        return 1.0  # GDAL says what is wrong with it
+        return 1.0  # GDAL states the fault
     return max(painted / cells, 1.0)
 
 
@@ -256,8 +257,8 @@ def _in_archive(path: Path, what: str) -> tuple[str, str]:
 
 
 def thinned(read: Callable[..., NDArray[Any]], dataset: Any, bands_read: Any, every: int) -> NDArray[Any]:
-    """Every so many rows and columns of what `read` gives of a dataset. GDAL's own way to read fewer cells unpacks
-    a tile again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
+    """Returns every n-th row and column of a dataset's `read`. GDAL's own way to read fewer cells unpacks a tile
+    again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
     from rasterio.windows import Window
 
     if every == 1:
@@ -270,7 +271,7 @@ def thinned(read: Callable[..., NDArray[Any]], dataset: Any, bands_read: Any, ev
 
 
 def middle_of(dataset: Any, most_side: int) -> Any:
-    """The window of so many rows and columns in the middle of a dataset, or of all that there are."""
+    """Returns the window of at most `rows` x `cols` cells in the middle of a dataset."""
     from rasterio.windows import Window
 
     rows, cols = min(dataset.height, most_side), min(dataset.width, most_side)

@@ -41,9 +41,9 @@ _UNITS_M = {
     **dict.fromkeys(("km", "kilometre", "kilometer"), 1000.0),
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
 }
-"""What a file may call the unit of its heights, in metres. Written as `_plain_unit` leaves it."""
+"""Names of height units in files, in metres. Written as `_plain_unit` leaves it."""
 _METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
-"""Where an image without a place lies."""
+"""Coordinate system of an image without a place."""
 _HALF_WORLD_M = math.pi * 6_378_137.0
 """Half of the side of the web's map, EPSG:3857."""
 _DEEPEST_ZOOM = 24
@@ -53,11 +53,11 @@ _MOST_CODES, _LEAST_CODES = 256, 3
 """Different values of a map of codes: as many as a byte has; and with fewer than three a height model in whole
 metres holds codes of a table by chance (decision 45)."""
 _LOOK_CELLS = 128
-"""A side of what is looked at first: most height models are ruled out by 16,384 heights."""
+"""Side of the sample that is examined first: most height models are ruled out by 16,384 heights."""
 
 
 def read_raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    """What a raster gives: heights, or the classes of a land-cover map on level ground.
+    """Reads a raster: heights, or the classes of a land-cover map on flat ground.
 
     Raises TerrainError if it cannot be read, may be one or the other, or does not fit a grid (see `plan_grid`).
     """
@@ -90,7 +90,7 @@ def _level_cover(dataset: Any, place: _Place, path: Path, config: TerrainConfig,
 
 @dataclass(frozen=True)
 class Contents:
-    """What a raster holds.
+    """Kind of a raster's content.
 
     is_cover  codes of land cover, or a drawing of them
     encoding  how heights are stored as colours; None where numbers are heights
@@ -103,7 +103,7 @@ class Contents:
 
 
 def contents_of(dataset: Any, what: str, config: TerrainConfig) -> Contents:
-    """What a raster holds, by what the scenario says, else by its content.
+    """Returns the kind of a raster's content, by the scenario or else by its values.
 
     Raises TerrainError that names the setting which answers, if it may be one or the other.
     """
@@ -185,7 +185,7 @@ class _Place:
 
 
 def _place_of(dataset: Any, path: Path, config: TerrainConfig, holds: Contents) -> _Place:
-    """Where a raster lies.
+    """Returns the georeference of a raster.
 
     An image without a place lies where its path says if that is the path of a tile of a web map, zoom/x/y.png. Else
     it lies anywhere, in metres.
@@ -272,7 +272,7 @@ def _rows_of(dataset: Any, row0: int, row1: int) -> Floats:
 
 
 def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, float, list[str]]:
-    """(factor, offset) that make metres of what is stored, and what people should know of them."""
+    """Returns (factor, offset) from stored values to metres, and notes for people."""
     notes = []
     factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
     if (factor, offset) != (1.0, 0.0):
@@ -297,8 +297,7 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
 
 
 def _sampled(dataset: Any) -> Floats:
-    """The first band, or of a large one so many of its cells as fit, float32, as stored; NaN where no height is
-    declared."""
+    """Returns the first band, or a sample of a large one, float32, as stored; NaN where no height is declared."""
     every = math.ceil(math.sqrt(max(dataset.height * dataset.width / MOST_SAMPLED, 1.0)))
     sample: Floats = thinned(dataset.read, dataset, 1, every).astype(np.float32)
     known = thinned(dataset.read_masks, dataset, 1, every) > 0

@@ -1,4 +1,4 @@
-"""Where a terrain comes from: built in, or from a file of any kind, put on one square metric grid."""
+"""Sources of terrain: built in, or from a file of any kind, put on one square metric grid."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Source:
 
     elevation_m  float32 (rows, cols), m; NaN is a void
     classes      uint8 (rows, cols), TerrainClass
-    readings     uint8 (rows, cols), which classes an unknown cell may be, bits of `layers.READABLE`; 0 where none
-                 is known; None if nobody looked
+    readings     uint8 (rows, cols), possible classes of an unknown cell, bits of `layers.READABLE`; 0 where none is
+                 known; None without readings
     photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
     drawn        that the photo's own pixels are those of a drawn map, for people; None if they may be a photo's
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
-    level        bool (rows, cols), level ground as the file has it, before any resampling; None if nobody looked
-    notes        where it comes from and what was done to it, for people
+    level        bool (rows, cols), flat cells of the file, before any resampling; None if not examined
+    notes        origin and processing steps, for people
     """
 
     grid: GridSpec
@@ -65,7 +65,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     seed : int
         Of what is made up.
     progress : callable
-        Told what is done and how much of it.
+        Called with the current step and the share of it that is done.
 
     Raises
     ------
@@ -254,7 +254,7 @@ FILE_KINDS = ", ".join(_READERS)
 
 
 def is_terrain(path: Path) -> bool:
-    """Whether a file is named as one that holds a terrain, or begins as a raster."""
+    """Returns True if a file is named as one that holds a terrain, or begins as a raster."""
     return path.suffix.lower() in _READERS or is_raster(path)
 
 
@@ -283,7 +283,8 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
 
 
 def with_water(source: Source, config: TerrainConfig) -> Source:
-    """What is level in the file, or lower than the scenario says, is water where nothing else shows what it is."""
+    """Flat areas of the file, and cells lower than the scenario's limit, are water unless other evidence
+    contradicts."""
     water = np.zeros(source.classes.shape, np.bool_)
     if source.level is not None and config.level_is == "water":
         water |= source.level

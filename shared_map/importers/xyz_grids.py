@@ -30,21 +30,23 @@ _FURTHEST = 1e9
 """Metres or degrees: 25 times around the Earth. Beyond it no system has coordinates, and float64 still tells a
 micrometre."""
 _OFF_STEP = 0.05
-"""Of a step: printed coordinates are rounded. Points further off would be put into cells whose middle they miss."""
+"""Share of a step: printed coordinates are rounded. Points further off would be put into cells whose middle they
+miss."""
 _LEAST_FILLED = 0.1
-"""Of a grid's cells: points with fewer lie scattered, and a small file would ask for the memory of a large grid."""
+"""Share of a grid's cells: points with fewer are scattered, and a small file would ask for the memory of a large
+grid."""
 _X = ("x", "lon", "long", "lng", "longitude", "easting", "east", "e")
 _Y = ("y", "lat", "latitude", "northing", "north", "n")
 _Z = ("z", "h", "height", "elevation", "elev", "alt", "altitude", "dem", "value")
 _DEGREES = ("lon", "long", "lng", "longitude", "lat", "latitude")
 
 _NO_NUMBERS = (ValueError, IndexError, OverflowError)
-"""What numpy raises on lines that are not as they should be."""
+"""Exceptions of numpy on malformed lines."""
 Points = NDArray[np.float64]
 
 
 class _Layout(NamedTuple):
-    """How a text is laid out.
+    """Layout of a text.
 
     delimiter  between numbers; None is any blank
     header     number of the line that names columns; 0 if there is none
@@ -169,7 +171,7 @@ def _bad_line(
 
 
 def _heights(numbers: Points) -> Floats:
-    """What is too large for float32 becomes infinite, which is a void."""
+    """A value that is too large for float32 becomes infinite, which is no-data."""
     with np.errstate(over="ignore"):
         return numbers.astype(np.float32)
 

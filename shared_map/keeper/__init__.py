@@ -3,7 +3,8 @@ those that are gone. One runs in a swarm, or several, which hold the same.
 
 - A mark is acknowledged once it is on a keeper's disk: the keeper's digest names what it has committed, and nothing
   else (`mark_store`). A store survives kill -9 at any instant.
-- What dead authors left shrinks to what can still win (`compaction`), and is put back if one turns out to live.
+- Mark sets of dead authors shrink to the marks that can still win (`compaction`), and are restored if such an
+  author turns out to live.
 - Operators order at a keeper: zones, which are marks of authors of their own (`zone_orders`), and all else, in a
   book that all keepers merge (`order_service`). An answer promises that the order is on the disk.
 - A machine without the files of a terrain gets them from a keeper (`base_map`).

@@ -1,8 +1,8 @@
 """The base map on the wire: a terrain in packed pieces, and a terrain again, for machines that lack its files.
 
-What a piece must hash to is told beforehand, so that a false one is refused when it comes; that the whole is the
-terrain of the run is seen from the run's digest. A keeper answers for it (`BaseMapServer`), and a process without
-the files asks for it (`fetch_base_map`).
+The hash of each piece is sent beforehand, so that a false piece is refused on receipt; the run's digest shows that
+the whole is the terrain of the run. A keeper answers for it (`BaseMapServer`), and a process without the files asks
+for it (`fetch_base_map`).
 """
 
 from __future__ import annotations
@@ -49,16 +49,17 @@ LAYERS = {
     "photo": _Layer(np.uint8, 3),
 }
 NEEDED = ("ground", "elevation", "classes")
-"""What all need. The prior pace follows from the ground and the vehicle's radius; the photo is to look at."""
+"""Layers that every process needs. The prior pace follows from the ground and the vehicle's radius; the photo is to
+look at."""
 _PIECES_KEPT = 1024
 """Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
 _REGIONS_AT_ONCE = 8
 _PIECES_PER_REQUEST = 64
-"""Of at most 64 KiB each: what one answer may cost a keeper."""
+"""Pieces of at most 64 KiB each: the largest cost of one reply to a keeper."""
 _ASK_TIMEOUT_S = 3.0
 _PAUSE_S = 0.25
 _MOST_KEEPERS = 16
-"""Whoever answers for a base map beyond these is not asked."""
+"""Further processes that reply for a base map are not queried."""
 
 
 def layers_of(terrain: Terrain) -> dict[str, NDArray[Any]]:
@@ -79,7 +80,7 @@ def region_window(grid: GridSpec, region: int) -> Window:
 
 
 def describe(terrain: Terrain, keeper: str) -> BaseMap:
-    """What a keeper tells of its terrain: grid, notes, and the digest of every layer of every region.
+    """Returns a keeper's description of its terrain: grid, notes, and the digest of every layer of every region.
 
     `keeper` is the keeper's id, which a refusal names.
     """
@@ -168,18 +169,18 @@ class BaseMapCopy:
         for layer in layers:
             kind = LAYERS[layer]
             shape = (self.grid.rows, self.grid.cols)
-            # Of `empty` the system gives memory page by page, when a piece is written there.
+            # For `empty` the system allocates memory page by page, when a piece is written there.
             self._arrays[layer] = np.empty(shape if kind.depth == 1 else (*shape, kind.depth), kind.dtype)
 
     def missing(self, at_most: int) -> Iterator[tuple[str, list[int]]]:
-        """(layer, regions) still to come, at most so many regions of each layer."""
+        """Returns (layer, regions) still missing, up to a limit of regions per layer."""
         for layer, regions in self._missing.items():
             if regions:
                 yield layer, list(regions)[:at_most]
 
     @property
     def share(self) -> float:
-        """How much of it has come, 0 to 1."""
+        """Share of the map that has arrived, 0 to 1."""
         left = sum(len(regions) for regions in self._missing.values())
         return 1.0 - left / (len(self._missing) * self.grid.regions)
 
@@ -301,7 +302,7 @@ class BaseMapServer:
 
 @dataclass(frozen=True, slots=True)
 class Fetching:
-    """What to fetch, and how long to try.
+    """Layers to fetch, and the time limit.
 
     terrain   digest of the run's terrain
     within_s  gives up when so long nothing has come
@@ -316,8 +317,8 @@ class Fetching:
 def fetch_base_map(bus: Bus, wanted: Fetching, why: str, progress: Progress = no_progress) -> Terrain:
     """The run's terrain from any keeper that has it. Blocks; for the start of a process, on its main thread.
 
-    why  what is missing here, to begin the sentence with when it fails: "there is no file ..."
-    Raises TerrainError when no keeper gives it, or what comes is another terrain.
+    why  the missing part, to begin the sentence with when it fails: "there is no file ..."
+    Raises TerrainError if no keeper serves it, or if it is another terrain.
     """
     patience_s = time.monotonic() + wanted.within_s
     refusals: dict[str, str] = {}

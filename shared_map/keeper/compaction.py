@@ -1,17 +1,17 @@
 """Compaction: what dead authors left shrinks to the statements that can still win.
 
-Of the statements of a group's dead authors about one cell only the newest lasting one can ever win; what it
-overrules is dropped from its author's set. A set with nothing left becomes a tombstone: a set without statements,
-whose number says that it is compacted, and at which replicas forget that author's set of the tile.
+Of the marks of a group's dead authors in one cell only the newest lasting one can ever win; overruled marks are
+dropped from their author's set. A set with nothing left becomes a tombstone: a set without statements, whose number
+says that it is compacted, and at which replicas forget that author's set of the tile.
 
 A compacted set has a number between those of the author: it replaces the set which it was made of, and no newer
-one. So two keepers may compact with different knowledge: whichever compacted set stays, no winner was dropped. The
-store keeps what was dropped for good.
+one. Two keepers may therefore compact with different knowledge: any compacted set keeps every winner. The store
+keeps dropped marks permanently.
 
 The law: the compacted sets of a tile are a function of its whole sets, dropped statements included, and of which
-authors are dead. Whenever either changes, or may have changed unseen, the tile is due. So a statement is missing
-from the map only as long as a newer lasting one of a dead author stands there: should that author turn out to live,
-what it had overruled is put back, before it can take anything back.
+authors are dead. Whenever either changes, or may have changed unseen, the tile is due. A mark is therefore missing
+from the map only as long as a newer lasting one of a dead author covers it. If that author turns out to live, the
+overruled marks are restored before it can retract any.
 """
 
 from __future__ import annotations
@@ -48,11 +48,12 @@ class CompactionPlan:
         self._heard_ns[author] = now_ns
 
     def is_gone(self, author: str) -> bool:
-        """Whether an author counts as dead since the last update."""
+        """Returns True if an author counts as dead since the last update."""
         return author not in self._heard_ns
 
     def accepted(self, mark_set: MarkSet) -> None:
-        """A set was merged: a dead author's may need compaction, or retract what had overruled others."""
+        """Accepts a merged set: a dead author's may need compaction, or may retract marks that had overruled
+        others."""
         if self.is_gone(mark_set.author) or mark_set.author in self._gone:
             self._due[mark_set.tile] = None
 
@@ -93,10 +94,11 @@ class CompactionPlan:
 def compact(
     sets: Sequence[MarkSet], dropped: Mapping[str, MarkSet], gone: Collection[str], ended_ns: int
 ) -> list[MarkSet]:
-    """The sets to publish so that only what can win is left of a tile's dead authors; none if that is so already.
+    """Returns the sets to publish, so that only possible winners are left of a tile's dead authors; none if that is
+    so already.
 
     sets      all sets of one tile
-    dropped   author -> what was dropped from its set of this tile before, under the number of that compacted set
+    dropped   author -> marks dropped from its set of this tile before, under the number of that compacted set
     gone      dead authors
     ended_ns  statements which expired by then are dropped, too
     """
@@ -124,7 +126,7 @@ def compact(
 
 
 def _whole(held: MarkSet | None, dropped: MarkSet | None) -> MarkSet | None:
-    """The author's own last set as far as it is known: what is held of it, and what was dropped from it."""
+    """Returns the author's own last set as far as it is known: held marks and dropped ones."""
     if dropped is None or held is None:
         return held if dropped is None else dropped
     ours, theirs = (held.epoch, base_seq(held.seq)), (dropped.epoch, base_seq(dropped.seq))
@@ -153,7 +155,7 @@ def united(one: MarkSet, other: MarkSet | None = None) -> MarkSet:
 
 
 def without(whole: MarkSet, left: MarkSet) -> MarkSet:
-    """What `whole` states about cells of which `left` states nothing, under the number of `left`."""
+    """Returns the marks of `whole` in cells without a mark in `left`, under the number of `left`."""
     said = statements(whole)
     gone = taken(said, np.flatnonzero(~np.isin(said.cells, statements(left).cells)))
     return mark_set(whole.author, whole.group, whole.tile, left.epoch, left.seq, gone)

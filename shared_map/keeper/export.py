@@ -22,7 +22,7 @@ from swarm.wire.messages.map_data import FOREVER, MarkKind, MarkSet
 
 FORMAT = "swarm-map/1"
 NOTHING_SAID_BAND = 255
-"""Above every MarkKind: the value that a GIS is told to leave out."""
+"""Above every MarkKind: the no-data value for a GIS."""
 
 
 class _Mark(msgspec.Struct, array_like=True, gc=False):
@@ -35,7 +35,8 @@ class _Mark(msgspec.Struct, array_like=True, gc=False):
 
 
 class _Learned(msgspec.Struct, array_like=True, gc=False):
-    """What an author has measured of one kind of ground (`shared_map.learning`), and how people call that."""
+    """An author's measurement of one terrain class (`shared_map.learning`), with the name of the class for
+    people."""
 
     key: int
     kind: str
@@ -64,7 +65,7 @@ class _Export(msgspec.Struct):
 
 
 class ExportedMap(NamedTuple):
-    """What a store holds.
+    """Content of a store.
 
     terrain  its digest
     classes  of vehicles beside "ground", in the order of their numbers; None if that is not known
@@ -77,8 +78,8 @@ class ExportedMap(NamedTuple):
 
 
 def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet], classes: Sequence[str] = ()) -> str:
-    """Every set, readable: marks as [row, col, kind, pace or null, stamp_ns] and, where one ends by itself, when;
-    what was learned as [number, kind of ground, cells, mean and variance of 65536 ln(driven / prior pace)]."""
+    """Returns every set, readable: marks as [row, col, kind, pace or null, stamp_ns] and the time of expiry, if
+    any; learned factors as [number, terrain class, cells, mean and variance of 65536 ln(driven / prior pace)]."""
     listed = [
         {
             "author": each.author,
@@ -122,7 +123,7 @@ def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
 
 
 def from_json(text: str | bytes) -> ExportedMap:
-    """What was exported. Raises StoreError with the place of what is wrong."""
+    """Reads an export. Raises StoreError with the place of the fault."""
     try:
         read = msgspec.json.decode(text, type=_Export)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -181,7 +182,7 @@ def to_cells(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
     """(pace, kind, stamp) of the winning marks for all vehicles, (rows, cols) each. The pace is in s/m: inf is
     lethal, nan is as the prior has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything. The
-    stamp is when the mark was made: UNIX time in ns, 0 where nobody says anything."""
+    timestamp is the time of the mark: UNIX time in ns, 0 without a mark."""
     replica = MapReplica(grid)
     replica.merge(list(sets))
     replica.tick(now_ns)
@@ -189,7 +190,7 @@ def to_cells(
     kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
     stamps_ns = np.zeros(grid.cells, np.int64)
     for tile in replica.held.tiles:
-        if tile >= grid.tiles:  # what is learned, and what is said for one class alone
+        if tile >= grid.tiles:  # learned factors, and marks for one class alone
             continue
         won = replica.winners(tile)
         cells = grid_cells(grid, tile_corners(grid, tile), won.cells)

@@ -24,11 +24,11 @@ def run(
     store_path: Path | None = None,
     rebuild: bool = False,
 ) -> None:
-    """Keep the map until told to stop.
+    """Keeps the map until told to stop.
 
     store_path  the SQLite file; if not given, `map.sqlite` in the run's folder (`map-ID.sqlite` of a keeper whose
                 id is not 0), or memory where there is none
-    rebuild     a damaged store is moved aside and filled anew from the swarm
+    rebuild     a damaged store is moved aside, and a new one is filled from the swarm
     """
     terrain = load_terrain(setup)
     if store_path is None and setup.run_dir is not None:

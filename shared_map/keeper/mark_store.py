@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 STORE_VERSION = "2"
 _MEMORY = ":memory:"
 _LOG_BYTES = 1 << 20
-"""How far SQLite's write-ahead log grows beside the store, give or take one batch."""
+"""Size of SQLite's write-ahead log beside the store, give or take one batch."""
 BATCH_BYTES = 1 << 19
 """Marks of one commit, about."""
 _LONGEST_VALUE_BYTES = 16 << 20
@@ -82,7 +82,7 @@ SELECT DISTINCT tile / (:tiles + 1) FROM (
 """Numbers of classes for which alone something is marked, or was until compaction set it aside."""
 _DELETE = "DELETE FROM sets WHERE tile = ? AND author = ? AND (epoch, seq) <= (?, ?)"
 _OUTDATE = "DELETE FROM folded WHERE tile = ? AND author = ? AND (epoch, seq) < (?, ?)"
-"""What was dropped from a set counts only until its author states something newer."""
+"""Marks dropped from a set count only until their author publishes a newer set."""
 _DROP = f"REPLACE INTO folded ({', '.join(_COLUMNS)}, since_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 
 
@@ -90,8 +90,8 @@ class KeeperStore:
     """Every set in one SQLite file, or in memory under the name ":memory:". One writing process at a time.
 
     A commit is on the disk when it returns (WAL with synchronous=FULL): it survives kill -9 of this process at any
-    instant, and a power cut if the disk keeps what it was told to flush. All methods raise StoreError where the
-    file is damaged or cannot be written.
+    instant, and a power cut if the disk flushes as requested. All methods raise StoreError where the file is
+    damaged or cannot be written.
 
     rebuild    move a damaged file aside, and begin an empty one, which the swarm fills
     read_only  look at a store, even while a keeper writes it
@@ -139,9 +139,8 @@ class KeeperStore:
 
     def _class_order(self, given: list[str], grid: GridSpec) -> list[str]:
         """The classes in the order of their numbers, once a run with these has the store: those of the run, then
-        what only the store knows. Raises StoreError where a mark for one class alone would become one for another,
-        or for nobody though the class is there. A store which is older than its marks may lack some of their
-        classes."""
+        what only the store knows. Raises StoreError if a mark for one class alone would become one for another, or
+        for none though the class exists. A store which is older than its marks may lack some of their classes."""
         stored = self.classes
         with self._reading():
             used = sorted(row[0] for row in self._db.execute(_CLASSES_USED, {"tiles": grid.tiles}))
@@ -176,8 +175,8 @@ class KeeperStore:
 
     @property
     def classes(self) -> list[str]:
-        """The classes of vehicles beside "ground", in the order of the numbers by which marks name them; none in a
-        store that was not told them."""
+        """Returns the classes of vehicles beside "ground", in the order of the numbers by which marks name them;
+        none in a store without that table."""
         text = self._meta("classes")
         with self._reading("classes: "):
             return [] if text is None else msgspec.json.decode(text, type=list[str])
@@ -204,7 +203,7 @@ class KeeperStore:
         return self._sets("FROM sets")
 
     def set_aside(self, tile: int) -> dict[str, MarkSet]:
-        """Author -> what was dropped from its set of this tile, under the number of its last compacted set."""
+        """Returns author -> marks dropped from its set of this tile, under the number of its last compacted set."""
         return {each.author: each for each in self._sets("FROM folded WHERE tile = ?", tile)}
 
     def tiles_set_aside(self) -> list[int]:
@@ -224,8 +223,8 @@ class KeeperStore:
         return found[0] if found else None
 
     def save(self, sets: Iterable[MarkSet], now_ns: int = 0) -> None:
-        """Commit all or none. What a compacted set lacks of the set that it replaces is set aside. A StoreError
-        leaves the store usable."""
+        """Commit all or none. Marks which a compacted set lacks of the set that it replaces are archived. A
+        StoreError leaves the store usable."""
         given = list(sets)
         own = [each for each in given if each.seq % SEQ_STEP == 0]
         with self._writing():
@@ -313,8 +312,8 @@ def _open(path: str) -> sqlite3.Connection:
     try:
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
-        # What is committed is taken over from the log as soon as it has so many pages, and the log's file is cut to
-        # that then: otherwise a small disk is full of its log for good.
+        # Committed pages are checkpointed as soon as the log has this number of them, and the log file is truncated
+        # then: otherwise the log fills a small disk permanently.
         db.execute(f"PRAGMA wal_autocheckpoint = {_LOG_BYTES // 4096}")
         db.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE_BYTES)
@@ -396,7 +395,7 @@ KEEPER_STORE = ExternalCalls(
     },
     facts={"path": Path},
 )
-"""What a keeper uses of its store."""
+"""Calls of its store that a keeper uses."""
 
 
 class Keeper:
@@ -419,7 +418,7 @@ class Keeper:
 
     @property
     def waiting(self) -> int:
-        """How many sets are to be saved."""
+        """Number of sets that wait to be saved."""
         return len(self._waiting)
 
     def batches(self) -> Iterator[list[MarkSet]]:
@@ -436,7 +435,7 @@ class Keeper:
             yield batch
 
     def saved(self, sets: Iterable[MarkSet]) -> None:
-        """These sets are on the disk, or their tombstones deleted what was there."""
+        """Accepts that these sets are on the disk, or that their tombstones deleted older ones."""
         for each in sets:
             if is_tombstone(each):
                 self.committed.drop(each.author, each.tile)

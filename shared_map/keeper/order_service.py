@@ -1,4 +1,4 @@
-"""The keeper's book of orders: what it acknowledges is on its disk, and told to all."""
+"""The keeper's book of orders: an acknowledged order is on its disk, and published to all."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from swarm.wire.topics import GIVE_ORDER, ORDERS
 _PUBLISH_NS = NS_PER_S
 _TAG = "orders"
 _MOST_ADDED = 4096
-"""Agents beyond the scenario: whoever holds a certificate may raise tokens of any number."""
+"""Limit of agents beyond the scenario: the holder of a certificate may raise tokens of any number."""
 
 
 class KeptOrders:
@@ -57,7 +57,8 @@ class KeptOrders:
         self._bus.ask(ORDERS, Nothing(), self._post, tag=_TAG)
 
     def take_order_event(self, event: Event, now_ns: int) -> Order | str | bool:
-        """Whether the event was about orders and is done with; if one was given, the order, or why not."""
+        """Returns True if the event was about orders and needs no other handler; for a given order also the order,
+        or the reason for refusing it."""
         match event:
             case Appeared(peer=Peer(role="agent", id=id)):
                 if len(self._added) < _MOST_ADDED and all(plan.id != id for plan in plan_agents(self._scenario)):
@@ -96,7 +97,7 @@ class KeptOrders:
             self._store.save_orders(self._unsaved)
             self._unsaved = []
         except StoreError:
-            return  # it is said of the marks, which fare no better; who asks meanwhile asks others, too
+            return  # the alarm about marks covers it, which fare no better; meanwhile askers ask others, too
         self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
 
     def _take(self, given: GiveOrder, now_ns: int) -> Order | str:

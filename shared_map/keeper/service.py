@@ -41,17 +41,17 @@ _RETRY_NS = NS_PER_S
 """A disk that refused is tried again after this."""
 _NOTE_AGAIN_NS = 60 * NS_PER_S
 _NAME_AT_MOST = 16
-"""Authors that are named in gauges and notes: each gauge is a line for whoever collects them."""
+"""Authors that are named in gauges and events: each gauge is a line for its collector."""
 _COMPACT_EVERY_NS = NS_PER_S
 _COMPACT_TILES = 16
 """Compacted at once: what sets that arrive wait for is bounded."""
 _MOST_PROCESSES = 4096
-"""So many `Stats` are remembered: whoever holds a certificate may write under any number of ids."""
+"""Number of remembered `Stats`: the holder of a certificate may write under any number of ids."""
 
 
 class KeeperService:
-    """A replica which writes every set to its store, tells by its digest what is safe there, and answers for all
-    authors, above all for dead ones.
+    """A replica which writes every set to its store, publishes by its digest which sets are safe there, and replies
+    for all authors, above all for dead ones.
 
     replica   the marks
     counters  what the process publishes of itself
@@ -69,7 +69,7 @@ class KeeperService:
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
         self._stats: dict[tuple[str, str], Stats] = {}
-        """(role, id) -> the newest `Stats` of every process: those of the gone are for whoever comes later."""
+        """(role, id) -> the newest `Stats` of every process: those of ended processes are for late subscribers."""
         self._roster = Roster()
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
@@ -242,11 +242,11 @@ class KeeperService:
         asked.end()
 
     def _compact(self, now_ns: int) -> None:
-        """Compact what dead authors left, a few tiles at a time. The store is written before anything is published,
-        so that it can always put back what was dropped."""
+        """Compact what dead authors left, a few tiles at a time. The store is written before any set is published,
+        so that it can always restore dropped marks."""
         plan = self._plan
         plan.update(self.replica.held.ledger, now_ns)
-        # What a dead author has learned stays as it was said: nothing overrules it.
+        # Measurements of a dead author stay as they are: no set overrules them.
         beyond = beyond_tile(self.replica.grid)
         tiles = [tile for tile in plan.take_due(_COMPACT_TILES, now_ns) if tile != beyond]
         compacted: list[MarkSet] = []

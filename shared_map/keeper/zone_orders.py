@@ -39,7 +39,7 @@ from swarm.wire.messages.map_data import FOREVER, SEQ_STEP, STAMP_LIMIT_NS, Mark
 from swarm.wire.messages.orders import MOST_ZONES, Zone, ZoneOrder
 
 MOST_CELLS = 1 << 17
-"""Of one zone: what every replica takes in at once, within the quota of one author."""
+"""Limit of one zone: cells that every replica applies together, within the quota of one author."""
 MOST_IN_ALL = MAX_MARKS // 8
 """Cells of all zones: half of what a replica holds of one author."""
 

@@ -1,5 +1,5 @@
-"""From what authors have measured to one factor for each kind of ground, in integers: no step of `log_steps` rounds
-as a machine likes.
+"""One factor per terrain class from the measurements of all authors, in integers: no step of `log_steps` depends on
+a machine's rounding.
 
 The estimate is a normal one, shrunk towards no change (Gelman et al., Bayesian Data Analysis, section 2.5).
 """
@@ -20,7 +20,7 @@ from swarm.runtime.stats import LEARNED, Counters
 from swarm.wire.messages.map_data import MarkSet, owner_of
 
 Voice = Mapping[int, Measurement]
-"""What one process states: key of a kind of ground -> measurement."""
+"""Measurements of one process: key of a terrain class -> measurement."""
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
@@ -29,9 +29,9 @@ SLOPE_BINS = 6
 SLOPE_BIN_DEG = 5
 """Finer bins would be driven too seldom in a run of minutes to say anything of themselves."""
 _PRIOR_VARIANCE = ONE * 49 // 100
-"""Of ln(factor) before anything is measured: tau of 0.7."""
+"""Prior variance of ln(factor): tau of 0.7."""
 _USUAL_VARIANCE = ONE // 10
-"""Of y from cell to cell: paces of one kind differ by a third."""
+"""Variance of y from cell to cell: paces of one terrain class differ by a third."""
 _USUAL_CELLS = 20
 """A variance of few cells is uncertain: it is taken together with this many cells of the usual one. With five, six
 cells that happened to be alike moved a class that was right."""
@@ -41,7 +41,7 @@ _GATE = 20
 """Square of the number of standard errors that a mean must be away from 0: 4.5 of them. At two, one in twenty kinds
 that are right in the prior would be moved."""
 _MEDIAN_FROM = 5
-"""So many authors are judged by their median: of fewer, two that agree could be two lies."""
+"""Number of authors from which on they are judged by their median: of fewer, two that agree could both be false."""
 STEPS_PER_10TH = 6246
 """ln(1.1) in `ONE`: factors are powers of 1.1."""
 MOST_STEPS = 14
@@ -75,13 +75,13 @@ def log_steps(stated: Sequence[Measurement]) -> int:
 
 
 def estimate(stated: Sequence[Measurement]) -> Measurement:
-    """What all authors together state of one kind of ground: the cells that count, the mean, and the variance of
-    one cell. No cells if nobody states anything.
+    """Combines all authors' measurements of one terrain class: the cells that count, the mean, and the variance of
+    one cell. No cells if there are no measurements.
 
     No author's mean counts for more than the largest factor there is. Five authors or more that know five cells
-    each count by their median: less than half of them cannot move it beyond what an honest one states. Of fewer
-    none has a weight above twice the lower median of theirs, so that one liar among n moves the mean by 2 / (n + 1)
-    of the largest factor at most where all know as many cells.
+    each count by their median: less than half of them cannot move it beyond what an honest one states. With fewer,
+    no author has a weight above twice the lower median of theirs: one false author among n moves the mean by 2 / (n
+    + 1) of the largest factor at most, if all know as many cells.
     """
     known = sorted(each for each in stated if each.cells > 0)
     knowing = [each for each in known if each.cells >= _FEWEST_CELLS]
@@ -92,7 +92,7 @@ def estimate(stated: Sequence[Measurement]) -> Measurement:
         variance = _median([each.variance for each in knowing])
         cells = len(knowing) * _median([each.cells for each in knowing])
     else:
-        # Of those that know something: one that has hardly begun must not take the weight of all others.
+        # Only of those with measurements: one that has hardly begun must not take the weight of all others.
         counted = [each.cells for each in knowing or known]
         cap = 2 * counted[(len(counted) - 1) // 2] if len(known) > 1 else MOST_CELLS
         bounded = [each._replace(mean=_within(each.mean)) for each in known]
@@ -102,7 +102,7 @@ def estimate(stated: Sequence[Measurement]) -> Measurement:
 
 
 def factors_of(voices: Sequence[Voice]) -> Floats:
-    """What to multiply the prior pace of each kind of ground by: float32 (KEYS,). A kind that is hardly driven yet
+    """Returns the factor on the prior pace of each terrain class: float32 (KEYS,). A kind that is hardly driven yet
     has the factor of its class."""
     of_classes = [
         (kind, _together(parts))
@@ -122,7 +122,7 @@ def factors_of(voices: Sequence[Voice]) -> Floats:
 
 
 def factors_in(sets: Iterable[MarkSet]) -> Floats:
-    """What to multiply the prior pace of each kind of ground by: float32 (KEYS,).
+    """Returns the factor on the prior pace of each terrain class: float32 (KEYS,).
 
     sets  about the tile beyond the map; what carries no measurements is left out
     """
@@ -130,7 +130,7 @@ def factors_in(sets: Iterable[MarkSet]) -> Floats:
 
 
 class LearnedKind(NamedTuple):
-    """What is known of one kind of ground.
+    """State of one terrain class.
 
     kind            its class and its slopes in degrees, such as `forest 10-15`
     cells           driven cells, as all authors say together
@@ -180,7 +180,7 @@ class LearnedGauges:
         self._cells = None if keys is None else np.bincount(keys.reshape(-1), minlength=KEYS)
 
     def tick(self, factors: Floats) -> None:
-        """Publishes what is new.
+        """Publishes new gauges.
 
         factors  float32 (KEYS,)  another array whenever they have changed
         """

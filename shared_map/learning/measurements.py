@@ -1,10 +1,9 @@
-"""What an author measures of kinds of ground, and how that travels: as one more set of marks, about a tile beyond
-the map.
+"""An author's measurements of terrain classes, and their encoding: as one more mark set, in a tile beyond the map.
 
-So measurements have all that sets of marks have: numbers of which the newest wins, groups, quotas, authority by
-key, digests, late joins, the keeper's store. The cells of such a set are no places: cell 3 * key is the number of
-cells driven on that kind of ground, the next two are the mean and the variance of y = ln(driven pace / prior pace).
-Each number is written as a pace of 1 + n / 65536, which float32 holds exactly, within the bounds of marks.
+Measurements therefore have all properties of mark sets: numbers of which the newest wins, groups, quotas, authority
+by key, digests, late joins, the keeper's store. The cells of such a set are no places: cell 3 * key is the number
+of cells driven on that terrain class, the next two are the mean and the variance of y = ln(driven pace / prior
+pace). Each number is written as a pace of 1 + n / 65536, which float32 holds exactly, within the bounds of marks.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from swarm.wire.messages.map_data import MarkKind, MarkSet
 KEYS = 256
 """More kinds of ground than any terrain has; their number is a byte."""
 ONE = 1 << 16
-"""What is 1 in y and in its variance."""
+"""The integer for 1 in y and in its variance."""
 MOST = 5 * ONE
 """No |y| is taken for more: a pace e^5 times the prior's. The variance is at most the square of it, 25."""
 MOST_CELLS = (1 << 20) - 1
@@ -34,11 +33,11 @@ _MOST_VARIANCE = MOST * MOST // ONE
 _BIN = ONE // 64
 """Width of the bins of a trimmed mean, each with the exact sums of its own: memory does not grow with the cells."""
 _CUT = 4
-"""One in so many is left out at each end: the middle half stays."""
+"""One of this number is left out at each end: the middle half stays."""
 
 
 class Measurement(NamedTuple):
-    """What an author has measured of one kind of ground: cells, and mean and variance of y in `ONE`."""
+    """An author's measurement of one terrain class: cells, and mean and variance of y in `ONE`."""
 
     cells: int
     mean: int
@@ -69,7 +68,7 @@ def columns_of(measured: Mapping[int, Measurement], stamp_ns: int) -> Columns:
 
 
 def measurements_in(mark_set: MarkSet) -> dict[int, Measurement] | None:
-    """Key -> measurement, of a set about the tile beyond the map; None if it carries none: nobody takes it in."""
+    """Returns key -> measurement, of a set in the tile beyond the map; None if it carries none, and is refused."""
     if not mark_set.kinds:
         return {}
     cells = column(mark_set.cells, "<u2").astype(np.int64)
@@ -134,7 +133,7 @@ class TrimmedMean:
 
 
 def _first(order: list[list[int]], cut: int) -> tuple[int, int, int]:
-    """(the number that comes after so many, the sum of these, that of their squares); of a bin that is cut in two
+    """Returns (the number at this rank, the sum of those below, that of their squares); of a bin that is cut in two
     each part has the mean of the whole."""
     total = squares = 0
     for cells, of_bin, of_squares in order:
@@ -153,7 +152,7 @@ def rounded(number: int, by: int) -> int:
 
 
 class Measured:
-    """What one author has measured. A cell counts once, the first time that it is driven.
+    """Measurements of one author. A cell counts once, the first time that it is driven.
 
     version  grows with every cell that counts
     """
@@ -165,7 +164,7 @@ class Measured:
         self._means: dict[int, TrimmedMean] = {}  # by key
 
     def add(self, cell: int, driven_s_per_m: float, prior_s_per_m: float) -> None:
-        """A cell was driven at this pace. What is no pace, or lethal by the prior, says nothing."""
+        """A cell was driven at this pace. An invalid pace, or a lethal prior, gives no measurement."""
         if self._driven[cell] or not (0 < driven_s_per_m < math.inf and 0 < prior_s_per_m < math.inf):
             return
         self._driven[cell] = True

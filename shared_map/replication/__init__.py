@@ -2,7 +2,7 @@
 
 1. A *statement* says of one cell: this pace, lethal, or clear; with a stamp, and perhaps an end (`marks`). An
    author keeps all its statements about a tile of 32 x 32 cells in one *set*, under a number (epoch, seq). Its set
-   with a higher number replaces the one with a lower number; nobody else may write under its name.
+   with a higher number replaces the one with a lower number; no other process may write under its name.
 2. *The merge law* (`merge`): of all statements about a cell that have not ended the newest wins, of two with one
    stamp that of the larger author; an operator's zone wins over all. It reads nothing but the sets that are held,
    so order, grouping and repetition of what arrives cannot matter: replicas that hold the same sets have the same
@@ -10,19 +10,17 @@
    above.
 3. Stamps are *hybrid logical clocks*, one for each cell: an author that has seen a statement can overrule it,
    however far the clock of the other is ahead.
-4. Sets are published when they change (`replica_sync`). Who starts asks for all that is held (*late join*). What is
-lost
-   meanwhile is found by *anti-entropy*: each replica tells by a *digest* which numbers it holds (`digest`), and who
-   misses one asks its author and the keepers for that set. A digest of late changes goes out between the whole
-   ones.
-5. A keeper shrinks what dead authors left (`shared_map.keeper.compaction`). A set with nothing left becomes a
-   *tombstone*: an empty set with a number between two of the author's, at which replicas forget the author's set
-   and remember the number for a while (`held_sets`), so that a late copy is not taken for news. An author that is
-   alive after all hears of it, and states the same again under a higher epoch.
+4. Sets are published when they change (`replica_sync`). A process that starts asks for all held sets (*late join*).
+   Losses are found by *anti-entropy*: each replica publishes the numbers that it holds as a *digest* (`digest`),
+   and a replica that misses a set asks its author and the keepers for it. A digest of late changes goes out between
+   the whole ones.
+5. A keeper shrinks what dead authors left (`shared_map.keeper.compaction`). A set without any mark left becomes a
+   *tombstone*: an empty set with a number between two of the author's, at which replicas drop the author's set and
+   remember the number for a while (`held_sets`), so that a late copy is not accepted again. An author that is alive
+   after all hears of it, and states the same again under a higher epoch.
 6. *Limits* (`author_limits`): sets and statements held, in all and by process, are bounded, and each process has a
 budget
-   of changed cells. What exceeds the budget waits, and what exceeds the bounds is refused and counted, whoever sent
-   it.
+   of changed cells. Sets beyond the budget wait; sets beyond the bounds are refused and counted, whoever sent them.
 7. *Interest* (`regions_of_interest`, `mark_filter`): a replica may hold only regions near its vehicles and only
 groups that it may
    read. Then it hears only the digests that can concern it.

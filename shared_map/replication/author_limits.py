@@ -1,4 +1,4 @@
-"""What one author may cost a replica: memory (`Capacity`) and work (`Quota`)."""
+"""Limits of one author in a replica: memory (`Capacity`) and work (`Quota`)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _PART = 4
 """No process may fill more than one part in this many of any of these."""
 
 _MAX_WAITING = 1 << 14
-"""Sets of throttled processes that wait, in all. What finds no place is asked for again once a digest names it
+"""Sets of throttled processes that wait, in all. Sets without a place are requested again once a digest names them
 (decision 18)."""
 
 _BURST_S = 10
 """A full bucket lasts so long at its rate: a vehicle that finds a burnt forest may tell of it at once."""
 _FORGET_NS = 60 * NS_PER_S
 _SPEAKS_NS = _BURST_S * NS_PER_S
-"""Who was silent for longer has a full bucket, and needs no share."""
+"""An author that was silent for longer has a full bucket, and needs no share."""
 
 
 _NOTHING = (0, 0)
@@ -36,7 +36,7 @@ class Capacity:
     Which sets are refused depends on what came first, so replicas are equal only within the bounds. The bounds
     limit what a hostile author can cost to some 330 MB.
 
-    sets, marks  what is held now
+    sets, marks held now
     """
 
     def __init__(self, max_sets: int = MAX_SETS, max_marks: int = MAX_MARKS) -> None:
@@ -67,7 +67,8 @@ class Capacity:
         return not self._fits(owner_of(author), 1, TILE_AREA)
 
     def _fits(self, owner: str, sets: int, marks: int) -> bool:
-        """True if so many more stay within the bounds; a bound of sets matters to those that add one."""
+        """Returns True if this number more stays within the bounds; a bound of sets matters to those that add
+        one."""
         own_sets, own_marks = self._owners.get(owner, _NOTHING)
         return (
             self.marks + marks <= self._max_marks
@@ -89,8 +90,8 @@ class Quota:
 
     A process whose bucket is empty waits. While the shared bucket is empty, those above their share wait too: each
     that was heard in the last ten seconds has an equal share of the total rate. One below its share is never
-    delayed, whatever the others do. Of who waits the newest set of each tile and author is kept, and let in once
-    its buckets have filled: it is late, but not lost.
+    delayed, whatever the others do. Of a waiting author the newest set of each tile is kept, and admitted once its
+    buckets have filled: it is late, but not lost.
     """
 
     def __init__(self, author_marks_per_s: float, total_marks_per_s: float = math.inf) -> None:
@@ -105,7 +106,7 @@ class Quota:
         self._counted_ns = -NS_PER_S
 
     def admits(self, mark_set: MarkSet, now_ns: int) -> bool:
-        """Whether a set may be merged now; if not, it waits here, while there is a place for it."""
+        """Returns True if a set may be merged now; if not, it waits here, while there is a place for it."""
         owner = owner_of(mark_set.author)
         if owner not in self._waiting and self._may(owner, now_ns):
             return True
@@ -121,7 +122,8 @@ class Quota:
         return False
 
     def charge(self, author: str, marks: int, now_ns: int) -> None:
-        """Merging a set of this author changed so many cells; a set that changes none costs as much as one."""
+        """Charges the author for the cells that merging its set changed; a set that changes none costs as much as
+        one."""
         cost = max(marks, 1)
         each = self._filled(owner_of(author), now_ns)
         each.heard_ns = now_ns
@@ -132,7 +134,7 @@ class Quota:
             self._total.left = max(self._total.left - cost, -self._total_rate * _BURST_S)
 
     def due(self, now_ns: int) -> MarkSet | None:
-        """A set which has waited long enough; None if there is none. Those that wait take turns."""
+        """A set which has waited long enough; None if there is none. Waiting authors take turns."""
         for owner, waiting in self._waiting.items():
             if self._may(owner, now_ns):
                 mark_set = waiting.pop(next(iter(waiting)))

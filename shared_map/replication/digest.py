@@ -1,5 +1,5 @@
-"""Digests: which (epoch, seq) of which author's sets a replica holds, how two such tables differ (`Ledger`), and
-those of others that still have to be compared with what is held (`PendingDigests`). Pure: time is an argument."""
+"""Digests: the (epoch, seq) of each author's sets that a replica holds, how two such tables differ (`Ledger`), and
+received digests that still have to be compared with the held sets (`PendingDigests`). Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _newer(rows: NDArray[np.void], base: NDArray[np.void]) -> NDArray[np.bool_]:
     """
     if not len(base):
         return np.ones(len(rows), bool)
-    # Of a garbled digest with a tile twice, the last and thus the newest row of `base` counts.
+    # If a garbled digest has a tile twice, the last and thus the newest row of `base` counts.
     place = np.searchsorted(base["tile"], rows["tile"], side="right") - 1
     there = base[np.maximum(place, 0)]
     known = (place >= 0) & (there["tile"] == rows["tile"])
@@ -124,11 +124,11 @@ def fingerprint(held: Held) -> str:
 
 
 _GRACE_NS = NS_PER_S // 10
-"""A digest may overtake the sets that it names: what is missing is asked for only this long after it came."""
+"""A digest may overtake the sets that it names: missing sets are requested only this long after it came."""
 _RETRY_NS = NS_PER_S * 15 // 100
-"""What is missing is asked for so often; with 30 % of all messages lost replicas agree within two seconds so."""
+"""Interval between requests for missing sets; with 30 % of all messages lost replicas agree within two seconds."""
 _MAX_TRIES = 10
-"""After these the sender has sent its next whole digest, with which it begins anew."""
+"""After these the sender has sent its next whole digest, which starts again."""
 _MAX_SENDERS = 4096
 _MAX_BYTES = 64 << 20
 """A digest that would exceed this is dropped: its sender repeats it within seconds."""

@@ -31,7 +31,8 @@ class Tombstones:
         self._deleted: dict[tuple[int, str], tuple[int, int, int]] = {}  # -> (epoch, seq, when heard)
 
     def covers(self, received: MarkSet) -> bool:
-        """Whether a set was deleted already. Drops the tombstone of an author that states something newer."""
+        """Returns True if a set was deleted already. Drops the tombstone of an author that states something
+        newer."""
         if not self._deleted:
             return False
         tombstone = self._deleted.get((received.tile, received.author))
@@ -44,7 +45,7 @@ class Tombstones:
         return False
 
     def above(self, tile: int, author: str, number: tuple[int, int]) -> bool:
-        """Whether a tombstone of this (epoch, seq) or above is known."""
+        """Returns True if a tombstone of this (epoch, seq) or above is known."""
         tombstone = self._deleted.get((tile, author))
         return tombstone is not None and tombstone[:2] >= number
 
@@ -67,10 +68,10 @@ class Tombstones:
 
 
 class HeldSets:
-    """A table of sets, with its digest, its size and the tombstones of what was deleted from it.
+    """A table of sets, with its digest, its size and the tombstones of deleted sets.
 
     ledger      number of every set held; digests are made of it
-    capacity    counts what is held and bounds it
+    capacity    counts and bounds the held sets
     tombstones  numbers under which sets were deleted lately
     """
 
@@ -101,15 +102,16 @@ class HeldSets:
         return sorted(self._tiles)
 
     def off_grid(self, received: MarkSet) -> bool:
-        """Whether a set states something about cells which this grid does not have. What is learned is told about
-        the tile beyond the last one, as `words` has it, and not by operators."""
+        """Returns True if a set has marks in cells which this grid does not have. Measurements are published in the
+        tile beyond the last one, as `words` has it, and not by operators."""
         if received.tile == self._tile_count:
             return is_zone(received.author) or measurements_in(received) is None
         known = received.tile < self._tile_count and not self._ragged
         return not known and fault(received, self._grid) is not None
 
     def is_news(self, received: MarkSet, held: MarkSet | None) -> bool:
-        """Whether a set supersedes the held one of its tile and author, or if there is none, the deleted one."""
+        """Returns True if a set supersedes the held one of its tile and author, or if there is none, the deleted
+        one."""
         return not self.tombstones.covers(received) if held is None else supersedes(received, held)
 
     def put(self, new: MarkSet, *, own: bool = False) -> bool:
@@ -150,7 +152,7 @@ class HeldSets:
     def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
         """(author, tiles) of which they hold a newer set than we, and which we could hold.
 
-        What there is no capacity for is left out: it would be asked for again with every digest.
+        Sets without capacity are left out: they would be requested again with every digest.
         """
         newer = self.ledger.missing(theirs)
         possible = [(author, [tile for tile in tiles if self._could_hold(author, tile)]) for author, tiles in newer]

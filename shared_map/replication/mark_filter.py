@@ -1,7 +1,7 @@
 """Which marks of others a replica takes in: by author (the policy of groups) and by tile (its interest).
 
-An author's id begins with its group (`blue.a3.17f2`), and so do the keys of all that it writes. So access control
-can enforce the policy, and of a digest, which names only authors, nothing is asked for that would be refused.
+An author's id begins with its group (`blue.a3.17f2`), and so do the keys of all that it writes. Access control can
+therefore enforce the policy; and no set is requested of a digest, which names only authors, that would be refused.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def readable_for_target(
     """The groups whose marks the planner of a target takes in: all that any group reads which chases the target.
     None if that is all groups.
 
-    So the least informed of these groups gets routes as good as the best informed one, but not the marks behind
-    them. Groups which must not learn even that much have to chase targets of their own.
+    The least informed of these groups therefore gets routes as good as the best informed one, but not the marks
+    behind them. Groups which must not learn even that much have to chase targets of their own.
 
     chased_by  the targets of a group, where operators may have ordered others than the scenario says
     """
@@ -87,17 +87,17 @@ class MarkFilter:
         self._tiles = frozenset([beyond_tile(self._grid), *of_all_classes(self._grid, tiles)])
 
     def accepts_author(self, author: str, group: str) -> bool:
-        """Whether the policy of groups lets us read this author, which states to be of this group."""
+        """Returns True if the policy of groups lets us read this author, which states to be of this group."""
         if self.groups is None:
             return True
         return group in self.groups and author.startswith(f"{group}.")
 
     def accepts_tile(self, tile: int) -> bool:
-        """Whether a tile lies in the regions of interest, or beyond the map: what is learned concerns all."""
+        """Returns True if a tile is in the regions of interest, or beyond the map: measurements concern all."""
         return self._tiles is None or tile in self._tiles
 
     def accepted(self, sets: Sequence[tuple[str, list[int]]]) -> list[tuple[str, list[int]]]:
-        """Of (author, tiles), those which would be taken in."""
+        """Returns those of (author, tiles) which would be accepted."""
         of_authors = sets
         if self._prefixes is not None:
             of_authors = [(author, tiles) for author, tiles in sets if author.startswith(self._prefixes)]

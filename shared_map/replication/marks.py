@@ -30,7 +30,7 @@ def zone_author(name: str) -> str:
 
 
 def is_zone(author: str) -> bool:
-    """Whether what this author states is a zone: an operator's order, which wins over what vehicles find."""
+    """Returns True if this author's marks are a zone: an operator's order, which wins over marks of vehicles."""
     return author.startswith(_ZONES)
 
 
@@ -114,25 +114,25 @@ def next_seq(seq: int) -> int:
 
 MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
 """A statement stamped further ahead of the reader's clock than this is refused: no author could overrule one
-that is stamped near the limit. As wide as clocks that are set for another zone."""
+that is stamped near the limit. As wide as the error of clocks that are set for another zone."""
 _CLOCK_WAS_SET_NS = 1_735_689_600 * NS_PER_S
 """2025: a clock before this was never set, as after a start without a network, and says nothing about stamps."""
 
 
 def is_ahead(of: MarkSet, now_ns: int) -> bool:
-    """Whether a set states something from further ahead than clocks may differ."""
+    """Returns True if a set has a timestamp further ahead than clocks may differ."""
     if now_ns < _CLOCK_WAS_SET_NS or not of.kinds:
         return False
     return max(memoryview(of.stamps_ns).cast("q")) > now_ns + MAX_AHEAD_NS
 
 
 def is_tombstone(of: MarkSet) -> bool:
-    """Whether this set says that nothing is left of a dead author's set of this tile (see `compaction`)."""
+    """Returns True if this set states that no mark of a dead author is left in this tile (see `compaction`)."""
     return not of.kinds and of.seq % SEQ_STEP > 0
 
 
 def supersedes(new: MarkSet, old: MarkSet) -> bool:
-    """Whether `new` replaces `old` of the same author and tile: the higher (epoch, seq) does.
+    """Returns True if `new` replaces `old` of the same author and tile: the higher (epoch, seq) does.
 
     No author puts two different sets under one number, but a damaged payload may look as if it did. Then the larger
     content wins, so that the order of arrival does not matter even there.
@@ -207,10 +207,10 @@ NO_STATEMENTS = Statements(
 class HybridClock:
     """Stamps for an author's statements: its own clock, but newer than what it knows about the cell.
 
-    So an author can always overrule a statement that it has seen, however far ahead the clock of the other is. This
-    is a hybrid logical clock (Kulkarni et al. 2014) kept for each cell: one wrong clock does not carry the others
-    along. Bound: of two statements made without knowledge of each other, one by a clock which is d ahead may beat
-    a statement up to d younger, until an author that has seen both states something.
+    An author can therefore always overrule a mark that it has seen, however far ahead the clock of the other is.
+    This is a hybrid logical clock (Kulkarni et al. 2014) kept for each cell: one wrong clock does not carry the
+    others along. Bound: of two statements made without knowledge of each other, one by a clock which is d ahead may
+    beat a statement up to d younger, until an author that has seen both states something.
     """
 
     def __init__(self) -> None:

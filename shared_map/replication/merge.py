@@ -1,10 +1,10 @@
 """The merge law: which statement about a cell wins, and which cells' winners change when sets of marks change.
 
-Of all statements about a cell that have not expired, the newest wins; of two with one stamp, that of the larger
-author id. An operator's statement (a zone) wins over all others: a vehicle that sees open ground must not open what
-people have closed. The law reads nothing but the sets that are held, so the order, grouping and repetition in which
-they arrived cannot matter. A newer set, a tombstone, an expiry and a region that is left are all one `TileChange`:
-the sets of a tile before and after.
+The newest unexpired mark of a cell wins; of two with one timestamp, that of the larger author id. An operator's
+statement (a zone) wins over all others: a vehicle that sees open ground must not open what people have closed. The
+law reads nothing but the sets that are held, so the order, grouping and repetition in which they arrived cannot
+matter. A newer set, a tombstone, an expiry and a region that is left are all one `TileChange`: the sets of a tile
+before and after.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
 _AREA_BITS = TILE_AREA.bit_length() - 1
 _FEW = 128
-"""Up to so many statements, before and after together, lists are faster than arrays (decision 18)."""
+"""Up to this number of marks, before and after together, lists are faster than arrays (decision 18)."""
 _NOTHING = (_CLEAR, 0.0, NO_STATEMENT)
 _NO_COLUMNS = (
     np.empty(0, np.uint32),

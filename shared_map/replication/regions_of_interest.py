@@ -15,7 +15,7 @@ from swarm.grid import REGION_CELLS, GridSpec
 class Interest:
     """The squares within `enter_cells` of any cell, and of the squares before those still within `leave_cells`.
 
-    The hysteresis keeps a vehicle at a border from subscribing anew with every crossing. Squares are numbered row
+    The hysteresis keeps a vehicle at a border from subscribing again with every crossing. Squares are numbered row
     by row, as regions are. Raises ValueError if squares are left nearer than they are entered.
 
     leave_cells   default: twice `enter_cells`
@@ -85,8 +85,8 @@ class DigestInterest:
     - everybody, while no keeper is heard, after a link came back, and now and then.
 
     A set that was lost is found by the next digest of its author if the author is known, else by that of the
-    keeper. If the keeper is gone, full or cut off from the author, it is found when the replica next listens to
-    everybody.
+    keeper. If the keeper has ended, is full or is cut off from the author, that is found when the replica next
+    subscribes to all digests.
 
     name       of the listener: those with different names do not all listen to everybody at the same time
     period_ns  of whole digests
@@ -111,11 +111,11 @@ class DigestInterest:
         self._all_due_ns = self._all_until_ns + self._phase_ns
 
     def listen_to_all(self, now_ns: int) -> None:
-        """A link came back: what was missed meanwhile may be of anybody."""
+        """Subscribes to all digests after a link came back: missed sets may belong to any author."""
         self._all_until_ns = now_ns + _ALL_FOR * self._period_ns
 
     def keeper_spoke(self, keeper: str, now_ns: int) -> None:
-        """A keeper told all sets that it holds."""
+        """Notes that a keeper has published all its sets."""
         _note(self._keepers, keeper, now_ns + _KEEPER_FOR * self._period_ns)
 
     def author_is_near(self, author: str, now_ns: int) -> None:
@@ -123,7 +123,7 @@ class DigestInterest:
         _note(self._authors, author, now_ns + _NAMED_FOR * self._period_ns)
 
     def update(self, now_ns: int) -> frozenset[str] | None:
-        """Whose digests to listen to from now on; None for those of everybody."""
+        """Returns the senders of digests to subscribe to from now on; None for all."""
         self._keepers = {keeper: until for keeper, until in self._keepers.items() if now_ns <= until}
         self._authors = {author: until for author, until in self._authors.items() if now_ns <= until}
         if now_ns >= self._all_due_ns:

@@ -40,7 +40,7 @@ from swarm.wire.messages.map_data import FOREVER, PACE_LEAST, PACE_MOST, MarkKin
 
 
 class CostSink(Protocol):
-    """Where winning statements go, and what authors have learned: the cost map.
+    """Receiver of winning marks and of measurements: the cost map.
 
     class_number  whom the statements are for: 0 for all vehicles, or one of the scenario's classes from 1 on
     """
@@ -60,8 +60,8 @@ class CostSink(Protocol):
 class Merged:
     """The sets that a merge took in, in no particular order.
 
-    changed  how many cells each of them gave another winner. Where several sets of one tile were merged together,
-             all new winners of the tile, but no more than the statements in the set and the one that it replaced
+    changed  how many cells each of them gave another winner. If several sets of one tile were merged together, all
+             new winners of the tile, but no more than the marks in the set and the one that it replaced
     """
 
     sets: list[MarkSet]
@@ -159,7 +159,7 @@ class MapReplica:
         return Merged(taken, [min(in_tile[s.tile], most) for s, most in zip(taken, statements_of, strict=True)])
 
     def _admits(self, received: MarkSet, held: MarkSet | None) -> bool:
-        """Whether a set is part of this map, wanted and news; counts why not."""
+        """Returns True if a set is part of this map, wanted and new; counts the reason if not."""
         if self.held.off_grid(received) or is_ahead(received, self._now_ns):
             self.counts["sets_refused"] += 1
             return False
@@ -176,8 +176,8 @@ class MapReplica:
         return True
 
     def _settle(self, before: Mapping[int, Sequence[MarkSet]], before_ns: int, measured: bool) -> list[int]:
-        """Bring the cost map from the winners of these sets (by tile) at `before_ns` to those of what is held now.
-        Returns how many winners changed in each tile."""
+        """Brings the cost map from the winners of these sets (by tile) at `before_ns` to those held now. Returns
+        how many winners changed in each tile."""
         counts = dict.fromkeys(before, 0)
         by_class: dict[int, list[TileChange]] = {}
         for tile, sets in before.items():
@@ -231,8 +231,8 @@ class MapReplica:
         self._drop_unwanted()
 
     def read_groups(self, groups: frozenset[str] | None) -> None:
-        """Hold only sets of these groups from now on, besides our own; of all if None. Digests show what is missing
-        of those that were not heard before."""
+        """Hold only sets of these groups from now on, besides our own; of all if None. Digests then show the
+        missing sets of authors that were not readable before."""
         self.filter.read_groups(groups)
         self._drop_unwanted()
 
@@ -350,7 +350,7 @@ class MapReplica:
         won = dense(winners(self.held.of_tile(tile), self._now_ns))
         stamps = self._clock.stamps_ns(now_ns, won.stamps_ns[cells])
         if lifetime_s is None and len(np.unique(cells)) == len(cells):
-            # What we state already, and wins for ever, need not be stated again.
+            # A mark that we have stated already, and that wins permanently, need not be stated again.
             wins = (own.stamps_ns[cells] != NO_STATEMENT) & (own.stamps_ns[cells] == won.stamps_ns[cells])
             known = wins & (won.kinds[cells] == kinds) & (won.paces[cells] == paces)
             known &= own.untils_ns[cells] == FOREVER
@@ -411,7 +411,8 @@ class MapReplica:
         return [tile for _, tiles in wanted for tile in tiles]
 
     def has_ended(self, author: str) -> bool:
-        """Whether all that an author states on some tile has ended: at once if our clock is far ahead of its."""
+        """Returns True if all marks of an author in some tile have expired: immediately if our clock is far ahead
+        of its."""
         sets = (self.held.get(tile, author) for tile in self.held.tiles)
         return any(each and each.kinds and not len(standing(each, self._now_ns).cells) for each in sets)
 
@@ -425,6 +426,6 @@ class MapReplica:
 
 
 _LEARN_EVERY_NS = 5 * NS_PER_S
-"""Words of what is learned change the cost map at most this often, whoever says them: each change is one of the
-whole map, and grows every tree anew. What is held alone decides what they change it to, so replicas that hold the
-same are equal after this time at the latest (decision 68)."""
+"""New measurements change the cost map at most this often: each change is one of the whole map, and each tree is
+searched again from scratch. The change depends on held sets alone, so replicas that hold the same are equal after
+this time at the latest (decision 68)."""

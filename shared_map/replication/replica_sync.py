@@ -35,7 +35,7 @@ _JOIN_RETRY_NS = NS_PER_S // 2
 _ASK_AGAIN_NS = NS_PER_S * 15 // 100
 """A question whose answer is lost on a network that loses 30 % is repeated so soon (decision 18)."""
 _MAX_ASKS = 16
-"""Authors who are asked for at once: what a digest that lies about thousands can start."""
+"""Limit of authors that are asked together: the most that a false digest with thousands of rows can start."""
 _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
 """A set that was put is named in digests of changes so often and for so long: of some four, one arrives."""
@@ -50,7 +50,7 @@ _MANY = "-"
 _MAX_NAMES = 4096
 """Authors of whom is remembered when they spoke or were warned of: names cost a sender nothing."""
 _WARN_AGAIN_NS = 60 * NS_PER_S
-"""An author is named once a minute (decision 18): whoever floods must not fill the log as well."""
+"""An author is named once a minute (decision 18): one that floods must not fill the log as well."""
 
 
 class MapSync:
@@ -67,7 +67,7 @@ class MapSync:
     on_digest    called with the author of every digest that is heard, and when
     near         hold only regions that `enter` names, instead of the whole map, and hear only the digests that
                  can matter there (`DigestInterest`)
-    at_ticks     merge what others put at the next tick, all at once, and wake nobody for it: for a service that
+    at_ticks     merge received sets at the next tick, all together, without waking a thread: for a service that
                  uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
     """
@@ -111,7 +111,7 @@ class MapSync:
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
         self._changed: dict[int, int | None] = {}
         self._digests = PendingDigests()
-        # Whose digests are of interest, and to whom we listen: None for everybody.
+        # Senders of digests that are of interest, and to which we subscribe: None for all.
         self._digest_interest = DigestInterest(self._name or "", self._digest_ns, near=near)
         self._listened_to: frozenset[str] | None = None
         self._asked_ns: dict[str, int] = {}  # author -> when its missing sets were asked for, until the ask ends
@@ -130,8 +130,8 @@ class MapSync:
             self._bus.serve(MARKS, self._post, author=self.replica.author)
 
     def enter(self, regions: frozenset[int]) -> None:
-        """Hold these regions from now on, if this replica holds only what is near: fetch what was stated about the
-        new ones, and forget what others stated elsewhere. Digests show if an answer is lost."""
+        """Holds these regions from now on, if this replica holds only its vicinity: fetches marks in the new ones,
+        and drops those elsewhere. Digests show if an answer is lost."""
         before = self._regions
         if before is None or regions == before:
             return
@@ -184,7 +184,7 @@ class MapSync:
         return True
 
     def tick(self, now_ns: int) -> None:
-        """Publish what is due, compare the digests that have waited long enough, ask for what is missing."""
+        """Publishes what is due, compares the digests that have waited long enough, and requests missing sets."""
         for digest in self._bus.collected(DIGEST):
             assert isinstance(digest.message, Digest)
             self._on_digest(digest.message.author, now_ns)
@@ -205,8 +205,8 @@ class MapSync:
             self._put(action)
 
     def holds(self, author: str, rows: bytes, now_ns: int) -> bool:
-        """Whether the map has what these rows of a digest name of an author, as far as it is of interest here, and
-        it has not ended yet by our clock. What is missing is asked for."""
+        """Returns True if the map has the sets that these rows of a digest name, as far as they are of interest
+        here and have not expired by our clock. Missing sets are requested."""
         self._take_in(now_ns)
         lacking = self.replica.lacking(author, rows)
         if lacking:

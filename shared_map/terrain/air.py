@@ -26,17 +26,18 @@ from swarm.grid import GridSpec
 
 _GRADES = 0.1, 0.5
 _GRADE_OF_RELIEF = 1.8
-"""Of the relief over the shorter side: steep terrain needs a steep surface, over gentle one it only costs."""
+"""Share of the relief over the shorter side: steep terrain needs a steep surface, over gentle terrain it only
+costs."""
 _ROOM = 1.02
-"""How far beyond the grade of a surface the table of factors reaches: rounding makes steps a hair steeper."""
+"""Margin of the table of factors beyond the grade of a surface: rounding makes steps a hair steeper."""
 
 
 @dataclass(frozen=True, eq=False)
 class AirGround:
-    """What a tree of an air class is grown over.
+    """Input of a search for an air class.
 
-    height_m      float32 (rows, cols), above the same zero as the terrain; NaN where nobody flies
-    pace_s_per_m  float32 (rows, cols); inf where nobody flies
+    height_m      float32 (rows, cols), above the same zero as the terrain; NaN where no vehicle flies
+    pace_s_per_m  float32 (rows, cols); inf where no vehicle flies
     climb         the factor of a step by its rise, and by the wind
     grade         of the surface
     """
@@ -54,9 +55,8 @@ def air_ground(
 
     Parameters
     ----------
-    elevation_m : (rows, cols) float32, m; NaN is a void. Nobody flies over a void or beside one, as nobody knows
-        how high it is
-    closed : (rows, cols) bool, no-fly zones; none if not given
+    elevation_m : (rows, cols) float32, m; NaN is a void. No vehicle flies over a no-data cell or beside one, as its
+    height is unknown closed : (rows, cols) bool, no-fly zones; none if not given
     """
     grade = grade_of(elevation_m, grid.resolution_m) if air.grade is None else air.grade
     lifted = lifted_floor(clearance_floor(elevation_m, air.clearance_m), grade, grid.resolution_m)
@@ -161,7 +161,7 @@ def air_terrain(common: Terrain, air: AirConfig, wind: WindConfig, named: str) -
 
 
 def _said_of(wind: WindConfig, air: AirConfig) -> tuple[str, ...]:
-    """What people are told of the wind; nothing where there is none."""
+    """Returns the sentence about the wind; empty if there is none."""
     if not wind.speed_m_per_s:
         return ()
     low, high = air.speed_m_per_s - wind.speed_m_per_s, air.speed_m_per_s + wind.speed_m_per_s

@@ -20,7 +20,7 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostWorld:
-    """What a cost layer is made with. Arrays are (rows, cols) and read-only.
+    """Arguments with which a cost layer is made. Arrays are (rows, cols) and read-only.
 
     elevation_m  float32  NaN where there is a void
     classes      uint8    `shared_map.terrain.layers.TerrainClass`

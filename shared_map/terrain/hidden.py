@@ -21,7 +21,7 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 RUBBLE_FACTOR = np.float32(3.0)
 CONNECTED_SHARE = 0.85
-"""At least this share of the largest passable part stays passable and connected, besides what is flooded."""
+"""At least this share of the largest passable part stays passable and connected, besides flooded cells."""
 
 
 def true_ground(
@@ -146,7 +146,7 @@ def _flood(truth: Floats, height: Floats, share: float, rng: np.random.Generator
     rows, cols = height.shape
     low = np.flatnonzero(passable.reshape(-1) & (height <= np.quantile(height[passable], 0.2)).reshape(-1))
     start = int(low[rng.integers(len(low))])
-    # Of a memoryview single values are read in half the time that an array takes.
+    # A memoryview reads single values in half the time that an array takes.
     flat, open_ = height.reshape(-1).data, passable.reshape(-1).data
     shore: list[tuple[float, int]] = [(flat[start], start)]
     seen = {start}

@@ -3,17 +3,16 @@
 The merge rule, per cell, in this order:
 
 1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
-   Where `cost.directional`, the slope factor is left out, and each step costs by its rise instead (`step_climb`).
-   No finite pace is above `PACE_MOST` or below `PACE_LEAST`.
+   With `cost.directional` the slope factor is left out, and each step costs by its rise instead (`step_climb`). No
+   finite pace is above `PACE_MOST` or below `PACE_LEAST`.
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
    Then the scenario's own layers (`cost_layers`), one after the other; a void stays lethal.
 3. Zones in the order written: a pace sets the pace of open ground, a factor multiplies it, preferred halves, rough
-   doubles, slow water multiplies; a road sets the road pace (over cliffs and the terrain's own water too: a
-   cutting, a causeway; not over a void), one of a file only where that is quicker. Then water that is lethal closes
-   what it touches, roads too; then bridges open the water beneath them; then every forbidden zone is lethal,
-   whatever else was painted there.
-   Where `cost.directional`, each cell then pays what `cost.cross_slope_factor` asks for driving along its slope;
-   steps that lead up or down get it back.
+   doubles, slow water multiplies. A road sets the road pace, over cliffs and the terrain's own water too (a
+   cutting, a causeway), but not over no-data; a road of a file only where that is quicker. Then water that is
+   lethal closes what it touches, roads too; then bridges open the water beneath them; then every forbidden zone is
+   lethal, whatever else was painted there. With `cost.directional` each cell then pays `cost.cross_slope_factor`
+   for driving along its slope; steps that lead up or down get it back.
 4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of
    `vehicle_radius_m` in its middle would touch a lethal cell.
 5. Marks replace the ground cell by cell (see `cost_map`), before inflation.
@@ -41,7 +40,7 @@ LETHAL = np.float32(np.inf)
 
 
 class TerrainClass(enum.IntEnum):
-    """What covers a cell."""
+    """Land cover of a cell."""
 
     UNKNOWN = 0
     WATER = 1
@@ -81,7 +80,7 @@ READABLE = (
     TerrainClass.SNOW,
     TerrainClass.UNKNOWN,
 )
-"""What a cell of a photo may be read as, from general to particular: each is a bit of its readings, the first the
+"""Possible readings of a photo's cell, from general to particular: each is a bit of its readings, the first the
 lowest."""
 
 
@@ -158,7 +157,8 @@ def slope_deg(elevation_m: Floats, resolution_m: float) -> Floats:
 
 
 def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
-    """How far the eight neighbours lie off the plane that leans on a cell, at most, in metres: 0 on any even slope.
+    """Returns the largest deviation of the eight neighbours from the plane through a cell, in metres: 0 on any even
+    slope.
 
     The array brings its own border of one cell; a void beside a cell does not count.
     """
@@ -172,7 +172,7 @@ def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
 
 
 def along_slope_of_padded(padded_m: Floats, resolution_m: float, cost: CostConfig) -> Floats:
-    """What the slope of each cell raises the pace along it by (`slope_rules.along_slope_factor`).
+    """Returns the factor of each cell's slope on the pace along it (`slope_rules.along_slope_factor`).
 
     A cell is as steep as its steepest step, if its slope is less: so no step gets more back than its cell has paid.
     """
@@ -194,7 +194,7 @@ def class_factors(cost: CostConfig) -> Floats:
 
 
 def doubt_factors(cost: CostConfig) -> Floats:
-    """Factor of an unknown cell by its readings, bits of `READABLE`: the dearest of them.
+    """Returns the factor of an unknown cell by its readings, bits of `READABLE`: the highest of them.
 
     A lethal reading counts only where all are lethal, or doubt would wall off what may be driven on. Without
     readings, and where the scenario prices the unknown itself, `class_factors` has the factor."""
@@ -313,8 +313,8 @@ def inflate(ground: Floats, halves: Sequence[int]) -> Floats:
 def largest_part(passable: Bools) -> Bools:
     """The largest connected part of the cells that can be driven, bool (rows, cols); none if there are none.
 
-    A diagonal step has passable cells beside it, so what is connected by eight-neighbour steps is exactly what is
-    connected by four-neighbour steps.
+    A diagonal step has passable cells beside it, so connected by eight-neighbour steps is exactly connected by
+    four-neighbour steps.
     """
     # Imported here: it takes half a second, and no process of a run needs it where the terrain is prepared.
     from scipy import ndimage

@@ -1,4 +1,4 @@
-"""Where a terrain's cells lie: in metres of its map, and as latitudes and longitudes."""
+"""Coordinates of a terrain's cells: in metres of its map, and as latitudes and longitudes."""
 
 from __future__ import annotations
 

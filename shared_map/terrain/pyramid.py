@@ -39,7 +39,7 @@ class Level:
 
 
 def level_of(terrain: Terrain, most_cells: int) -> Level:
-    """The finest level that has at most so many cells."""
+    """Returns the finest level that has at most this number of cells."""
     lethal = np.isinf(terrain.pace_s_per_m)
     level = Level(
         1,
@@ -107,7 +107,7 @@ def _mean(corners: list[Floats], without: np.float32, weights: list[Floats] | No
 
 
 def _commonest(corners: list[Bytes]) -> Bytes:
-    """Of four classes: one that occurs twice, else the first; road beats all."""
+    """Returns the most common of four classes: one that occurs twice, else the first; road beats all."""
     a, b, c, d = corners
     common = np.where((b == c) | (b == d), b, np.where(c == d, c, a))
     road = np.uint8(TerrainClass.ROAD)

@@ -14,7 +14,7 @@ from shared_map.array_files import Bools, Floats, reuse_memory
 
 BAND_ROWS = 128
 Progress = Callable[[str, float], None]
-"""Called with what is being done, and the share of it that is done, 0 to 1."""
+"""Called with the current step, and the share of it that is done, 0 to 1."""
 
 
 def no_progress(what: str, share: float) -> None:

@@ -46,8 +46,8 @@ class RuleRow(NamedTuple):
 def slope_factor(grade: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground, the same in all directions; inf where steeper than `max_slope_deg` or NaN.
 
-    Of a rule that tells uphill from downhill it is the mean of both: there and back again cost together what they
-    do where steps have directions. Half of the ways over a cell lead along its slope, so half of what
+    For a rule that distinguishes uphill from downhill it is the mean of both: there and back again cost together
+    the same as with direction-dependent steps. Half of the ways over a cell lead along its slope, so half of what
     `cross_slope_factor` adds is added.
     """
     sine = _sine(grade)
@@ -60,7 +60,7 @@ def slope_factor(grade: Floats, cost: CostConfig) -> Floats:
 def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
 
-    Steeper than `max_climb_deg` up or `max_descent_deg` down is inf. Of ground with a `cross_slope_factor` it is
+    Steeper than `max_climb_deg` up or `max_descent_deg` down is inf. On ground with a `cross_slope_factor` it is
     relative to `along_slope_factor`.
     """
     sine = _sine(rise)
@@ -75,8 +75,8 @@ def along_slope_factor(steepness: Floats, cost: CostConfig) -> Floats:
     """Pace along a slope, neither up nor down, relative to level ground; 1 where the slope is NaN.
 
     A cell of steepness g that is crossed with a rise r costs (1 + k sin(g)^2) / (1 + k sin(r)^2) times as much for
-    its slope across the way: 1 straight up or down, `cross_slope_factor` along a slope of `max_slope_deg`. What
-    depends on the cell is this; what depends on the rise is in `directional_factor`.
+    its slope across the path: 1 straight up or down, `cross_slope_factor` along a slope of `max_slope_deg`. This is
+    the part that depends on the cell; the part that depends on the rise is in `directional_factor`.
     """
     sine = _sine(steepness)
     factor: Floats = np.float32(1) + np.float32(_cross_slope(cost)) * (sine * sine)
@@ -121,7 +121,7 @@ def _limit(cost: CostConfig) -> float:
 
 
 def _cross_slope(cost: CostConfig) -> float:
-    """What the square of a slope's sine adds to the pace along it."""
+    """Returns the coefficient of the square of a slope's sine in the pace along it."""
     return (cost.cross_slope_factor - 1) / _limit(cost) ** 2
 
 
@@ -150,8 +150,8 @@ def _energy(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     """A wheeled vehicle: as quick as on level ground, unless its motor or its brakes are too weak for that.
 
     Per weight and metre the motor works rolling resistance x cos + sin, and has `power_reserve` x rolling
-    resistance for it at the flat speed. Downhill the brakes hold what gravity gives beyond the rolling resistance,
-    for which they have `braking_share` of the motor's power: who comes down quicker runs away or burns them. With a
+    resistance for it at the flat speed. Downhill the brakes hold the share of gravity beyond the rolling
+    resistance, for which they have `braking_share` of the motor's power: a faster descent overheats them. With a
     share of 1 that is the drivers' rule to descend in the gear in which one would climb.
     """
     rolling = cost.rolling_resistance
@@ -204,7 +204,8 @@ MINETTI_STEEPEST = 0.45
 
 def _minetti(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     """Walking at constant metabolic power: pace in proportion to the energy per metre, which the source tells along
-    the slope, here per metre of the map. Beyond what was measured a metre of height costs as much as at its end."""
+    the slope, here per metre of the map. Beyond the measured range a metre of height costs as much as at its
+    end."""
     steepest = np.float32(MINETTI_STEEPEST)
     inside = np.clip(rise, -steepest, steepest)
     joules = polynomial(inside, MINETTI)

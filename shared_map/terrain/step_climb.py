@@ -15,7 +15,7 @@ as it heads into the wind by as much as holds it on its course: the wind triangl
     (sqrt(1 - (w x d)^2) - w . d) / (1 - |w|^2)
 
 of the time that it takes in still air. This is a norm of the vector that is flown, which need not be symmetric: no
-way around is shorter in time than the straight one. What goes out and comes back the same way always takes longer.
+way around is shorter in time than the straight one. A loop out and back on the same path always takes longer.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ class Wind:
 
     @property
     def calm(self) -> bool:
-        """Whether there is none."""
+        """True if there is no wind."""
         return self.south == self.east == 0.0
 
     def time_m(self, south_m: float, east_m: float) -> float:
-        """How far one comes in still air, m, while one flies this far: the length times the factor of its
-        direction."""
+        """Returns the distance flown in still air (m) in the time of this flight: the length times the factor of
+        its direction."""
         across = self.east * south_m - self.south * east_m
         along = self.south * south_m + self.east * east_m
         here = math.sqrt(south_m * south_m + east_m * east_m - across * across) - along
         return here / (1.0 - self.south * self.south - self.east * self.east)
 
     def factor(self, south_m: float, east_m: float) -> float:
-        """What a metre in a direction takes, over what it takes in still air; 1 of no direction."""
+        """Returns the time of a metre in a direction, relative to still air; 1 without a direction."""
         length_m = math.hypot(south_m, east_m)
         return self.time_m(south_m, east_m) / length_m if length_m else 1.0
 
@@ -71,7 +71,8 @@ STILL = Wind()
 
 
 def wind_of(speed_mps: float, from_deg: float, airspeed_mps: float) -> Wind:
-    """Wind as it is told: its speed, and where it comes from, clockwise from north."""
+    """Returns the wind as people state it: its speed, and the direction from which it blows, clockwise from
+    north."""
     share, towards = speed_mps / airspeed_mps, math.radians(from_deg % 360.0 + 180.0)
     return Wind(south=-share * math.cos(towards), east=share * math.sin(towards))
 
@@ -87,8 +88,8 @@ _WAYS = np.zeros((3, 3), np.int64)
 """Direction 0..7 of a step by its rows and columns, each less one."""
 _WAYS[np.array(STEP_ROW) + 1, np.array(STEP_COL) + 1] = range(8)
 _ROOM = ENTRIES / (ENTRIES - 0.51)
-"""What a limit is widened by: it then lies on the border between the last entry and the one before, by a hair on
-the side of what is allowed, and the last stands for all that is steeper."""
+"""Widening of a limit: it then lies on the border between the last entry and the one before, by a hair on the
+allowed side, and the last entry covers all steeper grades."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ class Climb:
     factors      float32  (2 * ENTRIES + 1) for rises from -steepest to steepest; 1 in the middle; inf where no step
                           may be so steep
     steepest     metres per metre; steeper steps cost as much as this
-    wind         of what flies; None of what drives
+    wind         of flying classes; None for ground classes
     """
 
     grid: GridSpec
@@ -110,8 +111,8 @@ class Climb:
 
     @cached_property
     def table(self) -> Floats:
-        """float32 (8, 2 * ENTRIES + 1): the factor of a step by its direction 0..7 and its rise, wind included. Of
-        the steps without wind all rows are alike."""
+        """float32 (8, 2 * ENTRIES + 1): the factor of a step by its direction 0..7 and its rise, wind included.
+        Without wind all rows of the steps are alike."""
         wind = STILL if self.wind is None else self.wind
         drifts = [wind.factor(*step) - 1.0 for step in zip(STEP_ROW, STEP_COL, strict=True)]
         table: Floats = (self.factors.astype(np.float64) + np.array(drifts)[:, None]).astype(np.float32)
@@ -119,7 +120,7 @@ class Climb:
 
     @property
     def windy(self) -> bool:
-        """Whether a step's direction counts beside its rise."""
+        """True if a step's direction counts beside its rise."""
         return self.wind is not None and not self.wind.calm
 
     @cached_property
@@ -152,12 +153,12 @@ class Climb:
         return f", and none is steeper than {' or '.join(said)}" if said else ""
 
     def allows(self, tail: int, head: int) -> bool:
-        """Whether a step between neighbours (flat indices) is not too steep."""
+        """Returns True if a step between neighbours (flat indices) is not too steep."""
         return self.of_step(tail, head) < math.inf
 
     def driven(self, tail: int, head: int) -> float:
-        """As `of_step`, for a vehicle that is on this step whatever it costs: it turned back where it had climbed,
-        or is on its way out of a closed zone. Never inf: what is too steep is driven as slowly as anything."""
+        """Like `of_step`, for a vehicle that is on this step at any cost: it turned back where it had climbed, or
+        is on its way out of a closed zone. Never inf: a step that is too steep is driven at the lowest speed."""
         return min(self.of_step(tail, head), self.highest)
 
     @cached_property
@@ -203,7 +204,7 @@ class Climb:
         return self.wind.factor(south, east) + (self.factors.item(entry) - 1.0) * step_m / length_m
 
     def _entry(self, tail: int, head: int) -> tuple[int, int]:
-        """Where in the table a step between neighbours is."""
+        """Returns the table index of a step between neighbours."""
         cols = self.grid.cols
         row0, col0 = divmod(tail, cols)
         row1, col1 = divmod(head, cols)
@@ -214,8 +215,8 @@ class Climb:
 
 
 def may_be_pulled(climb: Climb | None) -> bool:
-    """Whether routes may be pulled straight: not where uphill is not downhill on the ground, as a climb has a price
-    for each step there, and a limit."""
+    """Returns True if routes may be any-angle: not on direction-dependent ground, where a climb has a price for
+    each step, and a limit."""
     return climb is None or climb.wind is not None
 
 

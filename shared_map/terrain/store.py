@@ -44,7 +44,7 @@ from swarm.runtime.role import RoleSetup
 log = logging.getLogger(__name__)
 
 MOST_BYTES = 2 << 30
-"""Of all kept terrains together; the ones used longest ago go first."""
+"""Limit for all cached terrains together; the least recently used go first."""
 _SUMS = "sums.json"
 _ABANDONED_S = 3600.0
 """A folder that is still being written is younger: to write `MOST_BYTES` takes minutes on a slow disk."""
@@ -65,7 +65,7 @@ def scenario_key(scenario: Scenario) -> str:
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):
-    """What stands beside the arrays of a prepared terrain, or of the ground of a class, in a file of JSON.
+    """Metadata beside the arrays of a prepared terrain, or of the ground of a class, in a JSON file.
 
     key       `scenario_key` of what they were made from
     steepest  of its climb; None where steps cost the same both ways
@@ -140,7 +140,7 @@ def save_ground(meta_file: Path, terrain: Terrain, arrays: Mapping[str, NDArray[
 
 
 def read_ground(meta_file: Path, meta: Description, heights_m: Floats) -> dict[str, Any]:
-    """What `save_ground` left of the ground, as fields of a `Terrain`; arrays are mapped read-only.
+    """Returns the content of `save_ground`, as fields of a `Terrain`; arrays are mapped read-only.
 
     heights_m  by which steps climb
 
@@ -243,8 +243,8 @@ def _beside(setup: RoleSetup, name: str) -> NDArray[Any] | None:
 
 
 def homes_of(prior: Floats, truth: Floats) -> Bools:
-    """Where vehicles may start: the largest connected part that can be driven by the map and in truth, bool (rows,
-    cols).
+    """Returns the start cells of vehicles: the largest connected part that is passable by the map and by ground
+    truth, bool (rows, cols).
 
     prior, truth  float32 (rows, cols), s/m; inf is lethal
     """
@@ -253,7 +253,7 @@ def homes_of(prior: Floats, truth: Floats) -> Bools:
 
 def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
     """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
-    for the other processes. What is returned is mapped, as theirs."""
+    for the other processes. The result is mapped, as theirs."""
     key, kept = scenario_key(scenario), kept_key(scenario)
     if kept is None or not fetch_kept(kept, folder):
         terrain = build_terrain(scenario, progress)
@@ -272,7 +272,7 @@ def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) 
 
 
 def kept_root() -> Path:
-    """Where terrains are kept."""
+    """Returns the folder of cached terrains."""
     home = os.environ.get("XDG_CACHE_HOME")
     return (Path(home) if home else Path.home() / ".cache") / "terrain-swarm" / "terrain"
 
@@ -317,7 +317,7 @@ def fetch_kept(key: str, into: Path) -> bool:
 
 
 def keep(key: str, files: Iterable[Path]) -> None:
-    """Keep these files of a terrain. Where that is not possible nothing is kept, and nothing is wrong."""
+    """Keep these files of a terrain. If that is not possible, no terrain is cached, without an error."""
     files = list(files)
     root = kept_root()
     partial = root / f"{key}.{os.getpid()}.part"
@@ -362,7 +362,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _evict(root: Path) -> None:
-    """Drop what was used longest ago, down to `MOST_BYTES`, and what a killed process began to keep."""
+    """Drops the least recently used terrains, down to `MOST_BYTES`, and partial files of killed processes."""
     left = MOST_BYTES
     for folder in sorted(root.iterdir(), key=lambda each: each.stat().st_mtime, reverse=True):
         left -= sum(path.stat().st_size for path in folder.iterdir())

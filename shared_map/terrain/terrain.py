@@ -58,9 +58,9 @@ class Terrain:
     classes           uint8    TerrainClass
     digest            16 hex digits of grid, prior pace and cost rules (and heights, where steps cost by them)
     climb             what a step costs for what it climbs; None if it costs the same both ways
-    least_s_per_m     no vehicle is quicker, whatever is marked or learned
-    flight_m          float32  of what flies, the height of the surface on which it does; None of what drives
-    notes             sentences about where it came from and what was done to it
+    least_s_per_m     top speed of any vehicle, with any mark or factor
+    flight_m          float32 height of the surface of a flying class; None for ground classes
+    notes             sentences about its origin and processing
     zones             what each zone did to it; empty of a prepared one
     """
 
@@ -224,7 +224,7 @@ def _digest(grid: GridSpec, pace: Floats, cost: CostConfig, elevation_m: Floats 
     digest.update(np.ascontiguousarray(pace).data)
     if elevation_m is not None:
         digest.update(np.ascontiguousarray(elevation_m).data)
-    # Where a file lies differs between machines; what it painted is in the pace.
+    # The location of a file differs between machines; its effect is in the pace.
     zones = tuple(
         msgspec.structs.replace(z, mask=z.mask and Path(z.mask).name, file=z.file and Path(z.file).name)
         for z in cost.zones

@@ -1,4 +1,4 @@
-"""What people should know of a terrain before anything drives on it."""
+"""Facts about a terrain for people before any vehicle drives on it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from swarm.places import bounds_of, extent_of
 _MOST_SIDE = 2048
 """Slopes and parts of larger terrains are taken from every second, third, ... cell."""
 _JOINED_SIDE = 1024
-"""Of larger terrains one-way steps are followed in a square of so many cells a side: a second or less."""
+"""On larger terrains one-way steps are followed in a square of this side in cells: a second or less."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
 _STEEP_DEG = 60.0
 _LOWEST_LAND_M = -450.0
@@ -63,8 +63,9 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
 
 
 def _facts_of_steps(climb: Climb, passable: Bools) -> dict[str, float]:
-    """Of all steps between passable neighbours the share that is too steep, and the largest part of the passable
-    cells in which there is a way from each cell to each other. Of a large terrain both are those of its middle."""
+    """Returns the share of steps between passable neighbours that is too steep, and the largest part of the
+    passable cells in which each cell is reachable from each other. On a large terrain both are those of its
+    middle."""
     if np.isfinite(climb.factors).all():
         return {}
     row0, col0 = (max(side - _JOINED_SIDE, 0) // 2 for side in passable.shape)
@@ -118,7 +119,7 @@ def _largest_part(passable: Bools) -> float:
 
 
 def doubts_about(facts: dict[str, Any]) -> list[str]:
-    """What looks wrong, each with the setting that answers it."""
+    """Returns doubts about a terrain, each with the setting that resolves it."""
     doubts = []
     if facts["lethal_share"] > _MUCH_LETHAL:
         doubts.append(
@@ -152,7 +153,7 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
 
 
 def said_of(terrain: Terrain) -> list[str]:
-    """What a run says of its terrain before anything drives: numbers, how it was made, what looks wrong."""
+    """Returns a run's sentences about its terrain before any vehicle drives: numbers, processing, doubts."""
     grid, lethal = terrain.grid, float(np.isinf(terrain.pace_s_per_m).mean())
     water = float((terrain.classes == TerrainClass.WATER).mean())
     size = f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m"

@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 PREFERRED_FACTOR = np.float32(0.5)
 ROUGH_FACTOR = np.float32(2.0)
 _BESIDE = (".shx", ".dbf", ".prj", ".cpg")
-"""What belongs to a Shapefile."""
+"""Files that belong to a Shapefile."""
 _APPROACH_CELLS = 3
-"""So many cells of road on either side of a bridge are opened with it: water covers every cell that it touches, and
-has a width by its class, so that it may reach beyond the ends of the bridge."""
+"""This number of road cells on either side of a bridge is opened with it: water covers every cell that it touches,
+and has a width by its class, so that it may reach beyond the ends of the bridge."""
 
 
 @dataclass
 class ZoneFacts:
-    """What a zone did to the terrain, for people.
+    """Effect of a zone on the terrain, for people.
 
     cells    that it covers
     changed  whose pace it changed
@@ -166,7 +166,7 @@ class _Painter:
         self._water: Bools | None = None
 
     def read(self, zone: ZoneConfig, where: str) -> _Painted:
-        """What a zone covers."""
+        """Reads the cells that a zone covers."""
         facts = ZoneFacts(zone.called, zone.kind)
         if zone.file is not None:
             from shared_map.importers.zones.zone_files import burn_zone
@@ -185,7 +185,7 @@ class _Painter:
         return _Painted(zone, facts, values=(window, values))
 
     def cost(self, painted: _Painted) -> None:
-        """What is no more than costly."""
+        """Applies zones that only cost."""
         zone, (window, values) = painted.zone, painted.values
         if not window.empty:
             self._set(painted.facts, window, self._changed(zone, window, values, from_file=zone.file is not None))
@@ -226,7 +226,7 @@ class _Painter:
 
     @staticmethod
     def _possible(pace: Any) -> Any:
-        """Costly is not lethal: what is finite stays so, and within what any message may say."""
+        """A cost is not lethal: finite values stay finite, and within the range of a message."""
         return np.where(np.isinf(pace), LETHAL, np.clip(pace, np.float32(PACE_LEAST), np.float32(PACE_MOST)))
 
     def water(self, painted: _Painted) -> None:
@@ -260,7 +260,7 @@ class _Painter:
         self._pace[_part(window)] = after
 
     def forbidden(self, painted: _Painted) -> None:
-        """What is forbidden is lethal, whatever else was painted there; so are roads of a lethal class."""
+        """Forbidden zones are lethal, on top of any other zone; so are roads of a lethal class."""
         if painted.zone.kind in ("forbidden", "road"):
             self._close(painted)
 

@@ -1,4 +1,4 @@
-"""What covers the ground: classes by a photo, and by maps of land cover.
+"""Land cover: classes from a photo, and from land-cover maps.
 
 A photo is read by `photos` and classified by `classify`, by rules that need no labels (`photo_rules`) or learnt
 from a few. A map of land cover is read by `land_cover`; `cover_codes` has what its codes mean, from

@@ -1,7 +1,8 @@
 """Colour photo and slope -> what covers the ground: by rules without any labels, or learnt from a few.
 
 A shadow is as dark and blue as a lake, but lies on a slope and is not smooth; a cloud is as bright as snow and
-never water. So water must be level, smooth and bluish or nearly black, and is grown from where that is certain.
+never water. Water must therefore be flat, smooth and bluish or nearly black, and is grown from cells where that is
+certain.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ SMALLEST_LAKE = 12
 SHORE = (2, 2, 2)
 """Around lakes, as `spread` takes it: a beach is a bright line, too."""
 ROAD_GRADE = np.float32(0.5)
-"""Of the hillside that a road is cut into, as 3 x 3 cells have it."""
+"""Grade of the hillside that a road is cut into, over 3 x 3 cells."""
 
 
 class ByRules(NamedTuple):
-    """What a photo shows by rules.
+    """Readings of a photo by rules.
 
     classes   uint8 (rows, cols), TerrainClass; UNKNOWN also where a photo that is exposed a little differently
               would show another class
@@ -67,7 +68,7 @@ def class_readings(
     seen: Bools | None = None,
     progress: Progress = no_progress,
 ) -> ByRules:
-    """What a photo shows, without labels.
+    """Returns the readings of a photo without labels.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def class_readings(
     seen : bool (rows, cols), optional
         Where the photo shows anything; elsewhere the class is UNKNOWN.
     progress : callable
-        Told what is done and how much of it.
+        Called with the current step and the share of it that is done.
 
     """
     rows, cols = rgb.shape[:2]
@@ -119,8 +120,8 @@ def _line_strength(rgb: Bytes, row0: int, row1: int, part: slice) -> Bytes:
 
 
 def _lakes(wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> Bools:
-    """Patches of likely water of which a fifth is certain, and that are level. Where a shadow lies over a shore the
-    patch is not: then what is still of it, and its shore."""
+    """Patches of likely water of which a fifth is certain, and that are level. If a shadow covers a shore the patch
+    is no lake; then its still part, and the shore of that."""
     from scipy import ndimage
 
     likely = (wetness & LIKELY) > 0
@@ -153,8 +154,8 @@ def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resoluti
 # --- learnt -------------------------------------------------------------------------------------------------
 
 NEAREST, MOST_OF_A_CLASS = 15, 300
-"""Of labelled cells, those that are asked, and those of one class that are kept. On polygons that it has not seen
-the learner is right on 80 % of the labelled cells of Davos with these, and on 79 with twice as many kept."""
+"""Number of labelled cells that are compared, and of those of one class that are kept. On polygons that it has not
+seen the learner is right on 80 % of the labelled cells of Davos with these, and on 79 with twice as many kept."""
 
 
 class Learner:
@@ -191,7 +192,7 @@ class Learner:
 
 
 def _stretched(columns: Floats) -> Floats:
-    """Texture and grade by their square roots: most ground is even, and differs in what is left."""
+    """Texture and grade enter by their square roots: most ground is even, and differs in the small remainder."""
     stretched = columns.copy()
     stretched[:, (5, -1)] = np.sqrt(stretched[:, (5, -1)])
     return stretched
@@ -247,7 +248,7 @@ def _samples(rgb: Bytes, elevation_m: Floats | None, resolution_m: float, labels
 def held_out(
     rgb: Bytes, elevation_m: Floats | None, resolution_m: float, labels: Bytes, groups: NDArray[np.int32]
 ) -> tuple[Bytes, Bytes]:
-    """What a learner says of each labelled cell that saw nothing of the same polygon.
+    """Returns the prediction for each labelled cell of a learner that was trained without its polygon.
 
     Parameters
     ----------
@@ -276,7 +277,7 @@ def held_out(
 
 
 def confusion(true: Bytes, predicted: Bytes) -> NDArray[np.int64]:
-    """How often each class was taken for which: int64 (classes, classes), by true (row) and predicted class."""
+    """Returns the confusion matrix: int64 (classes, classes), by true (row) and predicted class."""
     counts = np.zeros((max(TerrainClass) + 1,) * 2, np.int64)
     np.add.at(counts, (true, predicted), 1)
     return counts

@@ -1,4 +1,4 @@
-"""What the codes and colours of land-cover maps mean: the built-in tables, and tables of the user's own.
+"""Codes and colours of land-cover maps: the built-in tables, and tables of the user's own.
 
 A code becomes a class where one of ours fits. Else it becomes a pace relative to open ground, or lethal.
 """
@@ -24,8 +24,8 @@ Rgb = tuple[int, int, int]
 
 HIGHEST_CODE = 65_533
 NO_COLOUR, NOTHING = HIGHEST_CODE + 1, HIGHEST_CODE + 2
-"""What `legend_codes` gives a colour that the legend lacks; and white and black, which are margins, unless the
-legend has them."""
+"""Results of `legend_codes` for a colour that the legend lacks; and for white and black, which are margins, unless
+the legend has them."""
 _SHOWN = 8
 SAME_COLOUR = 5
 """Publishers' legends differ by so much per channel between editions."""
@@ -42,7 +42,7 @@ _HIGHEST_FACTOR = 1e12
 
 @dataclass(frozen=True)
 class Ground:
-    """What a code stands for.
+    """Meaning of a code.
 
     kind    the class; UNKNOWN where none of ours fits
     factor  pace relative to open ground; inf is lethal
@@ -183,7 +183,7 @@ def _value(cell: str, what: str) -> CoverGround:
 
 
 def table_named(name: str) -> CoverTable:
-    """What `terrain.cover_codes` names: a built-in table, or a CSV file.
+    """Returns the table named by `terrain.cover_codes`: a built-in table, or a CSV file.
 
     Raises TerrainError if it is neither.
     """

@@ -1,4 +1,4 @@
-"""What the values of a land-cover file stand for: as the scenario says, as the file shows, or by its colours.
+"""Meaning of the values of a land-cover file: by the scenario, by names in the file, or by its colours.
 
 A file shows its table by its palette, its category names, its metadata or its codes. Nothing is guessed: where
 several tables fit, or none does, an error asks for the setting that says it.
@@ -25,23 +25,23 @@ from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 _LEAST_ALIKE = 0.8
-"""Of the codes that a file has, so many must have the colours or the names of a table."""
+"""Share of a file's codes that must have the colours or the names of a table."""
 _LEAST_KNOWN = 0.95
-"""Of a file's cells, so many must have a code of a table."""
+"""Share of a file's cells that must have a code of a table."""
 _MOST_XML = 4 << 20
 """GDAL's description of a file: room for a text of 60 bytes, tags included, for each of the 65,534 codes. To parse
 so much takes less than 0.1 s."""
 _MOST_SAMPLED = 1 << 20
 """Every cell of 1024 x 1024: of a larger file still a hundred of a code that a ten-thousandth of it has."""
 _LOOK_CELLS = 256
-"""A side of what is looked at first. Among 65,536 pixels a photo has far more than `MOST_COLOURS`, so it is not
-read as a whole."""
+"""Side of the sample that is examined first, in cells. Among 65,536 pixels a photo has far more than
+`MOST_COLOURS`, so it is not read as a whole."""
 _VALUE_COLUMNS = ("value", "code", "gridcode", "grid_code")
 
 
 @dataclass(frozen=True, eq=False)
 class Meaning:
-    """How the values of a file become grounds.
+    """Conversion of a file's values into grounds.
 
     table  what the codes stand for
     how    how that is known, for people
@@ -54,7 +54,7 @@ class Meaning:
 
 
 def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None:
-    """How the values of a file become grounds; None if nothing tells.
+    """Returns the conversion of a file's values into grounds; None if there is no evidence.
 
     Raises TerrainError if it holds no codes, or if several tables fit.
     """
@@ -95,7 +95,7 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a file shows of the meaning of its codes.
+    """Evidence in a file for the meaning of its codes.
 
     counts   cells of each code, of some cells of the file; no-data left out
     palette  colour of each code; empty if it has none
@@ -111,12 +111,13 @@ class Evidence:
     middle: tuple[float, float] | None
 
     def share(self, codes: Iterable[int]) -> float:
-        """Of the cells, the share that has one of these codes."""
+        """Returns the share of the cells that has one of these codes."""
         return sum(self.counts.get(code, 0) for code in codes) / max(sum(self.counts.values()), 1)
 
 
 def evidence_of(dataset: Any, sample: NDArray[Any]) -> Evidence:
-    """What a file of one band shows; `sample` has codes of some of its cells, (cells,), no-data left out."""
+    """Returns the evidence in a file of one band; `sample` has codes of some of its cells, (cells,), no-data left
+    out."""
     from rasterio.enums import ColorInterp
 
     codes, cells = np.unique(sample, return_counts=True)
@@ -191,7 +192,8 @@ def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
 
 
 def sampled_colours(dataset: Any) -> NDArray[np.int32]:
-    """Of some cells of an image, (cells,), red << 16 | green << 8 | blue; what it does not show left out.
+    """Returns the colours of some cells of an image, (cells,), red << 16 | green << 8 | blue; masked cells left
+    out.
 
     None of an image that has too many colours for a drawing in its middle: a photo is not read twice.
     """

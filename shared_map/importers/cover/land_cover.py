@@ -26,20 +26,20 @@ from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
 _TOLD_CODES = 6
-"""Codes that the note names, the most frequent first: a sentence of some 300 characters. It is told how many more
-there are."""
+"""Codes that the note names, the most frequent first: a sentence of some 300 characters. Codes listed in a note,
+which states how many more there are."""
 _NO_CODE = -1
 """Below every code: cells that the file does not reach."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """What a land-cover map says of the terrain.
+    """Land cover of the terrain.
 
     classes  uint8 (rows, cols), TerrainClass
     factor   float32 (rows, cols), pace relative to open ground beside that of the class; inf is lethal
     known    bool (rows, cols): where it says anything
-    notes    what was read and how, for people
+    notes    the file and how it was read, for people
     """
 
     classes: Bytes
@@ -83,7 +83,7 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
     config : TerrainConfig
         `cover_codes`, `cover_classes` and `crs` count.
     progress : callable
-        Told what is done and how much of it.
+        Called with the current step and the share of it that is done.
 
     Raises
     ------
@@ -130,7 +130,7 @@ _STRANGE, _EMPTY = HIGHEST_CODE + 1, HIGHEST_CODE + 2
 
 
 def _entries(codes: NDArray[Any]) -> NDArray[np.intp]:
-    """Where each value is looked up: a code at itself, what is none at _STRANGE, no data at _EMPTY."""
+    """Returns the table index of each value: a code at itself, an unknown code at _STRANGE, no data at _EMPTY."""
     with np.errstate(invalid="ignore"):
         empty = ~(codes >= 0) | (codes == NOTHING) | (codes == np.inf)
         strange = ~empty & (codes > HIGHEST_CODE)
@@ -152,7 +152,8 @@ def _look_up(table: CoverTable) -> tuple[Bytes, Floats, Bytes]:
 
 
 def _codes_in_memory(dataset: Any, meaning: Meaning) -> NDArray[Any] | None:
-    """Codes of the whole file, where GDAL would not warp what is stored: colours, and cells that a mask hides."""
+    """Returns the codes of the whole file, if GDAL cannot warp it as stored: colours, and cells that a mask
+    hides."""
     from rasterio.enums import MaskFlags
 
     hidden = MaskFlags.per_dataset in dataset.mask_flag_enums[0]
@@ -188,7 +189,7 @@ def _codes(dataset: Any, meaning: Meaning, row0: int, row1: int) -> NDArray[Any]
 
 
 def _told(what: str, meaning: Meaning, cells: NDArray[np.int64], states: Bytes) -> Iterable[str]:
-    """What people should know: the table, the codes that it has and those that it lacks, cells without any.
+    """Returns notes for people: the table, the codes that it has and those that it lacks, cells without any.
 
     Raises TerrainError if the table has none of the codes: then it is that of another map.
     """

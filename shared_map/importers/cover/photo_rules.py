@@ -1,4 +1,4 @@
-"""What a photo shows of the ground, by rules without any labels, whatever its exposure; and how it shows water.
+"""Readings of a photo by rules without labels, independent of its exposure; and signs of water.
 
 Rules look at means of colours, at texture and at slope, a tile at a time: a tile's arrays fit into the cache of a
 core, and this is most of what an import costs.
@@ -20,9 +20,9 @@ from shared_map.terrain.row_bands import counted, looked_up, padded_rows
 HALO = 2
 """Cells around a tile that its features look at."""
 TILE_COLS = 512
-"""Of a tile as high as a band: a dozen float32 arrays of its cells fit into the cache of a core."""
+"""Width of a tile as high as a band: a dozen float32 arrays of its cells fit into the cache of a core."""
 _RED_LIGHT, _GREEN_LIGHT, _BLUE_LIGHT = 0.299, 0.587, 0.114
-"""How bright red, green and blue are to the eye (Rec. 601)."""
+"""Brightness of red, green and blue to the eye (Rec. 601)."""
 LEVEL_GRADE, SHORE_GRADE = 0.05, 0.15
 """About 3 and 8.5 degrees: water is level; beside it the bank already tilts the slope of a 3 x 3 window."""
 STILL_GRADE = 0.004
@@ -31,7 +31,7 @@ LIKELY, CERTAIN, STILL = np.uint8(1), np.uint8(2), np.uint8(4)
 EXPOSURES = ((1.1, 1.03), (0.9, 0.97))
 """(gain, red over green): two photos of one place differ by as much, and more."""
 LEVEL_SAND = 0.1
-"""On gentler ground what is as bright as snow, and not even, may be a beach, a roof or a quarry."""
+"""On gentler ground, bright and uneven cells may be a beach, a roof or a quarry instead of snow."""
 _GRASS, _SOIL, _ROCK, _BUILT, _FOREST, _SNOW, _SHADE = (np.uint8(1 << n) for n in range(len(READABLE)))
 CLASS_OF_READINGS = np.full(256, TerrainClass.UNKNOWN, np.uint8)
 """uint8 (256,), TerrainClass by readings: UNKNOWN where they are several."""
@@ -130,7 +130,7 @@ def tiles(
 
 
 def ground_readings(f: Features) -> Bytes:
-    """What the photo shows, and would show if it were exposed a little differently: bits of `READABLE`."""
+    """Returns the readings of the photo, also at slightly different exposures: bits of `READABLE`."""
     readings = _ground(f.red, f.green, f.blue, f.light, f.around, f.texture, f.grade)
     doubtful = (readings == _SNOW) & (f.grade < LEVEL_SAND) & (f.texture > 8)
     for gain, warm in EXPOSURES:
@@ -164,13 +164,13 @@ def _ground(
         (_SHADE, shade),
     ):
         np.maximum(found, where.view(np.uint8) * bit, out=found)
-    # Whatever lies in the shade of a wall is a part of it.
+    # Cells in the shade of a wall are part of it.
     found[shade & (grade > 0.5)] = _ROCK
     return found
 
 
 def water_signs(f: Features) -> Bytes:
-    """Of each cell, which of LIKELY, CERTAIN and STILL it is."""
+    """Returns for each cell its signs of LIKELY, CERTAIN and STILL water."""
     dead_level = f.grade < STILL_GRADE
     # Sky light in a shadow is blue, not green: a lake is both.
     teal = (f.blue > 1.45 * f.red) & (f.green > 1.4 * f.red)
@@ -198,7 +198,7 @@ _DIRECTIONS = 8
 _SIDE = 2.0
 _TAPS = (-4, -2, 0, 2, 4)
 _MARGIN = 6
-"""Of side and tap together."""
+"""Margin for side and tap together."""
 _BRIGHTEST = 40
 """Grey levels over its sides that count at most: one bright roof is no road."""
 _FIXED = 8
@@ -211,7 +211,7 @@ Shorts = NDArray[np.int16]
 
 
 def line_strength(rgb: Bytes) -> Bytes:
-    """How much each cell looks like the crest of a line.
+    """Returns the likeness of each cell to the crest of a line.
 
     Parameters
     ----------

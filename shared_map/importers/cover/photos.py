@@ -22,14 +22,14 @@ MOST_SIDE = 1024
 """The million pixels in the middle tell the kind of an image; a larger look takes longer in proportion."""
 _DARK = 30
 """Of 765, the sum of three bytes: in darker pixels one step of a byte is a tenth of a channel, and ratios of
-channels say nothing."""
+channels have no meaning."""
 _LEGEND_COLOURS, _LEGEND_SAME = 64, 0.6
 """A drawn map has few colours, though CORINE's legend has 44, and most of its pixels are as those to the left and
 above. A photo has noise, and thousands of colours."""
 _RED_OVER_GREEN, _LIKE_BLUE, _FALSE_SHARE = 1.4, 0.15, 0.25
-"""A pixel is as red as plants are in near infrared where red exceeds green by so many times, and green differs from
-blue by less than this share of red; red ground and roofs have more green than blue. An image is in false colour
-where more than this share of it is so."""
+"""A pixel is as red as plants are in near infrared if red exceeds green by this factor, and green differs from blue
+by less than this share of red; red ground and roofs have more green than blue. An image is in false colour where
+more than this share of it is so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Photo:
 
     rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
     seen   bool (rows, cols): where it shows anything
-    notes  what was done to it, for people
+    notes  processing steps, for people
     drawn  that its own pixels are those of a drawn map, for people; None if they may be a photo's
     """
 
@@ -60,7 +60,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     given_crs : str or None
         Coordinate system of a photo that has a place but does not name its system.
     progress : callable
-        Told what is done and how much of it.
+        Called with the current step and the share of it that is done.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
 
 
 def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
-    """What an image is instead of a true-colour photo, for people; None if it may be one.
+    """Returns the kind of an image that is not a true-colour photo, for people; None if it may be one.
 
     Parameters
     ----------
@@ -197,8 +197,8 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
     Returns
     -------
     str or None
-        A map with a legend has few colours, in areas. Where near infrared is shown as red, plants are red, with as
-        much green as blue; the reds of true ground have more green than blue.
+        A map with a legend has few colours, in areas. In images that show near infrared as red, plants are red,
+        with as much green as blue; the reds of true ground have more green than blue.
     """
     drawn = why_drawn(rgb, seen)
     if drawn is not None:
@@ -213,7 +213,8 @@ def why_not_true_colour(rgb: Bytes, seen: Bools) -> str | None:
 
 
 def why_drawn(rgb: Bytes, seen: Bools) -> str | None:
-    """That an image is a drawn map, for people; None if it may be a photo. Arguments as of `why_not_true_colour`.
+    """Returns a sentence that an image is a drawn map; None if it may be a photo. Arguments as of
+    `why_not_true_colour`.
 
     Pixels must be the file's own, or copies of them: between two colours of a legend an interpolation makes others.
     """

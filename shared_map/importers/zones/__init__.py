@@ -1,6 +1,6 @@
 """Zones that files draw: vector files, whose features are burnt into cells, and rasters of pace.
 
-`vector_files` opens a file and reads its features as they are stored; `vector_shapes` mends them and brings them
-into cells; `burn` makes cells of them. `zone_files` decides which features count and what they are worth, by the
+`vector_files` opens a file and reads its features as they are stored; `vector_shapes` repairs them and brings them
+into cells; `burn` rasterises them. `zone_files` decides which features count and what they are worth, by the
 classes of ways of `way_classes`, whose built-in table is `ways.toml`.
 """

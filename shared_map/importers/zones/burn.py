@@ -23,7 +23,7 @@ _PIECE = 50
 _POLYGON = 3
 _NUDGE = (1.3e-4, 0.7e-4)
 """In cells. A line through the very corner of cells passes two of them that have no side in common, and no vehicle
-drives from one to the other between closed cells. Only coordinates that somebody rounded to cells do that."""
+drives from one to the other between closed cells. Only rounded coordinates touch cells exactly."""
 
 
 class Drawn(NamedTuple):

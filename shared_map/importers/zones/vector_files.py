@@ -34,7 +34,7 @@ _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What a layer says of itself.
+    """Metadata of a layer.
 
     source    how GDAL names the file
     what      how sentences name it
@@ -68,7 +68,7 @@ class Features:
 
 
 def is_vector(path: Path) -> bool:
-    """Whether a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
+    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
     with contextlib.suppress(OSError, TerrainError, *BAD_ARCHIVE):
         return _found(path, "") is not None
     return False
@@ -175,7 +175,7 @@ def _refused(what: str) -> Iterator[None]:
 
 
 def _source(path: Path, what: str) -> str:
-    """How GDAL names a file. Raises TerrainError on what is none of the kinds that are read."""
+    """Returns GDAL's name for a file. Raises TerrainError on a file of another kind."""
     check_bytes(path, FileKind.VECTORS)
     try:
         found = _found(path, what)

@@ -1,5 +1,5 @@
-"""Shapes of a file in any coordinate system, brought into cells of a grid: mended, cut at its border, bent as maps
-bend them; and its areas as simple rings, for orders to a running swarm.
+"""Shapes of a file in any coordinate system, brought into cells of a grid: repaired, cut at its border, densified
+as the projection bends them; and its areas as simple rings, for orders to a running swarm.
 
 Cell coordinates are (column, row) from the north-west corner: cell (r, c) is the square from (c, r) to (c+1, r+1).
 """
@@ -28,7 +28,7 @@ _DEG_M = 111_000.0
 _POLYGONS = 3
 MOST_OUTLINES = 50
 _TOLERANCES_CELLS = (0.01, 0.05, 0.1, 0.25)
-"""How far corners that are left out may lie off the line, until few enough are left."""
+"""Tolerances for dropped corners, tried in order until few enough are left."""
 
 Corner = tuple[float, float]
 
@@ -51,7 +51,7 @@ class Shapes:
 
 
 class Placing:
-    """How the coordinates of a layer come onto a grid.
+    """Transformation of a layer's coordinates onto a grid.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def _shown(box: Box) -> str:
 
 
 def _jumps(geometry: Any) -> bool:
-    """Whether an edge spans more than half of the globe, and not all of it."""
+    """Returns True if an edge spans more than half of the globe, and not all of it."""
     import shapely
 
     parts, _ = _simple(np.array([geometry], object))
@@ -279,7 +279,7 @@ def _mended(
 
 
 def _crossings(polygon: Any) -> float:
-    """About how often the edges of a polygon cross, by some of them: to count all takes as long as to mend."""
+    """Estimates the crossings of a polygon's edges from a sample: counting all takes as long as the repair."""
     import shapely
 
     points = shapely.get_coordinates(polygon)

@@ -1,4 +1,4 @@
-"""What OpenStreetMap's tags say of roads and water: classes with widths and factors, bridges, tunnels."""
+"""OpenStreetMap tags of roads and water: classes with widths and factors, bridges, tunnels."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ COLUMNS: Mapping[Kind, tuple[str, ...]] = {
     "road": ("highway", "fclass"),
     "water": ("waterway", "natural", "landuse", "fclass"),
 }
-"""Where the class stands: OSM's own keys, and the one of extracts as Shapefiles."""
+"""Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
 TAGS = ("bridge", "tunnel", "width", "est_width", "area")
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""
@@ -59,7 +59,8 @@ _WIDTH = re.compile(r"\s*(\d{1,5}(?:[.,]\d{1,9})?)\s*(m|metres|meters)?\s*")
 
 
 def unpacked(row: Mapping[str, str]) -> dict[str, str]:
-    """Tags of a feature: its columns, and what is packed into one. A column of its own counts more."""
+    """Returns the tags of a feature: its columns, and those that are packed into one. A column of its own counts
+    more."""
     tags: dict[str, str] = {}
     packed = row.get("tags")
     if packed is not None and packed.startswith("{"):
@@ -82,7 +83,8 @@ def class_of(kind: Kind, tags: Mapping[str, str], attribute: str | None) -> str 
 
 
 def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | None:
-    """What a class is worth, by the user's table, then by the built-in one of a kind; None if it is left out."""
+    """Returns the cost of a class, by the user's table, then by the built-in one of a kind; None if it is left
+    out."""
     known = None if kind is None else BUILT_IN[kind].get(_VARIANT.sub("", name))
     given = own.get(name)
     if given is None:
@@ -108,5 +110,5 @@ def is_bridge(tags: Mapping[str, str]) -> bool:
 
 
 def is_tunnel(tags: Mapping[str, str]) -> bool:
-    """Whether it runs below the ground: a map of one level has no place for it."""
+    """Returns True if it runs below the ground: a map of one level has no place for it."""
     return tags.get("tunnel", "no").lower() not in _NO

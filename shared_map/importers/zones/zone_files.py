@@ -35,7 +35,7 @@ _LEAST, _MOST = 1e-6, 1e6
 
 @dataclass
 class FileFacts:
-    """What became of a file's features, for people.
+    """Result of reading a file's features, for people.
 
     features  in the layer; used on the terrain; outside of it
     skipped   why some were left out -> how many
@@ -118,7 +118,7 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
 
 
 class _Worth:
-    """What each feature of a zone is worth.
+    """Cost of each feature of a zone.
 
     Raises TerrainError if the zone does not say how to tell.
     """

@@ -98,8 +98,8 @@ def landscape(
 
 
 def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
-    """Plausible classes without a photo: rock on what is steep, forest on slopes, grass between, bare soil here and
-    there.
+    """Returns plausible classes without a photo: rock on steep cells, forest on slopes, grass between, bare soil
+    here and there.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def _grade(elevation_m: Floats, resolution_m: float) -> Floats:
 
 
 LEVEL_LIGHT = 0.70710678
-"""How bright level ground is."""
+"""Brightness of flat ground."""
 
 
 def shade(east: Floats, north: Floats, exaggeration: float = 1.0) -> Floats:
@@ -187,7 +187,7 @@ def paint_photo(
     seed : int
         Of the grain.
     progress : callable
-        Told what is done and how much of it.
+        Called with the current step and the share of it that is done.
 
     Returns
     -------

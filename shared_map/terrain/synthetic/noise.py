@@ -79,7 +79,7 @@ def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: floa
 
 
 def mountain_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
-    """As `fractal_noise`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the
+    """Like `fractal_noise`, from gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the
     work.
 
     Values are roughly within -1..1.

@@ -15,8 +15,8 @@ from shared_map.terrain.synthetic.ways import Ways
 FORD_EVERY, FORD_LENGTH = 64, 4
 """Cells along a river from one shallow place to the next, and how long it is: a river never cuts a map in two."""
 _COARSE_CELLS = 250_000
-"""Above this many cells rivers are found on every second, fourth, ... cell. One of them takes 0.1 s of CPU on so
-many, and 0.7 s on a million, and a terrain may have fifty."""
+"""Above this many cells rivers are found on every second, fourth, ... cell. One river takes 0.1 s of CPU on this
+number of cells, and 0.7 s on a million, and a terrain may have fifty."""
 _BANK_GRADE = 0.03
 """Rise of a bank beside the water, 1.7 degrees, and 3.4 over the first 12 cells: far below the slopes that are
 lethal."""
@@ -148,7 +148,7 @@ def _cut(elevation_m: Floats, level: Floats, resolution_m: float) -> Floats:
 
 
 def _rise(away_m: Any, resolution_m: float) -> Any:
-    """How far a bank rises above the river, m."""
+    """Returns the height of a bank above the river, m."""
     return away_m * np.float32(_BANK_GRADE) * (np.float32(1) + away_m / np.float32(12 * resolution_m))
 
 

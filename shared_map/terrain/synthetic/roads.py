@@ -62,7 +62,8 @@ def lay_roads(pace: Floats, count: int, grid: GridSpec, seed: int) -> Bools:
 
 
 def _price(pace: Floats, stride: int) -> Floats:
-    """What builders pay: the square of pace, so that roads bend around slopes; lethal ground not at all."""
+    """Returns the builders' price: the square of pace, so that roads bend around slopes; lethal ground is not
+    entered."""
     coarse = pace
     if stride > 1:
         rows, cols = (pace.shape[0] // stride) * stride, (pace.shape[1] // stride) * stride

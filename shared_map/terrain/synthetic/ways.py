@@ -13,8 +13,8 @@ Cell = tuple[int, int]
 class Ways:
     """The cheapest ways from one cell to all others (Dijkstra, 1959).
 
-    A step to one of eight neighbours costs its length in cells times the mean of both prices; what has an infinite
-    price is not entered.
+    A step to one of eight neighbours costs its length in cells times the mean of both prices; cells with an
+    infinite price are not entered.
     """
 
     def __init__(self, price: NDArray[np.floating[Any]], start: Cell) -> None:
